@@ -1,0 +1,1 @@
+"""Flight logs: MCAP, MAVLink telemetry, DataFlash, ULog and CSV to samples, and back."""
