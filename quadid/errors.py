@@ -1,0 +1,60 @@
+"""Errors a caller can act on.
+
+Every error says what was found, what is allowed and what to do about it.  The command line turns any
+`QuadidError` into one line and exit code 2 (bad input) or 3 (the data cannot support an answer).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class QuadidError(Exception):
+    """Base of all errors raised on purpose.
+
+    Attributes:
+        found: what was met, as text.
+        allowed: what would have been valid.
+        fix: what the user can do.
+    """
+
+    exit_code = 2
+
+    def __init__(self, found: str, allowed: str = "", fix: str = "") -> None:
+        self.found, self.allowed, self.fix = found, allowed, fix
+        parts = [found]
+        if allowed:
+            parts.append(f"allowed: {allowed}")
+        if fix:
+            parts.append(f"fix: {fix}")
+        super().__init__("; ".join(parts))
+
+
+class VehicleError(QuadidError):
+    """A vehicle description that cannot be a flying vehicle."""
+
+
+class LogError(QuadidError):
+    """A log that cannot be read, or lacks what was asked of it."""
+
+
+class WindowError(QuadidError):
+    """Arrays that do not form a valid window: shape, unit, order or finiteness."""
+
+
+class ParameterError(QuadidError):
+    """A parameter outside its bounds, or an unknown name."""
+
+
+class NotIdentifiableError(QuadidError):
+    """The data were read well but cannot support an answer."""
+
+    exit_code = 3
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Returns ``did you mean 'x'?`` for the valid name closest to `name`, or the list of valid names."""
+    options = list(valid)
+    close = difflib.get_close_matches(name, options, n=1, cutoff=0.4)
+    return f"did you mean '{close[0]}'?" if close else "use one of " + ", ".join(options)

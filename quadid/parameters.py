@@ -1,0 +1,130 @@
+"""Identified parameters: names, units, values, bounds, covariance and status."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import ParameterError, nearest
+
+FloatArray = NDArray[np.float64]
+
+
+class Status(str, Enum):
+    """What the data say about one parameter."""
+
+    IDENTIFIED = "identified"
+    RATIO_ONLY = "ratio_only"
+    PRIOR_DOMINATED = "prior_dominated"
+
+
+NOMINAL_UNITS: dict[str, str] = {
+    "b": "N s^2/rad^2",
+    "d": "N m s^2/rad^2",
+    "J_xx": "kg m^2",
+    "J_yy": "kg m^2",
+    "J_zz": "kg m^2",
+    "J_r": "kg m^2",
+}
+"""The paper's identified vector Theta: thrust and drag coefficient, body inertias, rotor inertia; with SI units."""
+NOMINAL_NAMES: tuple[str, ...] = tuple(NOMINAL_UNITS)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One identified number.
+
+    Attributes:
+        name: paper's symbol, or ``effect.parameter`` for an effect.
+        unit: SI unit.
+        value: estimate.
+        sigma: standard deviation of the estimate, same unit; NaN when unknown.
+        initial: value the fit started from.
+        bounds: allowed interval.
+        status: what the data say about it.
+        relative_to: for `ratio_only`, the parameter whose ratio to this one is known.
+        ci95: 95 % interval; derived from `sigma` by the fit, which may use the log scale.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sigma: float = math.nan
+    initial: float = math.nan
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    status: Status = Status.IDENTIFIED
+    relative_to: str | None = None
+    ci95: tuple[float, float] = (math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Parameters with their joint covariance.
+
+    Attributes:
+        parameters: the numbers, in vector order.
+        covariance: shape (n, n), in the parameters' own units.
+    """
+
+    parameters: tuple[Parameter, ...]
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        """Checks shapes; raises ParameterError."""
+        n = len(self.parameters)
+        if self.covariance.shape != (n, n):
+            raise ParameterError(f"covariance of shape {self.covariance.shape}", f"shape ({n}, {n})")
+        self.covariance.setflags(write=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in vector order."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def values(self) -> FloatArray:
+        """Values in vector order, shape (n,)."""
+        return np.array([p.value for p in self.parameters])
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.parameters)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        """Returns the parameter called `name`; raises ParameterError with the nearest valid name."""
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise ParameterError(f"unknown parameter '{name}'", fix=nearest(name, self.names))
+
+
+INERTIA_SLACK = 1.5
+"""How far a guess may break the triangle inequality.  The paper's own Table 2 breaks it by 24 % (J_zz = 0.0292 against
+J_xx + J_yy = 0.0236), so a small breach is taken for a poor guess, and only a large one for a wrong file."""
+
+
+def impossible_inertia(diagonal: Sequence[float], slack: float = INERTIA_SLACK) -> str | None:
+    """Says why principal moments of inertia cannot belong to a rigid body, or returns None.
+
+    Each must be positive and none may exceed the sum of the other two (triangle inequality) by more than `slack`.
+
+    Args:
+        diagonal: J_xx, J_yy, J_zz [kg m^2].
+        slack: factor by which the inequality may be broken; 1 for none.
+    """
+    names = ("J_xx", "J_yy", "J_zz")
+    for name, value in zip(names, diagonal, strict=True):
+        if not value > 0.0:
+            return f"{name} = {value:g} kg m^2 is not positive"
+    for i, name in enumerate(names):
+        others = sum(diagonal) - diagonal[i]
+        if diagonal[i] > slack * others:
+            return f"{name} = {diagonal[i]:g} kg m^2 breaks the triangle inequality: the other two sum to {others:g}"
+    return None

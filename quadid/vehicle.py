@@ -1,0 +1,255 @@
+"""The vehicle: geometry, mass, command, initial parameters, known effects; read from and written as YAML text."""
+
+from __future__ import annotations
+
+import math
+from importlib import resources
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from quadid.effects import EFFECTS
+from quadid.errors import VehicleError, nearest
+from quadid.parameters import NOMINAL_NAMES, impossible_inertia
+
+FloatArray = NDArray[np.float64]
+GRAVITY = 9.80665
+"""Standard gravity [m/s^2]."""
+DEFAULT_BOUND_FACTOR = 4.0
+"""A bare initial guess may be wrong by this factor each way."""
+
+PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Rotor(_Strict):
+    """One rotor.
+
+    Attributes:
+        position: from the geometric centre, FRD [m].
+        spin: +1 or -1, its sign in Omega_r; +1 turns about -z and pushes the vehicle about +z.
+    """
+
+    position: tuple[Coordinate, Coordinate, Coordinate]
+    spin: Literal[-1, 1]
+
+
+class Command(_Strict):
+    """What the rotor columns of a log mean.
+
+    Attributes:
+        kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1] or ``pwm`` [us].
+        sampling: ``held``: a row acts until the next; ``instant``: a reading, linear in between.
+        max_speed: rotor speed at full command [rad/s], for normalized and pwm.
+        range: pulse widths of zero and full command [us], for pwm.
+    """
+
+    kind: Literal["rotor_speed", "normalized", "pwm"] = "rotor_speed"
+    sampling: Literal["held", "instant"] = "held"
+    max_speed: PositiveFloat | None = None
+    range: tuple[PositiveFloat, PositiveFloat] = (1000.0, 2000.0)
+
+    @model_validator(mode="after")
+    def _complete(self) -> Command:
+        if self.kind != "rotor_speed" and self.max_speed is None:
+            raise ValueError(f"command kind '{self.kind}' needs max_speed [rad/s], the rotor speed at full command")
+        if self.range[1] <= self.range[0]:
+            raise ValueError(f"command range {list(self.range)} must rise, for example [1000, 2000]")
+        return self
+
+    def to_rotor_speed(self, values: FloatArray) -> FloatArray:
+        """Converts logged rotor columns, shape (n, rotors), to rotor speed [rad/s]."""
+        if self.kind == "rotor_speed":
+            return values
+        assert self.max_speed is not None
+        if self.kind == "pwm":
+            low, high = self.range
+            values = (values - low) / (high - low)
+        return values * self.max_speed
+
+
+class ParameterPrior(_Strict):
+    """Initial guess of one parameter: value, bounds, and standard deviation where known (same unit)."""
+
+    initial: PositiveFloat
+    bounds: tuple[PositiveFloat, PositiveFloat] | None = None
+    sigma: PositiveFloat | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ParameterPrior:
+        if self.bounds is not None and not self.bounds[0] <= self.initial <= self.bounds[1]:
+            raise ValueError(f"initial {self.initial:g} lies outside bounds [{self.bounds[0]:g}, {self.bounds[1]:g}]")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Bounds, by default a factor of 4 each way."""
+        return self.bounds or (self.initial / DEFAULT_BOUND_FACTOR, self.initial * DEFAULT_BOUND_FACTOR)
+
+
+class Noise(_Strict):
+    """Known 1-sigma noise: gyro [rad/s], attitude [rad], accel [m/s^2], velocity [m/s], position [m]."""
+
+    gyro: PositiveFloat | None = None
+    attitude: PositiveFloat | None = None
+    accel: PositiveFloat | None = None
+    velocity: PositiveFloat | None = None
+    position: PositiveFloat | None = None
+
+
+class Stabiliser(_Strict):
+    """Gains of the on-board attitude stabiliser, where known: angle P [1/s], rate P and D, yaw, as in `quadid.flight`."""
+
+    gains: dict[str, float]
+
+
+class Vehicle(_Strict):
+    """Everything known about a vehicle before its log is read.
+
+    Attributes:
+        name: identifier.
+        mass: kg, known; fixes the force scale.
+        rotors: at least three.
+        command: meaning of the rotor columns.
+        parameters: initial guess of b, d, J_xx, J_yy, J_zz, J_r.
+        effects: effects that are part of the model, name -> parameter -> value.
+        noise: known sensor noise, or None.
+        stabiliser: known stabiliser gains, or None.
+    """
+
+    name: str
+    mass: PositiveFloat
+    rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=16)
+    command: Command = Command()
+    parameters: dict[str, ParameterPrior]
+    effects: dict[str, dict[str, float]] = Field(default_factory=dict)
+    noise: Noise = Noise()
+    stabiliser: Stabiliser | None = None
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _bare_numbers(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            raise ValueError("parameters must map b, d, J_xx, J_yy, J_zz, J_r to numbers")
+        for key in value:
+            if key not in NOMINAL_NAMES:
+                raise ValueError(f"unknown parameter '{key}'; {nearest(str(key), NOMINAL_NAMES)}")
+        missing = [name for name in NOMINAL_NAMES if name not in value]
+        if missing:
+            raise ValueError(f"parameters lack {', '.join(missing)}; give an initial guess for each")
+        return {k: v if isinstance(v, dict | ParameterPrior) else {"initial": v} for k, v in value.items()}
+
+    @field_validator("effects", mode="before")
+    @classmethod
+    def _known_effects(cls, value: Any) -> Any:
+        for name, numbers in (value or {}).items():
+            if name not in EFFECTS:
+                raise ValueError(f"unknown effect '{name}'; {nearest(str(name), EFFECTS)}")
+            known = [p.name for p in EFFECTS[name].parameters]
+            if not isinstance(numbers, dict):
+                raise ValueError(f"effect '{name}' needs its parameters, for example {{{known[0]}: ...}}")
+            for key, number in numbers.items():
+                if key not in known:
+                    raise ValueError(f"effect '{name}' has no parameter '{key}'; {nearest(str(key), known)}")
+                if not isinstance(number, int | float) or math.isnan(number):
+                    raise ValueError(f"effect '{name}': {key} = {number!r} is not a number")
+        return value or {}
+
+    @model_validator(mode="after")
+    def _physical(self) -> Vehicle:
+        diagonal = [self.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")]
+        why = impossible_inertia(diagonal)
+        if why:
+            raise ValueError(f"impossible inertia: {why}")
+        arms = np.array([r.position for r in self.rotors])[:, :2]
+        spread = np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)
+        if spread[-1] < 1e-4:
+            raise ValueError("all rotors lie on one line: roll and pitch cannot both be controlled; check positions [m]")
+        if len({r.spin for r in self.rotors}) == 1:
+            raise ValueError("all rotors spin the same way: yaw cannot be balanced; give both +1 and -1")
+        return self
+
+    @property
+    def rotor_positions(self) -> FloatArray:
+        """Shape (rotors, 3) [m], FRD."""
+        return np.array([r.position for r in self.rotors])
+
+    @property
+    def spins(self) -> FloatArray:
+        """Shape (rotors,), +1 or -1."""
+        return np.array([float(r.spin) for r in self.rotors])
+
+    @property
+    def initial(self) -> FloatArray:
+        """Initial guess of (b, d, J_xx, J_yy, J_zz, J_r), shape (6,)."""
+        return np.array([self.parameters[n].initial for n in NOMINAL_NAMES])
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Bounds of the six, shape (6, 2)."""
+        return np.array([self.parameters[n].limits for n in NOMINAL_NAMES])
+
+    def hover_speed(self, b: float | None = None) -> float:
+        """Rotor speed [rad/s] at which thrust equals weight, for thrust coefficient `b` (default: initial guess)."""
+        coefficient = self.parameters["b"].initial if b is None else b
+        return math.sqrt(self.mass * GRAVITY / (coefficient * len(self.rotors)))
+
+    @classmethod
+    def from_yaml(cls, text: str, origin: str = "vehicle file") -> Vehicle:
+        """Parses a vehicle file.
+
+        Args:
+            text: YAML of `docs/contract` form.
+            origin: name used in errors.
+
+        Raises:
+            VehicleError: with the key, what is allowed, and the nearest valid one.
+        """
+        try:
+            raw = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise VehicleError(f"{origin}: not YAML ({str(error).splitlines()[0]})", "a YAML mapping") from error
+        if not isinstance(raw, dict):
+            raise VehicleError(f"{origin}: holds {type(raw).__name__}", "a mapping with name, mass, rotors, parameters")
+        try:
+            return cls.model_validate(raw)
+        except ValidationError as error:
+            raise VehicleError(f"{origin}: {_first_problem(error)}", fix="correct that entry") from error
+
+    @classmethod
+    def shipped(cls, name: str) -> Vehicle:
+        """Loads a shipped vehicle by name; raises VehicleError naming the nearest one."""
+        folder = resources.files("quadid") / "vehicles"
+        names = sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".yaml"))
+        if name not in names:
+            raise VehicleError(f"no shipped vehicle '{name}'", ", ".join(names) + ", or a YAML file", nearest(name, names))
+        return cls.from_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"), f"{name}.yaml")
+
+    def to_yaml(self) -> str:
+        """Writes the vehicle as YAML that `from_yaml` reads back."""
+        data = self.model_dump(mode="json", exclude_none=True)
+        return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
+
+
+def _first_problem(error: ValidationError) -> str:
+    detail = error.errors()[0]
+    place = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        return f"unknown key '{place}'; {nearest(str(detail['loc'][-1]), _valid_keys(detail['loc'][:-1]))}"
+    message = detail["msg"].removeprefix("Value error, ")
+    return f"{place}: {message} (found {detail['input']!r:.60})" if place else message
+
+
+def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
+    models: dict[str, type[BaseModel]] = {
+        "rotors": Rotor, "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser,
+    }  # fmt: skip
+    model = models.get(str(path[0]), Vehicle) if path else Vehicle
+    return list(model.model_fields)

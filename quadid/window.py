@@ -1,0 +1,193 @@
+"""Measured data as the core sees it: samples, channels, recordings, and windows on a uniform grid.
+
+Inside the core all data are SI, world NED, body FRD, quaternions body to world, scalar first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quadid.errors import WindowError
+
+FloatArray = NDArray[np.float64]
+Sampling = Literal["held", "instant"]
+
+CHANNELS: dict[str, tuple[int | None, str]] = {
+    "gyro": (3, "rad/s"),
+    "accel": (3, "m/s^2"),
+    "attitude": (4, "quaternion wxyz, body to world"),
+    "rotor_speed": (None, "rad/s"),
+    "motor_command": (None, "normalized 0..1 or us"),
+    "attitude_reference": (4, "rad, rad, rad, throttle 0..1"),
+    "velocity": (3, "m/s, NED"),
+    "position": (3, "m, NED"),
+    "battery": (1, "V"),
+}
+"""Known channels: number of columns (None: one per rotor) and unit.  ``accel`` is specific force (-g on z at rest)."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One message's worth of one channel: time [s], channel name, values in the channel's unit."""
+
+    t: float
+    channel: str
+    values: tuple[float, ...]
+
+
+def _frozen(values: ArrayLike, name: str, columns: int | None) -> FloatArray:
+    array = np.array(values, dtype=np.float64, order="C")
+    if array.ndim == 1 and columns == 1:
+        array = array[:, None]
+    if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
+        raise WindowError(f"{name} of shape {array.shape}", f"(n, {columns if columns else 'rotors'})")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of a recording at its own rate.
+
+    Attributes:
+        name: key of `CHANNELS`.
+        t: times [s], shape (n,), non-decreasing.
+        values: shape (n, columns).
+        source: where it came from, for people (topic, message name, column names).
+    """
+
+    name: str
+    t: FloatArray
+    values: FloatArray
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Checks name, shapes and order of time; raises WindowError."""
+        if self.name not in CHANNELS:
+            raise WindowError(f"unknown channel '{self.name}'", ", ".join(CHANNELS))
+        t = np.array(self.t, dtype=np.float64)
+        values = _frozen(self.values, self.name, CHANNELS[self.name][0])
+        if t.shape != (len(values),):
+            raise WindowError(f"{self.name}: {len(values)} rows but times of shape {t.shape}", "one time a row")
+        if len(t) > 1 and np.any(np.diff(t) < 0.0):
+            raise WindowError(f"{self.name}: time runs backwards", "non-decreasing time", "split at the step")
+        t.setflags(write=False)
+        object.__setattr__(self, "t", t)
+        object.__setattr__(self, "values", values)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a log holds, in core units and frames, each channel at its own rate.
+
+    Attributes:
+        name: name for people (file name).
+        format: how it was recognised: csv, mcap, tlog, dataflash, ulog.
+        channels: by name; absent channels are absent keys.
+        breaks: times [s] across which nothing may be joined (reboots, clock steps).
+        warnings: what was wrong with the log and what was done about it.
+        sha256: hash of the bytes read.
+        grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
+    """
+
+    name: str
+    format: str
+    channels: Mapping[str, Channel]
+    breaks: tuple[float, ...] = ()
+    warnings: tuple[str, ...] = ()
+    sha256: str = ""
+    grid: float | None = None
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of flight without gaps on a uniform grid.
+
+    NaN in a measured channel means "no measurement at this grid point"; rotor speeds must be finite.
+
+    Attributes:
+        t0: time of the first row [s].
+        dt: grid step [s].
+        rotor_speed: shape (n, rotors) [rad/s]; see `sampling`.
+        gyro: shape (n, 3) [rad/s], body FRD, instants; or None.
+        attitude: shape (n, 4), unit quaternions body to world; or None.
+        accel: shape (n, 3) [m/s^2], specific force in body FRD, mean over one sample centred on t; or None.
+        velocity: shape (n, 3) [m/s], world NED; or None.
+        position: shape (n, 3) [m], world NED; or None.
+        battery: shape (n, 1) [V]; or None.
+        attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
+        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading at t_k, linear between.
+        name: where it came from.
+        log_span: first and last time [s] of the whole log, for effects that run over a flight.
+    """
+
+    t0: float
+    dt: float
+    rotor_speed: FloatArray
+    gyro: FloatArray | None = None
+    attitude: FloatArray | None = None
+    accel: FloatArray | None = None
+    velocity: FloatArray | None = None
+    position: FloatArray | None = None
+    battery: FloatArray | None = None
+    attitude_reference: FloatArray | None = None
+    sampling: Sampling = "held"
+    name: str = ""
+    log_span: tuple[float, float] = field(default=(np.nan, np.nan))
+
+    def __post_init__(self) -> None:
+        """Checks shapes, finiteness and quaternion norms; normalises the sign of time span; raises WindowError."""
+        if not (np.isfinite(self.dt) and self.dt > 0.0):
+            raise WindowError(f"grid step {self.dt} s", "a positive step")
+        if self.sampling not in ("held", "instant"):
+            raise WindowError(f"sampling '{self.sampling}'", "held, instant")
+        rotor = _frozen(self.rotor_speed, "rotor_speed", None)
+        if not np.all(np.isfinite(rotor)):
+            bad = int(np.count_nonzero(~np.isfinite(rotor).all(axis=1)))
+            raise WindowError(f"{bad} rows of rotor_speed are not finite", "finite rotor speeds", "split the window there")
+        object.__setattr__(self, "rotor_speed", rotor)
+        for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            array = _frozen(values, name, CHANNELS[name][0])
+            if len(array) != len(rotor):
+                raise WindowError(f"{name} has {len(array)} rows, rotor_speed {len(rotor)}", "equal numbers of rows")
+            if np.any(np.isinf(array)):
+                raise WindowError(f"{name} holds infinite values", "finite values, or NaN where nothing was measured")
+            object.__setattr__(self, name, array)
+        if self.attitude is not None:
+            norm = np.linalg.norm(self.attitude, axis=1)
+            if np.any(np.abs(norm[np.isfinite(norm)] - 1.0) > 1e-3):
+                raise WindowError("attitude quaternions are not of unit length", "unit quaternions, scalar first")
+        if not np.isfinite(self.log_span[0]):
+            object.__setattr__(self, "log_span", (self.t0, self.t0 + self.dt * (len(rotor) - 1)))
+
+    def __len__(self) -> int:
+        return len(self.rotor_speed)
+
+    @property
+    def t(self) -> FloatArray:
+        """Times of the rows [s], shape (n,)."""
+        return self.t0 + self.dt * np.arange(len(self))
+
+    def slice(self, start: int, stop: int) -> Window:
+        """Returns rows `start` to `stop` (exclusive) as a window of the same log."""
+        cut = {
+            name: (None if getattr(self, name) is None else getattr(self, name)[start:stop])
+            for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
+        }
+        return Window(
+            self.t0 + self.dt * start,
+            self.dt,
+            self.rotor_speed[start:stop],
+            sampling=self.sampling,
+            name=self.name,
+            log_span=self.log_span,
+            **cut,
+        )
