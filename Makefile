@@ -1,0 +1,81 @@
+# quadid: every command that a developer or CI runs. `make` lists them.
+# Needs Python >= 3.11, make, cmake and a C/C++ compiler; everything else goes into .venv.
+
+VENV := .venv
+BIN := $(VENV)/bin
+# The first of these that is new enough; `make PYTHON=/path/to/python` overrides. The ROS wheels end at 3.13.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+# What is installed, one stamp a step; a step runs again only when what it reads has changed.
+RUNTIME := $(VENV)/.stamp-runtime
+DEV := $(VENV)/.stamp-dev
+ROS := $(VENV)/.stamp-ros
+MESSAGES := $(VENV)/.stamp-messages
+
+export PIP_NO_INPUT := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help
+help: ## list the targets
+	@grep -hE '^[a-z][a-z-]*:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+
+# --- the environment
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 to 3.13 with its venv module found: install one, or say make PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(RUNTIME): pyproject.toml | $(BIN)/python
+	$(PIP) install --editable .
+	@touch $@
+
+$(DEV): pyproject.toml $(RUNTIME)
+	$(PIP) install --editable ".[dev]"
+	@touch $@
+
+# Last, because these wheels make every start of this Python re-execute itself.
+$(ROS): pyproject.toml $(DEV)
+	$(PIP) install --editable ".[ros]"
+	@touch $@
+
+$(MESSAGES): $(ROS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg)
+	tools/build_messages.sh $(VENV)
+	@touch $@
+
+.PHONY: venv dev messages
+venv: $(RUNTIME) ## .venv with the quadid command
+dev: $(DEV) ## ... and what developers use: linters, types, tests
+messages: $(MESSAGES) ## ... and ROS 2 Jazzy with quadid_msgs
+
+# --- use
+
+.PHONY: demo
+demo: venv ## fly, identify and diagnose three flights, write the report
+	$(BIN)/quadid demo --out demo-out
+
+# --- check
+
+.PHONY: test lint typecheck format
+test: $(MESSAGES) lint typecheck ## everything that CI checks, but the browser
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser"
+
+lint: $(DEV) ## style, format, and which room may import which
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+typecheck: $(DEV) ## mypy --strict
+	$(BIN)/mypy
+
+format: $(DEV) ## let ruff put files into the common form
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# --- tidy
+
+.PHONY: clean
+clean: ## remove the environment, caches and what commands wrote
+	rm -rf $(VENV) build install log dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo-out
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,42 @@
+"""What all tests share: where the recorded flights are, and what must not be skipped in CI."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# The first call of a numba kernel compiles it: an example's time says nothing. In CI every run draws the same examples.
+hypothesis.settings.register_profile("quadid", deadline=None, print_blob=True, derandomize=bool(os.environ.get("CI")))
+hypothesis.settings.load_profile("quadid")
+
+
+def in_ci() -> bool:
+    """True where nothing may be skipped for being absent (environment variable CI)."""
+    return os.environ.get("CI", "").lower() in ("1", "true", "yes")
+
+
+def absent(reason: str) -> None:
+    """Fail in CI, skip elsewhere: something that the test needs is not on this machine."""
+    if in_ci():
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the recorded flights: QUADID_DATA, else ../shared/data beside the repository."""
+    folder = Path(os.environ.get("QUADID_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        absent(f"no recorded flights at {folder}: set QUADID_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """Root of the checkout under test."""
+    return REPOSITORY

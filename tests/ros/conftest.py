@@ -1,0 +1,38 @@
+"""ROS tests: wheels and messages present, a DDS domain of their own, one worker after the other."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import absent
+
+HERE = Path(__file__).resolve().parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test of this folder and keep them in one xdist worker: timing tests disturb each other."""
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.ros)
+            item.add_marker(pytest.mark.xdist_group("ros"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ros_environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A DDS domain of this run's own, reachable from this machine only; logs go to a scratch folder."""
+    for module in ("rclpy", "quadid_msgs"):
+        if importlib.util.find_spec(module) is None:
+            absent(f"{module} is not installed in {sys.prefix}: run 'make messages'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # above 101 the ports may be taken by clients
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+        patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
+        patch.delenv("RMW_IMPLEMENTATION", raising=False)  # naming an absent one ends the process without a word
+        yield
