@@ -59,12 +59,14 @@ class Channel:
         t: times [s], shape (n,), non-decreasing.
         values: shape (n, columns).
         source: where it came from, for people (topic, message name, column names).
+        faults: number of samples the reader dropped, by reason: duplicate, backwards, not_finite, bad_stamp.
     """
 
     name: str
     t: FloatArray
     values: FloatArray
     source: str = ""
+    faults: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Checks name, shapes and order of time; raises WindowError."""

@@ -1,0 +1,216 @@
+"""Merges the channels of a recording onto uniform grids: recording -> windows.
+
+No lag is invented.  When the log is faster than the grid, one symmetric low-pass goes over all fast channels alike,
+rotor speeds included; channels slower than the grid stay untouched and are NaN between their samples.  Gaps and breaks
+(reboots, clock steps) end a window; nothing is joined across them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import LogError, NotIdentifiableError
+from quadid.resample import COINCIDENT, sample_period
+from quadid.rotor_signal import rotor_signal
+from quadid.tracks import REQUIRED, Plan, make_plan, on_grid, reach
+from quadid.vehicle import Vehicle
+from quadid.window import Recording, Window
+
+FloatArray = NDArray[np.float64]
+
+SHORTEST = 1.0
+"""Windows shorter than this [s] are dropped where a rate was asked for."""
+
+
+@dataclass(frozen=True)
+class GridReport:
+    """What became of a recording on its way to windows.
+
+    Attributes:
+        rate: grid rate [Hz].
+        windows: number of windows kept.
+        seconds_used: time inside windows [s].
+        seconds_log: first to last sample of the log [s].
+        gaps: number of places where the log was cut (gaps and breaks).
+        dropped: number of stretches too short to keep.
+        seconds_dropped: time in them [s].
+        rotor_source: where the rotor speeds came from.
+        rotor_rate: their own rate in the log [Hz].
+        filtered: whether the channels were low-passed for the grid.
+        notes: sentences for people.
+    """
+
+    rate: float
+    windows: int
+    seconds_used: float
+    seconds_log: float
+    gaps: int
+    dropped: int
+    seconds_dropped: float
+    rotor_source: str
+    rotor_rate: float
+    filtered: bool
+    notes: tuple[str, ...] = ()
+
+
+class Gridded(NamedTuple):
+    """Windows and the account of how they were made."""
+
+    windows: list[Window]
+    report: GridReport
+
+
+def to_windows(
+    recording: Recording,
+    vehicle: Vehicle,
+    rate: float | None = 50.0,
+    start: float | None = None,
+    stop: float | None = None,
+    shortest: float | None = None,
+) -> list[Window]:
+    """Merges the channels of a recording onto uniform grids; see `grid_recording` for arguments and errors."""
+    return grid_recording(recording, vehicle, rate, start, stop, shortest).windows
+
+
+def grid_recording(
+    recording: Recording,
+    vehicle: Vehicle,
+    rate: float | None = 50.0,
+    start: float | None = None,
+    stop: float | None = None,
+    shortest: float | None = None,
+) -> Gridded:
+    """Merges the channels of a recording onto uniform grids, one per stretch without gaps.
+
+    A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
+    filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``.
+
+    Args:
+        recording: a log in core units and frames.
+        vehicle: tells what the rotor columns mean and how many there must be.
+        rate: grid rate [Hz]; None for the log's own (that of its gyro, else of its rotor signal).
+        start: first time to use [s], in the recording's time.
+        stop: last time to use [s].
+        shortest: shorter windows are dropped [s]; default 1 s where a rate is given, else only single rows.
+
+    Raises:
+        LogError: rotor columns that do not fit the vehicle, or no usable stretch.
+        NotIdentifiableError: no rotor signal, or one too slow to mean anything.
+    """
+    if rate is not None and not (math.isfinite(rate) and 1.0 <= rate <= 2000.0):
+        raise LogError(f"grid rate {rate} Hz", "1 to 2000 Hz", "leave it out for 50 Hz")
+    rotor = rotor_signal(recording, vehicle)
+    plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
+    spans = _spans(plan)
+    low, high = -math.inf if start is None else start, math.inf if stop is None else stop
+    if shortest is None:
+        shortest = SHORTEST if rate is not None else 0.0
+    windows: list[Window] = []
+    lost = 0.0
+    log_span = _log_span(recording)
+    for span in spans:
+        a, b = _inside(plan, span)
+        at = _grid_times(plan, max(a, low), min(b, high))
+        if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
+            windows.append(_window(plan, at, recording.name, log_span))
+        else:
+            lost += max(0.0, min(span[1], high) - max(span[0], low))
+    if not windows:
+        longest = max((b - a for a, b in spans), default=0.0)
+        raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), start, stop)
+    report = GridReport(
+        rate=1.0 / plan.step,
+        windows=len(windows),
+        seconds_used=sum((len(w) - 1) * w.dt for w in windows),
+        seconds_log=log_span[1] - log_span[0],
+        gaps=len(spans) - 1,
+        dropped=sum(max(a, low) < min(b, high) for a, b in spans) - len(windows),
+        seconds_dropped=lost,
+        rotor_source=rotor.source,
+        rotor_rate=1.0 / sample_period(rotor.t),
+        filtered=plan.filtered,
+        notes=(*rotor.notes, *_notes(plan, rotor.t)),
+    )
+    return Gridded(windows, report)
+
+
+def _spans(plan: Plan) -> list[tuple[float, float]]:
+    """Returns the times [s] during which every required channel is there, cut at gaps and breaks."""
+    spans: list[tuple[float, float]] = [(-math.inf, math.inf)]
+    for name in REQUIRED:
+        if name not in plan.tracks:
+            continue
+        track = plan.tracks[name]
+        own = [(float(track.t[cut][0]), float(track.t[cut][-1])) for cut in track.stretches]
+        spans = [(max(a, c), min(b, d)) for a, b in spans for c, d in own if max(a, c) <= min(b, d)]
+    return spans
+
+
+def _inside(plan: Plan, span: tuple[float, float]) -> tuple[float, float]:
+    """Shrinks a span to where the low-pass, if there is one, has samples on both sides in every required channel."""
+    a, b = span
+    for name in REQUIRED:
+        for cut in plan.tracks[name].stretches if name in plan.tracks else ():
+            t = plan.tracks[name].t[cut]
+            if t[0] <= span[1] and t[-1] >= span[0]:
+                c, d = reach(plan.tracks[name], cut, plan)
+                a, b = max(a, c), min(b, d)
+    return a, b
+
+
+def _grid_times(plan: Plan, a: float, b: float) -> FloatArray:
+    """Returns the grid in [a, b]; its first point is a sample of the gyro, else of the rotor signal."""
+    tolerance = COINCIDENT * plan.step
+    t = plan.tracks["gyro" if "gyro" in plan.tracks else "rotor_speed"].t
+    first = int(np.searchsorted(t, a - tolerance))
+    if first >= len(t) or t[first] > b + tolerance:
+        return np.empty(0)
+    return np.asarray(t[first] + plan.step * np.arange(math.floor((b - t[first] + tolerance) / plan.step) + 1))
+
+
+def _window(plan: Plan, at: FloatArray, name: str, log_span: tuple[float, float]) -> Window:
+    columns = {}
+    for channel, track in plan.tracks.items():
+        values = on_grid(channel, track, at, plan)
+        if not np.isnan(values).all():
+            columns[channel] = values
+    return Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, name=name, log_span=log_span)
+
+
+def _log_span(recording: Recording) -> tuple[float, float]:
+    ends = [(float(c.t[0]), float(c.t[-1])) for c in recording.channels.values() if len(c.t)]
+    return min(a for a, _ in ends), max(b for _, b in ends)
+
+
+def _notes(plan: Plan, rotor_times: FloatArray) -> list[str]:
+    notes = []
+    period = sample_period(rotor_times)
+    if period > 1.5 * plan.step:
+        notes.append(
+            f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
+            "fast motion cannot be attributed to the rotors"
+        )
+    return notes
+
+
+def _nothing_left(
+    recording: Recording, longest: float, needed: float, start: float | None, stop: float | None
+) -> LogError | NotIdentifiableError:
+    first, last = _log_span(recording)
+    if start is not None or stop is not None:
+        return LogError(
+            f"{recording.name}: nothing to use between {start} and {stop} s",
+            f"times within {first:.3f} to {last:.3f} s", "see `quadid inspect` for the flying spans",
+        )  # fmt: skip
+    return NotIdentifiableError(
+        f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",
+        f"at least {needed:.3g} s", "log at a steady rate, or ask for a lower --rate",
+    )  # fmt: skip
+
+
+__all__ = ["GridReport", "Gridded", "grid_recording", "to_windows"]

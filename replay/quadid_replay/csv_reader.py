@@ -1,0 +1,200 @@
+"""CSV of the contract: a header row, `t` [s], then any of the known columns, SI, world NED, body FRD."""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import LogError, nearest
+from quadid.resample import COINCIDENT, sample_period
+from quadid.window import Channel, Recording
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import clean_channel, fault_warnings
+from quadid_replay.frames import from_euler
+from quadid_replay.recognise import HEAD_BYTES, header_line
+
+FloatArray = NDArray[np.float64]
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "gyro": ("p", "q", "r"),
+    "accel": ("ax", "ay", "az"),
+    "attitude": ("qw", "qx", "qy", "qz"),
+    "velocity": ("vx", "vy", "vz"),
+    "position": ("x", "y", "z"),
+    "battery": ("battery",),
+    "attitude_reference": ("phi_ref", "theta_ref", "psi_ref", "throttle"),
+}
+EULER = ("phi", "theta", "psi")
+_ROTOR = {"rotor_speed": re.compile(r"w([1-9]\d?)"), "motor_command": re.compile(r"u([1-9]\d?)")}
+_LINES = 4096
+
+
+def read_csv(path: Path, sha256: str = "") -> Recording:
+    """Reads a CSV log.
+
+    Raises:
+        LogError: no header, a column group that is incomplete, or no usable row.
+    """
+    names, delimiter = _header(path)
+    layout, ignored = _layout(names, path.name)
+    table, notes = _table(path, len(names), delimiter)
+    if len(table) == 0:
+        raise LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
+    if ignored:
+        notes.append(f"columns not used: {', '.join(ignored)} ({nearest(ignored[0], _known())})")
+    clock = LogClock()
+    t, accepted = _recording_time(table[:, names.index("t")], clock)
+    refused = len(table) - int(np.count_nonzero(accepted))
+    rows = table[accepted]
+    channels: dict[str, Channel] = {}
+    for name, columns in layout.items():
+        values = rows[:, [names.index(c) for c in columns]]
+        blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
+        if columns == EULER:
+            values = from_euler(values)
+        channel = clean_channel(name, t[~blank], values[~blank], " ".join(columns), refused)
+        if channel is not None:
+            channels[name] = channel
+    if not channels:
+        raise LogError(f"{path.name}: no channel holds a finite number", "columns " + ", ".join(_known()))
+    warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
+    return Recording(
+        path.name, "csv", channels, tuple(clock.breaks), warnings, sha256, _uniform_step(channels)
+    )  # fmt: skip
+
+
+def _header(path: Path) -> tuple[list[str], str]:
+    with path.open("rb") as file:
+        line = header_line(file.read(HEAD_BYTES))
+    if line is None:
+        raise LogError(f"{path.name}: no header row", "t, then column names such as p,q,r,ax,ay,az,w1")
+    delimiter = max(",;\t", key=line.count)
+    names = [cell.strip().strip('"') for cell in line.split(delimiter)]
+    doubles = sorted({n for n in names if names.count(n) > 1})
+    if doubles:
+        raise LogError(f"{path.name}: column {', '.join(doubles)} appears twice", "each column once")
+    if "t" not in names:
+        raise LogError(f"{path.name}: no column t among {', '.join(names)[:120]}", "a column t with the time [s]")
+    return names, delimiter
+
+
+def _known() -> list[str]:
+    return [*(c for group in GROUPS.values() for c in group), *EULER, "w1", "u1"]
+
+
+def _layout(names: list[str], origin: str) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    """Assigns columns to channels; returns the columns nobody asked for as well."""
+    layout: dict[str, tuple[str, ...]] = {}
+    for channel, group in GROUPS.items():
+        _take(layout, channel, group, names, origin)
+    if "attitude" not in layout:
+        _take(layout, "attitude", EULER, names, origin)
+    for channel, pattern in _ROTOR.items():
+        numbers = sorted(int(m[1]) for m in map(pattern.fullmatch, names) if m)
+        if numbers and numbers != list(range(1, len(numbers) + 1)):
+            raise LogError(f"{origin}: rotor columns numbered {numbers}", "1, 2, 3 … without a hole")
+        if numbers:
+            layout[channel] = tuple(f"{'w' if channel == 'rotor_speed' else 'u'}{i}" for i in numbers)
+    if not layout:
+        raise LogError(f"{origin}: none of the columns {', '.join(names)[:120]} is known", ", ".join(_known()))
+    used = {"t", *EULER, *(c for columns in layout.values() for c in columns)}
+    return layout, [n for n in names if n not in used]
+
+
+def _take(
+    layout: dict[str, tuple[str, ...]], channel: str, group: tuple[str, ...], names: list[str], origin: str
+) -> None:
+    missing = [c for c in group if c not in names]
+    if not missing:
+        layout[channel] = group
+    elif len(missing) < len(group):
+        raise LogError(f"{origin}: {channel} lacks column {', '.join(missing)}", "all of " + " ".join(group))
+
+
+def _table(path: Path, width: int, delimiter: str) -> tuple[FloatArray, list[str]]:
+    """Reads the numbers in blocks; a line that does not fit is dropped and counted."""
+    rows = array("d")
+    bad: list[int] = []
+    cut = False
+    for number, lines, unfinished in _blocks(path):
+        if unfinished and _looks_cut(lines):
+            lines, cut = lines[:-1], True
+        try:
+            block = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None) if lines else np.empty((0, width))
+        except ValueError:
+            block = _line_by_line(lines, number, width, delimiter, bad)
+        if block.shape[1] != width:
+            block = _line_by_line(lines, number, width, delimiter, bad)
+        rows.frombytes(np.ascontiguousarray(block).tobytes())
+    notes = []
+    if bad:
+        notes.append(f"{len(bad)} lines with missing or unreadable cells dropped (first: line {bad[0]})")
+    if cut:
+        notes.append("the last line is cut short: dropped")
+    return np.frombuffer(rows, dtype=np.float64).reshape(-1, width), notes
+
+
+def _blocks(path: Path) -> Iterator[tuple[int, list[str], bool]]:
+    """Yields line number, up to `_LINES` data lines, and whether the last of them lacks its line end."""
+    lines: list[str] = []
+    seen_header, first, last = False, 0, ""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        for number, last in enumerate(file, 1):
+            if not last.strip() or last.lstrip().startswith("#"):
+                continue
+            if not seen_header:
+                seen_header, first = True, number + 1
+                continue
+            lines.append(last)
+            if len(lines) == _LINES:
+                yield first, lines, False
+                lines, first = [], number + 1
+    yield first, lines, bool(lines) and not last.endswith("\n")
+
+
+def _looks_cut(lines: list[str]) -> bool:
+    """A last line without line end whose last number is shorter than in the lines before: its digits may be missing."""
+    width = [len(line.rstrip().rpartition(",")[2]) for line in lines[-20:]]
+    return len(width) > 1 and width[-1] < min(width[:-1])
+
+
+def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad: list[int]) -> FloatArray:
+    good: list[list[float]] = []
+    for number, line in enumerate(lines, first):
+        cells = line.rstrip("\r\n").split(delimiter)
+        try:
+            values = [float(cell) if cell.strip().strip('"') else float("nan") for cell in cells]
+        except ValueError:
+            values = []
+        if len(values) == width:
+            good.append(values)
+        else:
+            bad.append(number)
+    return np.array(good, dtype=np.float64).reshape(-1, width)
+
+
+def _recording_time(raw: FloatArray, clock: LogClock) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Runs the stamps through the clock; returns the times of the accepted rows and which rows those are."""
+    steps = np.diff(raw)
+    if np.isfinite(raw).all() and (len(raw) < 2 or (steps.min() > -0.5 and steps.max() < 10.0)):
+        return raw, np.ones(len(raw), dtype=np.bool_)
+    times = [clock.time(float(stamp)) for stamp in raw]
+    accepted = np.array([time is not None for time in times])
+    return np.array([time for time in times if time is not None], dtype=np.float64), accepted
+
+
+def _uniform_step(channels: dict[str, Channel]) -> float | None:
+    """Returns the step [s] when every channel lies on one uniform grid (gaps aside), else None."""
+    longest = max(channels.values(), key=lambda c: len(c.t))
+    if len(longest.t) < 3:
+        return None
+    step = sample_period(longest.t)
+    steps = np.diff(longest.t)
+    steps = steps[steps < 1.5 * step]
+    same_rows = all(len(c.t) == len(longest.t) for c in channels.values())
+    return float(step) if same_rows and np.abs(steps - step).max() < COINCIDENT * step else None

@@ -1,0 +1,80 @@
+"""Frames and units at the door of the core: ROS (ENU, FLU) and degrees become NED, FRD and SI.
+
+All functions take arrays with one sample a row and return new arrays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+GRAVITY = 9.80665
+"""Standard gravity [m/s^2], the unit of accelerometers that count in g."""
+_HALF = np.sqrt(0.5)
+
+
+def flip_body(vectors: FloatArray) -> FloatArray:
+    """Turns body vectors between FLU and FRD (its own inverse), shape (n, 3)."""
+    return np.asarray(vectors * np.array([1.0, -1.0, -1.0]))
+
+
+def flip_world(vectors: FloatArray) -> FloatArray:
+    """Turns world vectors between ENU and NED (its own inverse), shape (n, 3)."""
+    return np.asarray(vectors[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]))
+
+
+def flip_attitude(q: FloatArray) -> FloatArray:
+    """Turns attitudes between FLU->ENU and FRD->NED, quaternions wxyz, shape (n, 4).
+
+    q' = q_world q q_body with q_world = (0, 1, 1, 0)/sqrt(2) and q_body = (0, 1, 0, 0), in closed form.  Twice gives
+    -q, the same attitude.
+    """
+    w, x, y, z = q.T
+    return np.asarray(-_HALF * np.column_stack([w + z, x + y, x - y, w - z]))
+
+
+def from_euler(angles: FloatArray) -> FloatArray:
+    """Turns roll, pitch, yaw [rad] (z-y-x), shape (n, 3), into quaternions wxyz body to world, shape (n, 4)."""
+    half = 0.5 * angles
+    (cr, cp, cy), (sr, sp, sy) = np.cos(half).T, np.sin(half).T
+    return np.column_stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def to_euler(q: FloatArray) -> FloatArray:
+    """Turns quaternions wxyz, shape (n, 4), into roll, pitch, yaw [rad], shape (n, 3)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.column_stack([roll, pitch, yaw])
+
+
+def continuous_sign(q: FloatArray) -> FloatArray:
+    """Chooses signs so that neighbouring quaternions are less than half a turn apart; the first keeps its own."""
+    if len(q) < 2:
+        return q
+    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+
+
+def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Returns the quaternions with those off unit length by more than 1e-3 normalised, and which rows are attitudes.
+
+    Rows of length below 0.5 or above 2 (zeros, garbage) are no attitudes.
+    """
+    norm = np.linalg.norm(q, axis=1)
+    good = (norm > 0.5) & (norm < 2.0)
+    off = good & (np.abs(norm - 1.0) > 1e-3)
+    if off.any():
+        q = q.copy()
+        q[off] /= norm[off, None]
+    return q, good

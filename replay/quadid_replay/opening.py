@@ -1,0 +1,47 @@
+"""The one door for logs: `open_log`."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from quadid.errors import LogError
+from quadid.window import Recording
+from quadid_replay.recognise import ALLOWED, HEAD_BYTES, recognise
+
+
+def open_log(path: str | Path, preset: str = "auto") -> Recording:
+    """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
+
+    Args:
+        path: the file; its format is told by its content, never by its suffix.
+        preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
+
+    Raises:
+        LogError: no such file, a directory, an empty file, an unknown format, or nothing readable in it.
+    """
+    file = Path(path)
+    head, sha256 = _head_and_hash(file)
+    kind = recognise(head, file.name)
+    if kind == "csv":
+        from quadid_replay.csv_reader import read_csv
+
+        return read_csv(file, sha256)
+    raise LogError(f"{file.name}: {kind} is not supported yet", "CSV")
+
+
+def _head_and_hash(file: Path) -> tuple[bytes, str]:
+    if file.is_dir():
+        raise LogError(f"{file} is a directory", ALLOWED, "name one log file; for a folder use `quadid fleet`")
+    digest = hashlib.sha256()
+    head = b""
+    try:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                head = head or block[:HEAD_BYTES]
+                digest.update(block)
+    except FileNotFoundError as error:
+        raise LogError(f"no file {file}", ALLOWED, "check the path") from error
+    except OSError as error:
+        raise LogError(f"{file} cannot be read ({error.strerror})", ALLOWED, "check its permissions") from error
+    return head, digest.hexdigest()

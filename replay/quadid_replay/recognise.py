@@ -1,0 +1,114 @@
+"""Tells the format of a log from its first bytes; the suffix is never believed."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from quadid.errors import LogError
+
+Format = Literal["mcap", "tlog", "dataflash", "ulog", "csv"]
+HEAD_BYTES = 65536
+"""How much of the file is looked at."""
+ALLOWED = "ROS 2 MCAP, MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, CSV with a header row and a column t"
+
+_MAGIC: tuple[tuple[bytes, Format], ...] = (
+    (b"\x89MCAP0\r\n", "mcap"),
+    (b"ULog\x01\x12\x35", "ulog"),
+)
+_FOREIGN: tuple[tuple[bytes, str, str], ...] = (
+    (b"#ROSBAG V2.0", "a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst DIR, then to MCAP"),
+    (b"SQLite format 3\x00", "a rosbag2 SQLite database", "convert it: ros2 bag convert with output storage mcap"),
+    (b"\x1f\x8b", "gzip-compressed", "unpack it: gunzip FILE"),
+    (b"\x28\xb5\x2f\xfd", "zstd-compressed", "unpack it: zstd -d FILE"),
+    (b"PK\x03\x04", "a zip archive", "unpack it: unzip FILE"),
+    (b"\x89HDF\r\n", "HDF5", "export it as CSV"),
+    (b"MATLAB 5.0", "a MATLAB file", "export it as CSV, or give the .bin it was made from"),
+    (b"FMT, 128,", "a DataFlash text log", "give the binary .bin log"),
+)
+_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
+
+
+def recognise(head: bytes, name: str) -> Format:
+    """Returns the format of a log that begins with `head`.
+
+    Args:
+        head: first `HEAD_BYTES` of the file (fewer if it is short).
+        name: file name, for errors only.
+
+    Raises:
+        LogError: none of the known formats; says what it is when that is known.
+    """
+    if not head:
+        raise LogError(f"{name}: empty file", ALLOWED, "check that the logger finished writing, then copy it again")
+    for magic, kind in _MAGIC:
+        if head.startswith(magic):
+            return kind
+    for magic, what, fix in _FOREIGN:
+        if head.startswith(magic):
+            raise LogError(f"{name}: {what}", ALLOWED, fix)
+    if _is_dataflash(head):
+        return "dataflash"
+    if _is_tlog(head):
+        return "tlog"
+    if _is_csv(head):
+        return "csv"
+    shown = head[:8].hex(" ")
+    raise LogError(f"{name}: unknown format (begins with {shown})", ALLOWED, "see docs/logs.md for what each needs")
+
+
+def _is_dataflash(head: bytes) -> bool:
+    """Two format messages (A3 95 80) 89 bytes apart, or one at the very start."""
+    if head[:3] == b"\xa3\x95\x80":
+        return True
+    at = head.find(b"\xa3\x95\x80")
+    return at >= 0 and head[at + 89 : at + 91] == b"\xa3\x95"
+
+
+def _is_tlog(head: bytes) -> bool:
+    """An 8-byte receive time (microseconds, big endian) before a MAVLink frame, twice in a row where there is room."""
+    for at in range(0, min(len(head) - 12, 2048)):
+        length = _frame_length(head, at)
+        if length is None:
+            continue
+        following = at + length
+        if following + 12 > len(head) or _frame_length(head, following) is not None:
+            return at == 0 or following + 12 <= len(head)
+    return False
+
+
+def _frame_length(head: bytes, at: int) -> int | None:
+    """Returns the length of receive time and frame at `at`, or None when there is no such thing."""
+    if at + 12 > len(head) or head[at + 8] not in (0xFE, 0xFD):
+        return None
+    stamp = int.from_bytes(head[at : at + 8], "big")
+    if not _EARLIEST_US < stamp < _LATEST_US:
+        return None
+    payload = head[at + 9]
+    if head[at + 8] == 0xFE:
+        return 8 + 8 + payload
+    return 8 + 12 + payload + (13 if head[at + 10] & 1 else 0)
+
+
+def _is_csv(head: bytes) -> bool:
+    """Text whose first line that is not a comment holds a column called t."""
+    line = header_line(head)
+    if line is None:
+        return False
+    cells = line.replace(";", ",").replace("\t", ",").split(",")
+    return "t" in [cell.strip().strip('"') for cell in cells]
+
+
+def header_line(head: bytes) -> str | None:
+    """Returns the first line that is neither empty nor a comment (#), or None when the bytes are not text."""
+    if b"\x00" in head:
+        return None
+    try:
+        text = head.decode("utf-8-sig", errors="strict")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # more than a character cut at the end of the head
+            return None
+        text = head[: error.start].decode("utf-8-sig")
+    for line in text.splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            return line
+    return None
