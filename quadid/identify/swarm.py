@@ -139,7 +139,7 @@ class Swarm:
             ParameterError: a box, a number of particles or initial points that make no swarm.
         """
         self.options = options or SwarmOptions()
-        self._lower, self._upper = _checked_box(lower, upper)
+        self._lower, self._upper = checked_box(lower, upper)
         if particles < 1:
             raise ParameterError(f"{particles} particles", "at least 1")
         self._width = self._upper - self._lower
@@ -152,7 +152,7 @@ class Swarm:
         self._place_initial_points()
         self._v = target - self._x
         self._own_best, self._own_cost = self._x.copy(), np.full(particles, np.inf)
-        self.best, self.best_cost = _read_only(self._x[0]), math.inf
+        self.best, self.best_cost = read_only(self._x[0]), math.inf
         self.stop, self.iteration, self.evaluations = Stop.RUNNING, 0, 0
         self._turn, self._placed = slice(0, particles), True
         self._mark, self._idle = math.inf, 0
@@ -186,7 +186,7 @@ class Swarm:
         self._own_cost[self._turn][better] = array[better]
         leader = int(np.argmin(self._own_cost))
         if self._own_cost[leader] < self.best_cost:
-            self.best, self.best_cost = _read_only(self._own_best[leader]), float(self._own_cost[leader])
+            self.best, self.best_cost = read_only(self._own_best[leader]), float(self._own_cost[leader])
         self._advance()
 
     @property
@@ -264,13 +264,15 @@ class Swarm:
             self.stop = Stop.RUNNING
 
 
-def _read_only(values: FloatArray) -> FloatArray:
+def read_only(values: FloatArray) -> FloatArray:
+    """Returns a copy that refuses to be written to, same shape."""
     copy = values.copy()
     copy.setflags(write=False)
     return copy
 
 
-def _checked_box(lower: ArrayLike, upper: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def checked_box(lower: ArrayLike, upper: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Returns both bounds as arrays, shape (n,); raises ParameterError unless they are finite and lower < upper."""
     low, high = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     if low.ndim != 1 or low.shape != high.shape or not low.size:
         raise ParameterError(f"bounds of shape {low.shape} and {high.shape}", "two equal shapes (n,), n at least 1")

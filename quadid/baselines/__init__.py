@@ -1,0 +1,1 @@
+"""What the swarm is compared with: other optimisers, and black-box subspace models."""
