@@ -1,7 +1,9 @@
 """The hot kernel: rolls out many parameter vectors ("lanes") over the segments of one window.
 
 Lanes are the innermost, fixed-length axis of every array, so that the compiler turns each lane loop into SIMD
-instructions: no trigonometry in the loops, no allocation, no branch that depends on a lane.
+instructions: no trigonometry in the loops, no allocation, no branch that depends on a lane.  Work arrays are flat,
+with row times LANES plus lane written out: with a constant stride the compiler can prove that rows do not overlap,
+without it the loops stay scalar.
 
 Each segment starts from its own initial state, `n_pre` steps before its first scored sample, and ends one step after
 the last, because a logged acceleration is the mean over one sample centred on its time.  Rotor speeds do not depend on
@@ -40,9 +42,11 @@ RING = 16
     C_INVM, C_MASS, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_WN, C_WE, C_CGX, C_CGY, C_W0,
     C_RX, C_RY, C_RZ, C_SIG, C_EC, C_ES, C_KAP, C_ECH, C_ESH, C_AHRS, C_GROUND,
     C_SAG, C_DT_TIME, C_DT_FRAC, C_MT_TIME, C_MT_FRAC,
-    C_E, C_E1, C_E2, C_E3, C_H,
-) = range(53)  # fmt: skip
-N_CONST = C_E + 5 * 4
+    C_TAU, C_SHIFT, C_PART, C_E, C_E1, C_E2, C_E3, C_H,
+) = range(56)  # fmt: skip
+C_GAIN = C_E + 5 * 4
+MAX_ROTORS = 16
+N_CONST = C_GAIN + MAX_ROTORS
 # Rows of the rotor aggregates of one half step.
 A_S2, A_X2, A_Y2, A_Z2, A_S1, A_O1, A_DO, A_G, A_M = range(9)
 N_AGG = 9
@@ -56,66 +60,68 @@ def lane_constants(theta: FloatArray, mass: float, rotors: int, dt: float, reach
     """Derives the per-lane constants from parameter vectors.
 
     Args:
-        theta: shape (lanes, size), see `quadid.model.layout`.
+        theta: shape (size * LANES,), see `quadid.model.layout`.
         mass: [kg].
         rotors: number of rotors.
         dt: step [s].
         reach: half the smallest distance between rotors [m], scales ground effect.
-        out: shape (N_CONST, LANES), written.
+        out: shape (N_CONST * LANES,), written.
     """
     for lane in range(LANES):
-        th = theta[lane]
-        jxx, jyy, jzz = th[ix.JXX], th[ix.JYY], th[ix.JZZ]
-        jxy, jxz, jyz = -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ]
+        jxx, jyy, jzz = theta[ix.JXX * LANES + lane], theta[ix.JYY * LANES + lane], theta[ix.JZZ * LANES + lane]
+        jxy, jxz, jyz = -theta[ix.JXY * LANES + lane], -theta[ix.JXZ * LANES + lane], -theta[ix.JYZ * LANES + lane]
         det = jxx * (jyy * jzz - jyz * jyz) - jxy * (jxy * jzz - jyz * jxz) + jxz * (jxy * jyz - jyy * jxz)
-        out[C_IXX, lane] = (jyy * jzz - jyz * jyz) / det
-        out[C_IYY, lane] = (jxx * jzz - jxz * jxz) / det
-        out[C_IZZ, lane] = (jxx * jyy - jxy * jxy) / det
-        out[C_IXY, lane] = (jxz * jyz - jxy * jzz) / det
-        out[C_IXZ, lane] = (jxy * jyz - jxz * jyy) / det
-        out[C_IYZ, lane] = (jxy * jxz - jxx * jyz) / det
-        out[C_JXX, lane], out[C_JYY, lane], out[C_JZZ, lane] = jxx, jyy, jzz
-        out[C_JXY, lane], out[C_JXZ, lane], out[C_JYZ, lane] = jxy, jxz, jyz
-        out[C_B, lane], out[C_D, lane], out[C_JR, lane], out[C_JSPIN, lane] = (
-            th[ix.B], th[ix.D], th[ix.JR], th[ix.JSPIN],
+        out[C_IXX * LANES + lane] = (jyy * jzz - jyz * jyz) / det
+        out[C_IYY * LANES + lane] = (jxx * jzz - jxz * jxz) / det
+        out[C_IZZ * LANES + lane] = (jxx * jyy - jxy * jxy) / det
+        out[C_IXY * LANES + lane] = (jxz * jyz - jxy * jzz) / det
+        out[C_IXZ * LANES + lane] = (jxy * jyz - jxz * jyy) / det
+        out[C_IYZ * LANES + lane] = (jxy * jxz - jxx * jyz) / det
+        out[C_JXX * LANES + lane], out[C_JYY * LANES + lane], out[C_JZZ * LANES + lane] = jxx, jyy, jzz
+        out[C_JXY * LANES + lane], out[C_JXZ * LANES + lane], out[C_JYZ * LANES + lane] = jxy, jxz, jyz
+        out[C_B * LANES + lane], out[C_D * LANES + lane], out[C_JR * LANES + lane], out[C_JSPIN * LANES + lane] = (
+            theta[ix.B * LANES + lane], theta[ix.D * LANES + lane], theta[ix.JR * LANES + lane], theta[ix.JSPIN * LANES + lane],
         )  # fmt: skip
-        out[C_INVM, lane], out[C_MASS, lane] = 1.0 / mass, mass
-        out[C_HOVER, lane] = 1.0 / (rotors * math.sqrt(mass * GRAVITY / (abs(th[ix.B]) * rotors)))
-        out[C_KX, lane], out[C_KY, lane], out[C_KZ, lane], out[C_CPAR, lane] = (
-            th[ix.KX], th[ix.KY], th[ix.KZ], th[ix.CPAR],
+        out[C_INVM * LANES + lane], out[C_MASS * LANES + lane] = 1.0 / mass, mass
+        out[C_HOVER * LANES + lane] = 1.0 / (rotors * math.sqrt(mass * GRAVITY / (abs(theta[ix.B * LANES + lane]) * rotors)))
+        out[C_KX * LANES + lane], out[C_KY * LANES + lane], out[C_KZ * LANES + lane], out[C_CPAR * LANES + lane] = (
+            theta[ix.KX * LANES + lane], theta[ix.KY * LANES + lane], theta[ix.KZ * LANES + lane], theta[ix.CPAR * LANES + lane],
         )  # fmt: skip
-        out[C_HX, lane], out[C_HY, lane], out[C_LP, lane], out[C_MQ, lane] = th[ix.HX], th[ix.HY], th[ix.LP], th[ix.MQ]
-        out[C_WN, lane], out[C_WE, lane] = th[ix.WN], th[ix.WE]
-        out[C_CGX, lane], out[C_CGY, lane], out[C_W0, lane] = th[ix.CGX], th[ix.CGY], th[ix.DEAD_SPEED]
-        out[C_RX, lane], out[C_RY, lane], out[C_RZ, lane] = (
-            th[ix.LAX] - th[ix.CGX], th[ix.LAY] - th[ix.CGY], th[ix.LAZ],
+        out[C_HX * LANES + lane], out[C_HY * LANES + lane], out[C_LP * LANES + lane], out[C_MQ * LANES + lane] = theta[ix.HX * LANES + lane], theta[ix.HY * LANES + lane], theta[ix.LP * LANES + lane], theta[ix.MQ * LANES + lane]
+        out[C_WN * LANES + lane], out[C_WE * LANES + lane] = theta[ix.WN * LANES + lane], theta[ix.WE * LANES + lane]
+        out[C_CGX * LANES + lane], out[C_CGY * LANES + lane], out[C_W0 * LANES + lane] = theta[ix.CGX * LANES + lane], theta[ix.CGY * LANES + lane], theta[ix.DEAD_SPEED * LANES + lane]
+        out[C_RX * LANES + lane], out[C_RY * LANES + lane], out[C_RZ * LANES + lane] = (
+            theta[ix.LAX * LANES + lane] - theta[ix.CGX * LANES + lane], theta[ix.LAY * LANES + lane] - theta[ix.CGY * LANES + lane], theta[ix.LAZ * LANES + lane],
         )  # fmt: skip
-        period = max(th[ix.IMU_PERIOD], 1e-7)
+        period = max(theta[ix.IMU_PERIOD * LANES + lane], 1e-7)
         sigma = 2.0 * math.pi / period / math.sqrt(2.0)
-        out[C_SIG, lane], out[C_KAP, lane] = sigma, 1.0 / sigma
-        out[C_EC, lane] = math.exp(-sigma * dt) * math.cos(sigma * dt)
-        out[C_ES, lane] = math.exp(-sigma * dt) * math.sin(sigma * dt)
-        out[C_ECH, lane] = math.exp(-0.5 * sigma * dt) * math.cos(0.5 * sigma * dt)
-        out[C_ESH, lane] = math.exp(-0.5 * sigma * dt) * math.sin(0.5 * sigma * dt)
-        out[C_AHRS, lane] = th[ix.AHRS_K]
-        out[C_GROUND, lane] = (th[ix.GROUND] * reach / 4.0) * abs(th[ix.GROUND] * reach / 4.0)
-        out[C_SAG, lane] = th[ix.SAG]
-        out[C_DT_TIME, lane], out[C_DT_FRAC, lane] = th[ix.DROP_TIME], th[ix.DROP_FRACTION]
-        out[C_MT_TIME, lane], out[C_MT_FRAC, lane] = th[ix.MASS_TIME], th[ix.MASS_FRACTION]
+        out[C_SIG * LANES + lane], out[C_KAP * LANES + lane] = sigma, 1.0 / sigma
+        out[C_EC * LANES + lane] = math.exp(-sigma * dt) * math.cos(sigma * dt)
+        out[C_ES * LANES + lane] = math.exp(-sigma * dt) * math.sin(sigma * dt)
+        out[C_ECH * LANES + lane] = math.exp(-0.5 * sigma * dt) * math.cos(0.5 * sigma * dt)
+        out[C_ESH * LANES + lane] = math.exp(-0.5 * sigma * dt) * math.sin(0.5 * sigma * dt)
+        out[C_AHRS * LANES + lane] = theta[ix.AHRS_K * LANES + lane]
+        out[C_GROUND * LANES + lane] = (theta[ix.GROUND * LANES + lane] * reach / 4.0) * abs(theta[ix.GROUND * LANES + lane] * reach / 4.0)
+        out[C_SAG * LANES + lane] = theta[ix.SAG * LANES + lane]
+        out[C_DT_TIME * LANES + lane], out[C_DT_FRAC * LANES + lane] = theta[ix.DROP_TIME * LANES + lane], theta[ix.DROP_FRACTION * LANES + lane]
+        out[C_MT_TIME * LANES + lane], out[C_MT_FRAC * LANES + lane] = theta[ix.MASS_TIME * LANES + lane], theta[ix.MASS_FRACTION * LANES + lane]
         # The delayed input switches (or bends) once within a step, at fraction f; four pieces, two a half step.
-        tau = max(th[ix.TAU], 1e-9)
-        delay = max(th[ix.DELAY], 0.0) / dt
+        tau = max(theta[ix.TAU * LANES + lane], 1e-9)
+        delay = max(theta[ix.DELAY * LANES + lane], 0.0) / dt
         f = delay - math.floor(delay)
+        out[C_TAU * LANES + lane], out[C_SHIFT * LANES + lane], out[C_PART * LANES + lane] = tau, math.floor(delay), f
+        for r in range(rotors):
+            out[(C_GAIN + r) * LANES + lane] = 1.0 - theta[(ix.LOSS + r) * LANES + lane]
         cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
         for piece in range(4):
             h = cuts[piece] * dt
             e = math.exp(-h / tau)
             row = C_E + 5 * piece
-            out[row, lane] = e
-            out[row + 1, lane] = tau * (1.0 - e)
-            out[row + 2, lane] = tau * (tau - (tau + h) * e)
-            out[row + 3, lane] = 0.5 * tau * (1.0 - e * e)
-            out[row + 4, lane] = h
+            out[row * LANES + lane] = e
+            out[(row + 1) * LANES + lane] = tau * (1.0 - e)
+            out[(row + 2) * LANES + lane] = tau * (tau - (tau + h) * e)
+            out[(row + 3) * LANES + lane] = 0.5 * tau * (1.0 - e * e)
+            out[(row + 4) * LANES + lane] = h
 
 
 @nb.njit(inline="always")
@@ -130,87 +136,125 @@ def _piece(w0, a, s, tau, e, e1, e2, e3, h):  # type: ignore[no-untyped-def]
 
 @nb.njit(**_jit)
 def rotors_step(
-    u: FloatArray, k: int, held: bool, theta: FloatArray, con: FloatArray, geometry: FloatArray, dt: float,
-    w: FloatArray, agg: FloatArray, per_lane: bool,
+    u: FloatArray, k: int, held: bool, con: FloatArray, geometry: FloatArray, dt: float, w: FloatArray,
+    agg: FloatArray, inputs: FloatArray, per_lane: bool,
 ) -> None:  # fmt: skip
     """Advances all rotors over step k and sums their moments for both half steps.
+
+    The input, delayed by (j + f) dt, switches (held) or bends (linear) once, at f dt after t_k: before that it is
+    a0 + s0 t, after it a1 + s1 t.  Each half step is therefore two pieces, one of which may have no length.
 
     Args:
         u: shape (n, rotors), input [rad/s].
         k: step, from t_k to t_k+1.
         held: the input acts held, else linear between samples.
-        theta, con: parameter vectors and their constants.
+        con: lane constants.
         geometry: shape (rotors, 3): x, y [m], spin.
         dt: step [s].
-        w: rotor speeds at the start, (rotors, LANES), advanced in place.
-        agg: shape (2, N_AGG, LANES), rows A_S2 .. A_DO written: means over each half step.
+        w: rotor speeds at the start, (rotors * LANES,), advanced in place.
+        agg: shape (2 * N_AGG * LANES,), rows A_S2 .. A_DO written: means over each half step.
+        inputs: work space (6 * LANES,).
         per_lane: False when all lanes share lag, delay, dead speed and losses: lane 0 is computed and spread.
     """
     n, rotors = u.shape
-    lanes = LANES if per_lane else 1
     inv = 2.0 / dt
     for half in range(2):
-        for row in range(7):
-            for lane in range(LANES):
-                agg[half, row, lane] = 0.0
+        for i in range(7 * LANES):
+            agg[half * N_AGG * LANES + i] = 0.0
     for r in range(rotors):
         x, y, spin = geometry[r, 0], geometry[r, 1], geometry[r, 2]
-        for lane in range(lanes):
-            steps = max(theta[lane, ix.DELAY], 0.0) / dt
-            j = int(math.floor(steps))
-            f = steps - j
-            i0 = min(max(k - j, 0), n - 1)
-            im = min(max(k - j - 1, 0), n - 1)
-            tau = max(theta[lane, ix.TAU], 1e-9)
+        for lane in range(LANES if per_lane else 1):
+            j, f = int(con[C_SHIFT * LANES + lane]), con[C_PART * LANES + lane]
+            i0, im = min(max(k - j, 0), n - 1), min(max(k - j - 1, 0), n - 1)
             if held:
-                a0, s0, a1, s1 = u[im, r], 0.0, u[i0, r], 0.0
+                inputs[lane], inputs[LANES + lane] = u[im, r], 0.0
+                inputs[2 * LANES + lane], inputs[3 * LANES + lane] = u[i0, r], 0.0
             else:
                 ip = min(max(k - j + 1, 0), n - 1)
-                s0 = (u[i0, r] - u[im, r]) / dt
-                s1 = (u[ip, r] - u[i0, r]) / dt
-                a0 = u[im, r] + s0 * (1.0 - f) * dt
-                a1 = u[i0, r]
-            h0, h1, h2, h3 = con[C_H, lane], con[C_H + 5, lane], con[C_H + 10, lane], con[C_H + 15, lane]
-            ws = w[r, lane]
-            # Before the switch the input is a0 + s0 t, after it a1 + s1 t; the piece beside it has no length.
-            p1, p2, we = _piece(
-                ws, a0, s0, tau, con[C_E, lane], con[C_E1, lane], con[C_E2, lane], con[C_E3, lane], h0
-            )
-            o1, o2, wm = _piece(
-                we, a1, s1, tau, con[C_E + 5, lane], con[C_E1 + 5, lane], con[C_E2 + 5, lane], con[C_E3 + 5, lane], h1
-            )
-            m1a, m2a = (p1 + o1) * inv, (p2 + o2) * inv
-            p1, p2, we = _piece(
-                wm, a0 + s0 * h0, s0, tau, con[C_E + 10, lane], con[C_E1 + 10, lane], con[C_E2 + 10, lane],
-                con[C_E3 + 10, lane], h2,
-            )  # fmt: skip
-            o1, o2, wn = _piece(
-                we, a1 + s1 * h1, s1, tau, con[C_E + 15, lane], con[C_E1 + 15, lane], con[C_E2 + 15, lane],
-                con[C_E3 + 15, lane], h3,
-            )  # fmt: skip
-            m1b, m2b = (p1 + o1) * inv, (p2 + o2) * inv
-            dead = con[C_W0, lane]
-            gain = 1.0 - theta[lane, ix.LOSS + r]
-            for half in range(2):
-                m1 = m1a if half == 0 else m1b
-                m2 = m2a if half == 0 else m2b
-                lift = gain * (m2 - 2.0 * dead * m1 + dead * dead)
-                agg[half, A_S2, lane] += lift
-                agg[half, A_X2, lane] += x * lift
-                agg[half, A_Y2, lane] += y * lift
-                agg[half, A_Z2, lane] += spin * gain * m2
-                agg[half, A_S1, lane] += m1
-                agg[half, A_O1, lane] += spin * m1
-                agg[half, A_DO, lane] += spin * ((wm - ws) if half == 0 else (wn - wm)) * inv
-            w[r, lane] = wn
+                slope = (u[i0, r] - u[im, r]) / dt
+                inputs[lane], inputs[LANES + lane] = u[im, r] + slope * (1.0 - f) * dt, slope
+                inputs[2 * LANES + lane], inputs[3 * LANES + lane] = u[i0, r], (u[ip, r] - u[i0, r]) / dt
+        for lane in range(LANES):
+            inputs[4 * LANES + lane] = con[(C_GAIN + r) * LANES + lane]
+            inputs[5 * LANES + lane] = w[r * LANES + lane]
+        if per_lane:
+            for lane in range(LANES):
+                _one_rotor(lane, inv, x, y, spin, con, inputs, agg)
+            for lane in range(LANES):
+                w[r * LANES + lane] = inputs[5 * LANES + lane]
+        else:
+            _one_rotor(0, inv, x, y, spin, con, inputs, agg)
+            for lane in range(LANES):
+                w[r * LANES + lane] = inputs[5 * LANES]
     if not per_lane:
-        for r in range(rotors):
-            for lane in range(1, LANES):
-                w[r, lane] = w[r, 0]
         for half in range(2):
             for row in range(7):
+                base = (half * N_AGG + row) * LANES
                 for lane in range(1, LANES):
-                    agg[half, row, lane] = agg[half, row, 0]
+                    agg[base + lane] = agg[base]
+
+
+@nb.njit(inline="always")
+def _one_rotor(lane, inv, x, y, spin, con, inputs, agg):  # type: ignore[no-untyped-def]
+    """Adds one rotor of one lane to the aggregates of both half steps.
+
+    Few arrays, because the compiler checks every pair for overlap and gives up beyond a handful of pairs.
+    """
+    # All loads first: a load after a store to the same array stops the vectoriser.
+    g0 = agg[A_S2 * LANES + lane]
+    g1 = agg[A_X2 * LANES + lane]
+    g2 = agg[A_Y2 * LANES + lane]
+    g3 = agg[A_Z2 * LANES + lane]
+    g4 = agg[A_S1 * LANES + lane]
+    g5 = agg[A_O1 * LANES + lane]
+    g6 = agg[A_DO * LANES + lane]
+    g7 = agg[(N_AGG + A_S2) * LANES + lane]
+    g8 = agg[(N_AGG + A_X2) * LANES + lane]
+    g9 = agg[(N_AGG + A_Y2) * LANES + lane]
+    g10 = agg[(N_AGG + A_Z2) * LANES + lane]
+    g11 = agg[(N_AGG + A_S1) * LANES + lane]
+    g12 = agg[(N_AGG + A_O1) * LANES + lane]
+    g13 = agg[(N_AGG + A_DO) * LANES + lane]
+    a0, s0 = inputs[lane], inputs[LANES + lane]
+    a1, s1 = inputs[2 * LANES + lane], inputs[3 * LANES + lane]
+    tau, dead, gain = con[C_TAU * LANES + lane], con[C_W0 * LANES + lane], inputs[4 * LANES + lane]
+    h0, h1 = con[C_H * LANES + lane], con[(C_H + 5) * LANES + lane]
+    ws = inputs[5 * LANES + lane]
+    p1, p2, we = _piece(
+        ws, a0, s0, tau, con[C_E * LANES + lane], con[C_E1 * LANES + lane], con[C_E2 * LANES + lane],
+        con[C_E3 * LANES + lane], h0,
+    )  # fmt: skip
+    o1, o2, wm = _piece(
+        we, a1, s1, tau, con[(C_E + 5) * LANES + lane], con[(C_E1 + 5) * LANES + lane],
+        con[(C_E2 + 5) * LANES + lane], con[(C_E3 + 5) * LANES + lane], h1,
+    )  # fmt: skip
+    m1a, m2a = (p1 + o1) * inv, (p2 + o2) * inv
+    p1, p2, we = _piece(
+        wm, a0 + s0 * h0, s0, tau, con[(C_E + 10) * LANES + lane], con[(C_E1 + 10) * LANES + lane],
+        con[(C_E2 + 10) * LANES + lane], con[(C_E3 + 10) * LANES + lane], con[(C_H + 10) * LANES + lane],
+    )  # fmt: skip
+    o1, o2, wn = _piece(
+        we, a1 + s1 * h1, s1, tau, con[(C_E + 15) * LANES + lane], con[(C_E1 + 15) * LANES + lane],
+        con[(C_E2 + 15) * LANES + lane], con[(C_E3 + 15) * LANES + lane], con[(C_H + 15) * LANES + lane],
+    )  # fmt: skip
+    m1b, m2b = (p1 + o1) * inv, (p2 + o2) * inv
+    lift_a = gain * (m2a - 2.0 * dead * m1a + dead * dead)
+    lift_b = gain * (m2b - 2.0 * dead * m1b + dead * dead)
+    agg[A_S2 * LANES + lane] = g0 + lift_a
+    agg[A_X2 * LANES + lane] = g1 + x * lift_a
+    agg[A_Y2 * LANES + lane] = g2 + y * lift_a
+    agg[A_Z2 * LANES + lane] = g3 + spin * gain * m2a
+    agg[A_S1 * LANES + lane] = g4 + m1a
+    agg[A_O1 * LANES + lane] = g5 + spin * m1a
+    agg[A_DO * LANES + lane] = g6 + spin * (wm - ws) * inv
+    agg[(N_AGG + A_S2) * LANES + lane] = g7 + lift_b
+    agg[(N_AGG + A_X2) * LANES + lane] = g8 + x * lift_b
+    agg[(N_AGG + A_Y2) * LANES + lane] = g9 + y * lift_b
+    agg[(N_AGG + A_Z2) * LANES + lane] = g10 + spin * gain * m2b
+    agg[(N_AGG + A_S1) * LANES + lane] = g11 + m1b
+    agg[(N_AGG + A_O1) * LANES + lane] = g12 + spin * m1b
+    agg[(N_AGG + A_DO) * LANES + lane] = g13 + spin * (wn - wm) * inv
+    inputs[5 * LANES + lane] = wn
 
 
 @nb.njit(**_jit)
@@ -222,10 +266,10 @@ def flight_factors(t: float, span0: float, span1: float, dt: float, con: FloatAr
         ts = t + h * half
         mid = (ts + 0.5 * half - span0) * inv
         for lane in range(LANES):
-            dropped = min(max((ts + half - con[C_DT_TIME, lane]) / half, 0.0), 1.0)
-            loaded = min(max((ts + half - con[C_MT_TIME, lane]) / half, 0.0), 1.0)
-            agg[h, A_G, lane] = (1.0 - con[C_SAG, lane] * mid) * (1.0 - con[C_DT_FRAC, lane] * dropped)
-            agg[h, A_M, lane] = 1.0 / (1.0 + con[C_MT_FRAC, lane] * loaded)
+            dropped = min(max((ts + half - con[C_DT_TIME * LANES + lane]) / half, 0.0), 1.0)
+            loaded = min(max((ts + half - con[C_MT_TIME * LANES + lane]) / half, 0.0), 1.0)
+            agg[(h * N_AGG + A_G) * LANES + lane] = (1.0 - con[C_SAG * LANES + lane] * mid) * (1.0 - con[C_DT_FRAC * LANES + lane] * dropped)
+            agg[(h * N_AGG + A_M) * LANES + lane] = 1.0 / (1.0 + con[C_MT_FRAC * LANES + lane] * loaded)
 
 
 @nb.njit(inline="always")
@@ -246,22 +290,22 @@ def step_core(dt: float, con: FloatArray, agg: FloatArray, x: FloatArray, acc: F
     Args:
         dt: step [s].
         con: lane constants.
-        agg: rotor aggregates of this step, (2, N_AGG, LANES).
-        x: state (N_STATE, LANES): quaternion, rates; advanced in place.
-        acc: shape (2, 3, LANES): mean specific force of both half steps [m/s^2], written.
+        agg: rotor aggregates of this step, (2 * N_AGG * LANES,).
+        x: state (N_STATE * LANES,): quaternion, rates; advanced in place.
+        acc: shape (6 * LANES,): mean specific force of both half steps [m/s^2], written.
     """
     for lane in range(LANES):
-        b, d = con[C_B, lane], con[C_D, lane]
-        ixx, iyy, izz = con[C_IXX, lane], con[C_IYY, lane], con[C_IZZ, lane]
-        jxx, jyy, jzz, jr = con[C_JXX, lane], con[C_JYY, lane], con[C_JZZ, lane], con[C_JR, lane]
-        tx1, tx2 = -b * agg[0, A_Y2, lane], -b * agg[1, A_Y2, lane]
-        ty1, ty2 = b * agg[0, A_X2, lane], b * agg[1, A_X2, lane]
-        tz1, tz2 = d * agg[0, A_Z2, lane], d * agg[1, A_Z2, lane]
-        o1, o2 = jr * agg[0, A_O1, lane], jr * agg[1, A_O1, lane]
-        acc[0, 0, lane], acc[0, 1, lane], acc[0, 2, lane] = 0.0, 0.0, -b * agg[0, A_S2, lane] * con[C_INVM, lane]
-        acc[1, 0, lane], acc[1, 1, lane], acc[1, 2, lane] = 0.0, 0.0, -b * agg[1, A_S2, lane] * con[C_INVM, lane]
-        qw, qx, qy, qz = x[0, lane], x[1, lane], x[2, lane], x[3, lane]
-        p, q, r = x[4, lane], x[5, lane], x[6, lane]
+        b, d = con[C_B * LANES + lane], con[C_D * LANES + lane]
+        ixx, iyy, izz = con[C_IXX * LANES + lane], con[C_IYY * LANES + lane], con[C_IZZ * LANES + lane]
+        jxx, jyy, jzz, jr = con[C_JXX * LANES + lane], con[C_JYY * LANES + lane], con[C_JZZ * LANES + lane], con[C_JR * LANES + lane]
+        tx1, tx2 = -b * agg[A_Y2 * LANES + lane], -b * agg[(1 * N_AGG + A_Y2) * LANES + lane]
+        ty1, ty2 = b * agg[A_X2 * LANES + lane], b * agg[(1 * N_AGG + A_X2) * LANES + lane]
+        tz1, tz2 = d * agg[A_Z2 * LANES + lane], d * agg[(1 * N_AGG + A_Z2) * LANES + lane]
+        o1, o2 = jr * agg[A_O1 * LANES + lane], jr * agg[(1 * N_AGG + A_O1) * LANES + lane]
+        acc[0 * LANES + lane], acc[1 * LANES + lane], acc[2 * LANES + lane] = 0.0, 0.0, -b * agg[A_S2 * LANES + lane] * con[C_INVM * LANES + lane]
+        acc[(1 * 3 + 0) * LANES + lane], acc[(1 * 3 + 1) * LANES + lane], acc[(1 * 3 + 2) * LANES + lane] = 0.0, 0.0, -b * agg[(1 * N_AGG + A_S2) * LANES + lane] * con[C_INVM * LANES + lane]
+        qw, qx, qy, qz = x[0 * LANES + lane], x[1 * LANES + lane], x[2 * LANES + lane], x[3 * LANES + lane]
+        p, q, r = x[4 * LANES + lane], x[5 * LANES + lane], x[6 * LANES + lane]
         cx, cy, cz = (jyy - jzz) * ixx, (jzz - jxx) * iyy, (jxx - jyy) * izz
         # stage 1
         tx, ty, tz, o = 1.5 * tx1 - 0.5 * tx2, 1.5 * ty1 - 0.5 * ty2, 1.5 * tz1 - 0.5 * tz2, 1.5 * o1 - 0.5 * o2
@@ -288,48 +332,48 @@ def step_core(dt: float, con: FloatArray, agg: FloatArray, x: FloatArray, acc: F
         qy += s * (k1y + 2.0 * (k2y + k3y) + k4y)
         qz += s * (k1z + 2.0 * (k2z + k3z) + k4z)
         scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)  # one Newton step to unit length
-        x[0, lane], x[1, lane], x[2, lane], x[3, lane] = qw * scale, qx * scale, qy * scale, qz * scale
-        x[4, lane] = p + s * (a1x + 2.0 * (a2x + a3x) + a4x)
-        x[5, lane] = q + s * (a1y + 2.0 * (a2y + a3y) + a4y)
-        x[6, lane] = r + s * (a1z + 2.0 * (a2z + a3z) + a4z)
+        x[0 * LANES + lane], x[1 * LANES + lane], x[2 * LANES + lane], x[3 * LANES + lane] = qw * scale, qx * scale, qy * scale, qz * scale
+        x[4 * LANES + lane] = p + s * (a1x + 2.0 * (a2x + a3x) + a4x)
+        x[5 * LANES + lane] = q + s * (a1y + 2.0 * (a2y + a3y) + a4y)
+        x[6 * LANES + lane] = r + s * (a1z + 2.0 * (a2z + a3z) + a4z)
 
 
 @nb.njit(inline="always")
 def _body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, s1, o1, do, g, im, con, lane, height_gain):  # type: ignore[no-untyped-def]
     """Right-hand side with every effect: angular acceleration, specific force at the CG, acceleration in NED."""
     # Velocity relative to the air, in body axes.
-    rn, re, rd = vn - con[C_WN, lane], ve - con[C_WE, lane], vd
+    rn, re, rd = vn - con[C_WN * LANES + lane], ve - con[C_WE * LANES + lane], vd
     r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
     r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
     r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
     u = r00 * rn + r10 * re + r20 * rd
     v = r01 * rn + r11 * re + r21 * rd
     w = r02 * rn + r12 * re + r22 * rd
-    share = s1 * con[C_HOVER, lane]
-    speed = con[C_CPAR, lane] * math.sqrt(u * u + v * v + w * w)
-    b, m = con[C_B, lane] * g * height_gain, con[C_MASS, lane]
+    share = s1 * con[C_HOVER * LANES + lane]
+    speed = con[C_CPAR * LANES + lane] * math.sqrt(u * u + v * v + w * w)
+    b, m = con[C_B * LANES + lane] * g * height_gain, con[C_MASS * LANES + lane]
     # Specific force of the unloaded mass; im scales all of it when mass is taken up.
-    thrust = b * s2 * con[C_INVM, lane] + con[C_KZ, lane] * w * share
-    hx, hy = -con[C_KX, lane] * u * share, -con[C_KY, lane] * v * share
+    thrust = b * s2 * con[C_INVM * LANES + lane] + con[C_KZ * LANES + lane] * w * share
+    hx, hy = -con[C_KX * LANES + lane] * u * share, -con[C_KY * LANES + lane] * v * share
     sx, sy, sz = (hx - speed * u) * im, (hy - speed * v) * im, (-thrust - speed * w) * im
-    jr = con[C_JR, lane] * o1
-    tx = -b * (y2 - con[C_CGY, lane] * s2) + m * con[C_HY, lane] * hy + jr * q
-    ty = b * (x2 - con[C_CGX, lane] * s2) - m * con[C_HX, lane] * hx - jr * p
-    tz = con[C_D, lane] * g * z2 + con[C_JSPIN, lane] * do
-    jxx, jyy, jzz = con[C_JXX, lane], con[C_JYY, lane], con[C_JZZ, lane]
-    jxy, jxz, jyz = con[C_JXY, lane], con[C_JXZ, lane], con[C_JYZ, lane]
+    jr = con[C_JR * LANES + lane] * o1
+    tx = -b * (y2 - con[C_CGY * LANES + lane] * s2) + m * con[C_HY * LANES + lane] * hy + jr * q
+    ty = b * (x2 - con[C_CGX * LANES + lane] * s2) - m * con[C_HX * LANES + lane] * hx - jr * p
+    tz = con[C_D * LANES + lane] * g * z2 + con[C_JSPIN * LANES + lane] * do
+    jxx, jyy, jzz = con[C_JXX * LANES + lane], con[C_JYY * LANES + lane], con[C_JZZ * LANES + lane]
+    jxy, jxz, jyz = con[C_JXY * LANES + lane], con[C_JXZ * LANES + lane], con[C_JYZ * LANES + lane]
     lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
     tx -= q * lz - r * ly
     ty -= r * lx - p * lz
     tz -= p * ly - q * lx
-    ap = con[C_IXX, lane] * tx + con[C_IXY, lane] * ty + con[C_IXZ, lane] * tz - con[C_LP, lane] * p
-    aq = con[C_IXY, lane] * tx + con[C_IYY, lane] * ty + con[C_IYZ, lane] * tz - con[C_MQ, lane] * q
-    ar = con[C_IXZ, lane] * tx + con[C_IYZ, lane] * ty + con[C_IZZ, lane] * tz
+    ap = con[C_IXX * LANES + lane] * tx + con[C_IXY * LANES + lane] * ty + con[C_IXZ * LANES + lane] * tz - con[C_LP * LANES + lane] * p
+    aq = con[C_IXY * LANES + lane] * tx + con[C_IYY * LANES + lane] * ty + con[C_IYZ * LANES + lane] * tz - con[C_MQ * LANES + lane] * q
+    ar = con[C_IXZ * LANES + lane] * tx + con[C_IYZ * LANES + lane] * ty + con[C_IZZ * LANES + lane] * tz
     an = r00 * sx + r01 * sy + r02 * sz
     ae = r10 * sx + r11 * sy + r12 * sz
     ad = r20 * sx + r21 * sy + r22 * sz + GRAVITY
     # Specific force where the IMU sits: rigid-body acceleration of a point at (rx, ry, rz) from the CG.
-    rx, ry, rz = con[C_RX, lane], con[C_RY, lane], con[C_RZ, lane]
+    rx, ry, rz = con[C_RX * LANES + lane], con[C_RY * LANES + lane], con[C_RZ * LANES + lane]
     dot = p * rx + q * ry + r * rz
     sq = p * p + q * q + r * r
     fx = sx + aq * rz - ar * ry + p * dot - rx * sq
@@ -343,20 +387,20 @@ def step_full(dt: float, con: FloatArray, agg: FloatArray, x: FloatArray, acc: F
     """One step of attitude, rate, velocity and position with every effect; arguments as `step_core`."""
     h = 0.5 * dt
     for lane in range(LANES):
-        s2a, s2b = agg[0, A_S2, lane], agg[1, A_S2, lane]
-        x2a, x2b = agg[0, A_X2, lane], agg[1, A_X2, lane]
-        y2a, y2b = agg[0, A_Y2, lane], agg[1, A_Y2, lane]
-        z2a, z2b = agg[0, A_Z2, lane], agg[1, A_Z2, lane]
-        s1a, s1b = agg[0, A_S1, lane], agg[1, A_S1, lane]
-        o1a, o1b = agg[0, A_O1, lane], agg[1, A_O1, lane]
-        doa, dob = agg[0, A_DO, lane], agg[1, A_DO, lane]
-        ga, gb = agg[0, A_G, lane], agg[1, A_G, lane]
-        ma, mb = agg[0, A_M, lane], agg[1, A_M, lane]
-        qw, qx, qy, qz = x[0, lane], x[1, lane], x[2, lane], x[3, lane]
-        p, q, r = x[4, lane], x[5, lane], x[6, lane]
-        vn, ve, vd = x[7, lane], x[8, lane], x[9, lane]
-        height = max(-x[12, lane], 0.3)
-        lift = 1.0 + con[C_GROUND, lane] / (height * height)
+        s2a, s2b = agg[A_S2 * LANES + lane], agg[(1 * N_AGG + A_S2) * LANES + lane]
+        x2a, x2b = agg[A_X2 * LANES + lane], agg[(1 * N_AGG + A_X2) * LANES + lane]
+        y2a, y2b = agg[A_Y2 * LANES + lane], agg[(1 * N_AGG + A_Y2) * LANES + lane]
+        z2a, z2b = agg[A_Z2 * LANES + lane], agg[(1 * N_AGG + A_Z2) * LANES + lane]
+        s1a, s1b = agg[A_S1 * LANES + lane], agg[(1 * N_AGG + A_S1) * LANES + lane]
+        o1a, o1b = agg[A_O1 * LANES + lane], agg[(1 * N_AGG + A_O1) * LANES + lane]
+        doa, dob = agg[A_DO * LANES + lane], agg[(1 * N_AGG + A_DO) * LANES + lane]
+        ga, gb = agg[A_G * LANES + lane], agg[(1 * N_AGG + A_G) * LANES + lane]
+        ma, mb = agg[A_M * LANES + lane], agg[(1 * N_AGG + A_M) * LANES + lane]
+        qw, qx, qy, qz = x[0 * LANES + lane], x[1 * LANES + lane], x[2 * LANES + lane], x[3 * LANES + lane]
+        p, q, r = x[4 * LANES + lane], x[5 * LANES + lane], x[6 * LANES + lane]
+        vn, ve, vd = x[7 * LANES + lane], x[8 * LANES + lane], x[9 * LANES + lane]
+        height = max(-x[12 * LANES + lane], 0.3)
+        lift = 1.0 + con[C_GROUND * LANES + lane] / (height * height)
         # stage 1
         a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = _body(
             qw, qx, qy, qz, p, q, r, vn, ve, vd, 1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b,
@@ -397,21 +441,21 @@ def step_full(dt: float, con: FloatArray, agg: FloatArray, x: FloatArray, acc: F
         qy += s * (k1y + 2.0 * (k2y + k3y) + k4y)
         qz += s * (k1z + 2.0 * (k2z + k3z) + k4z)
         scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)
-        x[0, lane], x[1, lane], x[2, lane], x[3, lane] = qw * scale, qx * scale, qy * scale, qz * scale
-        x[4, lane] = p + s * (a1x + 2.0 * (a2x + a3x) + a4x)
-        x[5, lane] = q + s * (a1y + 2.0 * (a2y + a3y) + a4y)
-        x[6, lane] = r + s * (a1z + 2.0 * (a2z + a3z) + a4z)
-        x[7, lane] = vn + s * (n1 + 2.0 * (n2 + n3) + n4)
-        x[8, lane] = ve + s * (e1 + 2.0 * (e2 + e3) + e4)
-        x[9, lane] = vd + s * (d1 + 2.0 * (d2 + d3) + d4)
-        x[10, lane] += dt * vn + dt * s * (n1 + n2 + n3)
-        x[11, lane] += dt * ve + dt * s * (e1 + e2 + e3)
-        x[12, lane] += dt * vd + dt * s * (d1 + d2 + d3)
+        x[0 * LANES + lane], x[1 * LANES + lane], x[2 * LANES + lane], x[3 * LANES + lane] = qw * scale, qx * scale, qy * scale, qz * scale
+        x[4 * LANES + lane] = p + s * (a1x + 2.0 * (a2x + a3x) + a4x)
+        x[5 * LANES + lane] = q + s * (a1y + 2.0 * (a2y + a3y) + a4y)
+        x[6 * LANES + lane] = r + s * (a1z + 2.0 * (a2z + a3z) + a4z)
+        x[7 * LANES + lane] = vn + s * (n1 + 2.0 * (n2 + n3) + n4)
+        x[8 * LANES + lane] = ve + s * (e1 + 2.0 * (e2 + e3) + e4)
+        x[9 * LANES + lane] = vd + s * (d1 + 2.0 * (d2 + d3) + d4)
+        x[10 * LANES + lane] += dt * vn + dt * s * (n1 + n2 + n3)
+        x[11 * LANES + lane] += dt * ve + dt * s * (e1 + e2 + e3)
+        x[12 * LANES + lane] += dt * vd + dt * s * (d1 + d2 + d3)
         # Means over the halves from a parabola through the stages.
         fx, fy, fz = 0.5 * (f2x + f3x), 0.5 * (f2y + f3y), 0.5 * (f2z + f3z)
-        acc[0, 0, lane] = (5.0 * f1x + 8.0 * fx - f4x) / 12.0
-        acc[0, 1, lane] = (5.0 * f1y + 8.0 * fy - f4y) / 12.0
-        acc[0, 2, lane] = (5.0 * f1z + 8.0 * fz - f4z) / 12.0
-        acc[1, 0, lane] = (-f1x + 8.0 * fx + 5.0 * f4x) / 12.0
-        acc[1, 1, lane] = (-f1y + 8.0 * fy + 5.0 * f4y) / 12.0
-        acc[1, 2, lane] = (-f1z + 8.0 * fz + 5.0 * f4z) / 12.0
+        acc[0 * LANES + lane] = (5.0 * f1x + 8.0 * fx - f4x) / 12.0
+        acc[1 * LANES + lane] = (5.0 * f1y + 8.0 * fy - f4y) / 12.0
+        acc[2 * LANES + lane] = (5.0 * f1z + 8.0 * fz - f4z) / 12.0
+        acc[(1 * 3 + 0) * LANES + lane] = (-f1x + 8.0 * fx + 5.0 * f4x) / 12.0
+        acc[(1 * 3 + 1) * LANES + lane] = (-f1y + 8.0 * fy + 5.0 * f4y) / 12.0
+        acc[(1 * 3 + 2) * LANES + lane] = (-f1z + 8.0 * fz + 5.0 * f4z) / 12.0

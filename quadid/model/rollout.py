@@ -170,9 +170,9 @@ class Rollout:
         w, need = self.window, _needs(theta, self.channels)
         roll_segments(
             w.rotor_speed, w.sampling == "held", self.geometry, self.mass, self.reach, w.t0, w.dt, w.log_span[0],
-            w.log_span[1], self.measured, segments.starts, n_pre, segments.length, x0, theta, dx, need.full,
+            w.log_span[1], self.measured, segments.starts, n_pre, segments.length, x0, theta.T.ravel(), dx, need.full,
             need.rotor_lanes, need.factors, need.imu_lag, need.att_delay, need.imu_static, need.ahrs, self.channels,
-            out, ends,
+            out.reshape(out.shape[0], out.shape[1], -1), ends.reshape(len(ends), -1),
         )  # fmt: skip
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:
