@@ -12,6 +12,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 RUNTIME := $(VENV)/.stamp-runtime
 DEV := $(VENV)/.stamp-dev
 ROS := $(VENV)/.stamp-ros
+# Changes only when a wheel does, so that the messages are not rebuilt for nothing.
+ROS_VERSIONS := $(VENV)/.ros-versions
 MESSAGES := $(VENV)/.stamp-messages
 
 export PIP_NO_INPUT := 1
@@ -38,9 +40,13 @@ $(DEV): pyproject.toml $(RUNTIME)
 # Last, because these wheels make every start of this Python re-execute itself.
 $(ROS): pyproject.toml $(DEV)
 	$(PIP) install --editable ".[ros]"
+	@$(BIN)/python -m pip freeze | grep -i '^ros-' >$@.new; cmp -s $@.new $(ROS_VERSIONS) || cp $@.new $(ROS_VERSIONS); rm $@.new
 	@touch $@
 
-$(MESSAGES): $(ROS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg)
+$(ROS_VERSIONS): $(ROS)
+	@:
+
+$(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg)
 	tools/build_messages.sh $(VENV)
 	@touch $@
 
