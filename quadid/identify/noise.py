@@ -1,0 +1,146 @@
+"""Sensor noise: white plus slowly coloured, per channel; whitening; estimation from residuals.
+
+Each channel's noise is modelled as ``white^2 I + slow^2 R`` within a segment, R the correlation of a first-order
+Gauss-Markov process.  The two variances are found by equating two quadratic forms of the residual with their
+expectation given that the segment's initial state was fitted (minimum-norm quadratic unbiased estimation, C. R. Rao,
+J. Multivariate Analysis 1 (1971) 257).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.vehicle import Noise
+
+FloatArray = NDArray[np.float64]
+
+SLOW_TIME = 0.66
+"""Correlation time of the slow AHRS error [s]: a pole of 0.97 at 50 Hz, safe also when the noise is white."""
+_DEFAULT = np.array([0.02] * 3 + [0.005] * 3 + [0.2] * 3 + [0.1] * 3 + [0.05] * 3)
+_POLYNOMIAL = (1, 2, 0, 2, 3)
+"""Order of the trend that fitting a segment's initial state takes out of rate, attitude, specific force, velocity,
+position."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise of every residual channel.
+
+    Attributes:
+        white: standard deviation of the white part, shape (channels,), channel's unit.
+        slow: standard deviation of the slow part, shape (channels,).
+        slow_time: correlation time of the slow part [s].
+    """
+
+    white: FloatArray
+    slow: FloatArray
+    slow_time: float = SLOW_TIME
+
+    @classmethod
+    def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
+        """Typical MEMS noise, or what the vehicle file knows."""
+        white = _DEFAULT[:channels].copy()
+        for i, name in enumerate(("gyro", "attitude", "accel", "velocity", "position")):
+            value = getattr(known, name) if known is not None else None
+            if value is not None and 3 * i < channels:
+                white[3 * i : 3 * i + 3] = value
+        return cls(white, np.zeros(channels))
+
+    @property
+    def variance(self) -> FloatArray:
+        """Total variance of each channel, shape (channels,)."""
+        return np.asarray(self.white**2 + self.slow**2)
+
+    def whitener(self, length: int, dt: float) -> FloatArray:
+        """Returns W, shape (channels, length, length): W[c] @ r has unit variance and is white for pure noise r."""
+        out = np.zeros((len(self.white), length, length))
+        for c, (white, slow) in enumerate(zip(self.white, self.slow, strict=True)):
+            if slow == 0.0:
+                out[c] = np.eye(length) / white
+            else:
+                cov = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / self.slow_time)
+                out[c] = np.linalg.inv(np.linalg.cholesky(cov))
+        return out
+
+    @property
+    def is_white(self) -> bool:
+        """True when no channel has a slow part."""
+        return not np.any(self.slow)
+
+
+@lru_cache(maxsize=32)
+def _correlation(length: int, step: float) -> FloatArray:
+    lag = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+    return np.asarray(np.exp(-step * lag))
+
+
+def estimate_noise(
+    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_channels: tuple[int, ...] = (3, 4, 5)
+) -> NoiseModel:
+    """Estimates the noise from residuals of a fit flexible enough to leave only noise.
+
+    Args:
+        residuals: predicted - measured, shape (segments, length, channels).
+        weights: 0 for samples to leave out, shape as residuals.
+        dt: grid step [s].
+        freedom: fraction of the residual's degrees of freedom left after the parameters were fitted, 0..1.
+        slow_channels: channels that may have a slow part; elsewhere slow structure is left for the diagnosis to see.
+
+    Returns:
+        The noise; a channel without enough data keeps the typical value.
+    """
+    segments, length, channels = residuals.shape
+    guess = NoiseModel.guess(channels)
+    white, slow = guess.white.copy(), np.zeros(channels)
+    for c in range(channels):
+        complete = np.all(weights[:, :, c] > 0.0, axis=1)
+        basis, forms = _forms(length, round(dt / SLOW_TIME, 9), min(_POLYNOMIAL[c // 3], length - 2))
+        if np.count_nonzero(complete) < 5:
+            used = weights[:, :, c] > 0.0
+            if np.count_nonzero(used) > 20:
+                # Scattered samples: fitting the initial state takes `order` of each segment's samples.
+                order = _POLYNOMIAL[c // 3]
+                left = np.count_nonzero(used) - order * np.count_nonzero(used.any(axis=1))
+                white[c] = np.sqrt(np.sum(residuals[:, :, c][used] ** 2) / max(left, 1) / freedom)
+            continue
+        r = residuals[complete, :, c]
+        r = r - (r @ basis) @ basis.T
+        # Trim segments with outliers: the middle 98 % of segment powers.
+        power = np.sum(r * r, axis=1)
+        r = r[power <= np.quantile(power, 0.98)]
+        keep = 1.0 if len(r) < 50 else _trim_gain(len(power), length - basis.shape[1])
+        moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
+        var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
+        if c in slow_channels and length >= 8:
+            solution = np.linalg.solve(forms[2], moments)
+            if solution[1] > 0.0 and solution[0] > 0.0:
+                var_white, var_slow = float(solution[0]), float(solution[1])
+        white[c], slow[c] = np.sqrt(max(var_white, 1e-18)), np.sqrt(var_slow)
+    return NoiseModel(white, slow)
+
+
+@lru_cache(maxsize=64)
+def _forms(length: int, step: float, order: int) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
+    """Trend basis (length, order), quadratic forms (I, R), and their expectations under unit white and slow noise."""
+    t = np.linspace(-1.0, 1.0, length)
+    basis = np.linalg.qr(np.vander(t, order, increasing=True))[0] if order else np.zeros((length, 0))
+    project = np.eye(length) - basis @ basis.T
+    slow = _correlation(length, step)
+    forms = [np.eye(length), slow]
+    expectation = np.array(
+        [[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms]
+    )
+    return basis, (forms[0], forms[1], expectation)
+
+
+@lru_cache(maxsize=64)
+def _trim_gain(segments: int, freedom: int) -> float:
+    """Mean power of the lower 98 % of chi-square segments relative to all, by a fixed quadrature."""
+    from scipy.stats import chi2
+
+    p = (np.arange(4000) + 0.5) / 4000 * 0.98
+    return float(np.mean(chi2.ppf(p, freedom)) / freedom)

@@ -1,0 +1,301 @@
+"""Multiple shooting: short segments, each with its own initial state, which is eliminated exactly.
+
+For every segment the residual is linearised in its initial state a and the free parameters z, weighted and whitened:
+``r(a, z) = r0 + A da + B dz``.  Minimising over da leaves ``r' = P r0 + P B dz`` with P the projector onto the
+complement of A.  All later steps (polish, covariance, excitation, screening, cross-validation) are linear algebra on
+the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.noise import NoiseModel
+from quadid.model import layout as ix
+from quadid.model.kernel import LANES
+from quadid.model.layout import Entry, Layout
+from quadid.model.rollout import Rollout, Segments
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+LEAD_SECONDS = 0.2
+"""Stretch before a segment in which filters and delays settle."""
+_TANGENT_STEP = np.array([1e-6] * 3 + [1e-6] * 3 + [1e-5] * 3 + [1e-5] * 3)
+_RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
+"""Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
+VELOCITY_PRIOR = 8.0
+"""Standard deviation [m/s] of a segment's unknown initial velocity where none is measured."""
+_VELOCITY_NAMES = ("rotor_drag.", "parasitic_drag.", "rotor_drag_moment.", "axial_inflow.", "ground_effect.", "wind.")
+_WARM_UP_NAMES = ("imu_lag.", "attitude_delay.")
+_WARM_UP_INDEX = (ix.IMU_PERIOD, ix.ATT_DELAY)
+_VELOCITY_INDEX = (ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.GROUND)
+_STEP_FRACTION = 1e-4
+
+
+@dataclass(frozen=True)
+class Free:
+    """The free parameters of a problem and how they are scaled.
+
+    Nominal parameters are searched on the log scale, effects in units of their typical size.
+
+    Attributes:
+        entries: in vector order.
+    """
+
+    entries: tuple[Entry, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Dotted names."""
+        return tuple(e.name for e in self.entries)
+
+    @property
+    def index(self) -> NDArray[np.intp]:
+        """Places in the full vector."""
+        return np.array([e.index for e in self.entries], dtype=np.intp)
+
+    @property
+    def is_log(self) -> NDArray[np.bool_]:
+        """True for parameters on the log scale."""
+        return np.array([e.name in NOMINAL_NAMES for e in self.entries], dtype=bool)
+
+    @property
+    def scale(self) -> FloatArray:
+        """Size of one unit of a linear parameter."""
+        return np.array([e.typical for e in self.entries])
+
+    def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
+        """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
+        out = theta.copy()
+        for e, step in zip(self.entries, z, strict=True):
+            value = out[e.index] * np.exp(step) if e.name in NOMINAL_NAMES else out[e.index] + step * e.typical
+            out[e.index] = min(max(value, e.lower), e.upper)
+        return out
+
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """d parameter / d z at `theta`, shape (parameters,)."""
+        return np.where(self.is_log, theta[self.index], self.scale)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Per-segment quadratic model of the cost in the free parameters, initial states eliminated.
+
+    Attributes:
+        gram: shape (segments, P, P); grad: (segments, P); cost: (segments,), all for scaled parameters z:
+            ``cost(z) = cost + 2 grad z + z gram z``.
+        rows: independent residuals of each segment, measured samples less fitted initial-state directions.
+        residuals: predicted - measured at the linearisation point, channel units, (segments, length, channels).
+        weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
+        back: what gives the initial-state steps back: (offset (segments, k), slope (segments, k, P)).
+        window: index of the window of each segment; time: its first scored time [s].
+    """
+
+    gram: FloatArray
+    grad: FloatArray
+    cost: FloatArray
+    rows: FloatArray
+    residuals: FloatArray
+    weights: FloatArray
+    back: tuple[FloatArray, FloatArray]
+    window: NDArray[np.intp]
+    time: FloatArray
+
+
+class Shooting:
+    """The residual problem of several windows cut into segments.
+
+    Attributes:
+        noise: noise model used for weights.
+        theta: full parameter vector at the current point.
+        x0: current initial states, per window (segments, 13).
+    """
+
+    def __init__(
+        self, windows: Sequence[Window], vehicle: Vehicle, seconds: float, noise: NoiseModel | None = None,
+        layout: Layout | None = None,
+    ) -> None:  # fmt: skip
+        """Cuts `windows` into segments of about `seconds` with room for filters and delays before each."""
+        self.vehicle = vehicle
+        self.layout = layout or Layout(vehicle)
+        dt = windows[0].dt
+        self.dt = dt
+        length, lead = max(round(seconds / dt), 4), max(round(LEAD_SECONDS / dt), 1)
+        fits = [w for w in windows if len(w) > length + lead]
+        self.rollouts = [Rollout(w, vehicle) for w in fits]
+        self.channels = min((r.channels for r in self.rollouts), default=9)
+        self.segments = [Segments.cut(len(r), length, lead) for r in self.rollouts]
+        self.length, self.lead = length, lead
+        self.noise = noise or NoiseModel.guess(self.channels, vehicle.noise)
+        self._x0: dict[int, list[FloatArray]] = {}
+        self.robust: list[FloatArray | None] = [None] * len(self.rollouts)
+
+    @property
+    def count(self) -> int:
+        """Number of segments."""
+        return sum(len(s.starts) for s in self.segments)
+
+    def free(self, names: Sequence[str]) -> Free:
+        """Returns the free parameters called `names`."""
+        return Free(tuple(self.layout.entry(n) for n in names))
+
+    def states(self, n_pre: int) -> list[FloatArray]:
+        """Current initial states `n_pre` rows before the segments; measured ones at first."""
+        if n_pre not in self._x0:
+            pairs = zip(self.rollouts, self.segments, strict=True)
+            self._x0[n_pre] = [r.initial_states(s, n_pre) for r, s in pairs]
+        return self._x0[n_pre]
+
+    def set_states(self, n_pre: int, states: list[FloatArray]) -> None:
+        """Replaces the initial states."""
+        self._x0[n_pre] = states
+
+    def _shape(self, theta: FloatArray, free: Free) -> tuple[int, int]:
+        """Rows to roll before a segment and directions of its initial state that matter."""
+        warm = any(n.startswith(_WARM_UP_NAMES) for n in free.names) or any(theta[i] > 0.0 for i in _WARM_UP_INDEX)
+        moves = any(n.startswith(_VELOCITY_NAMES) for n in free.names) or any(theta[i] != 0.0 for i in _VELOCITY_INDEX)
+        tangents = {9: 9 if moves else 6, 12: 9, 15: 12}[self.channels]
+        return (self.lead if warm else 1), tangents
+
+    def linearise(self, theta: FloatArray, free: Free) -> Linearised:
+        """Linearises all segments at `theta` and the current initial states; eliminates the initial states."""
+        n_pre, k = self._shape(theta, free)
+        states = self.states(n_pre)
+        parts = []
+        for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
+            base, columns = self._columns(rollout, segments, theta, free, states[i], n_pre, k)
+            weights = _weights(rollout, segments, self.channels)
+            robust = self.robust[i]
+            if robust is not None and robust.shape == weights.shape:
+                weights = weights * robust
+            parts.append(self._eliminate(i, base, columns, weights, states[i], segments, k))
+        return _join(parts)
+
+    def _columns(
+        self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, n_pre: int, k: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (segments, length, channels) and its derivatives (…, k + P) by forward differences."""
+        m = 1 + k + len(free.entries)
+        thetas = np.repeat(theta[None], m, axis=0)
+        dx = np.zeros((m, 12))
+        steps = np.empty(m - 1)
+        steps[:k] = _TANGENT_STEP[:k]
+        dx[1 + np.arange(k), np.arange(k)] = _TANGENT_STEP[:k]
+        scale = free.jacobian(theta)
+        for j, e in enumerate(free.entries):
+            # Step inwards at an upper bound, so that no lane leaves the allowed range.
+            h = _STEP_FRACTION if theta[e.index] + scale[j] * _STEP_FRACTION <= e.upper else -_STEP_FRACTION
+            thetas[1 + k + j, e.index] += h * scale[j]
+            steps[k + j] = h
+        out, _ = rollout.roll(segments, thetas, x0, dx, n_pre)
+        out = out[..., : self.channels, :]
+        base = np.ascontiguousarray(out[0, ..., 0])
+        columns = np.empty((*base.shape, m - 1))
+        for block in range(len(out)):
+            low, high = max(block * LANES, 1), min((block + 1) * LANES, m)
+            if high > low:
+                part = out[block][..., low - block * LANES : high - block * LANES] - base[..., None]
+                columns[..., low - 1 : high - 1] = part / steps[low - 1 : high - 1]
+        return base, columns
+
+    def _eliminate(
+        self, i: int, base: FloatArray, columns: FloatArray, weights: FloatArray, x0: FloatArray,
+        segments: Segments, k: int,
+    ) -> Linearised:  # fmt: skip
+        count, length, channels, width = columns.shape
+        stacked = np.concatenate([columns, base[..., None]], axis=3)
+        white = self.whiten(stacked, weights)
+        flat = white.reshape(count, length * channels, width + 1)
+        h = np.matmul(flat.transpose(0, 2, 1), flat)
+        haa, hab, hbb = h[:, :k, :k].copy(), h[:, :k, k:width], h[:, k:width, k:width]
+        ga, gb, cost = h[:, :k, width].copy(), h[:, k:width, width], h[:, width, width].copy()
+        informed = np.einsum("sii->si", haa).copy()
+        haa[:, range(k), range(k)] += 1.0 / _RIDGE[:k] ** 2
+        if k >= 9 and not self._has_velocity(i):
+            v = x0[:, 7:10]
+            haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
+            ga[:, 6:9] += v / VELOCITY_PRIOR**2
+            cost += np.sum(v * v, axis=1) / VELOCITY_PRIOR**2
+        solved = np.linalg.solve(haa, np.concatenate([hab, ga[..., None]], axis=2))
+        slope, offset = solved[..., :-1], solved[..., -1]
+        hab_t = hab.transpose(0, 2, 1)
+        fitted = np.sum(informed / np.einsum("sii->si", haa), axis=1)
+        return Linearised(
+            gram=hbb - hab_t @ slope,
+            grad=gb - np.einsum("skp,sk->sp", hab, offset),
+            cost=cost - np.sum(ga * offset, axis=1),
+            rows=np.count_nonzero(weights, axis=(1, 2)) - fitted,
+            residuals=base,
+            weights=weights,
+            back=(offset, slope),
+            window=np.full(count, i, dtype=np.intp),
+            time=self.rollouts[i].window.t[segments.starts],
+        )
+
+    def _has_velocity(self, i: int) -> bool:
+        return self.rollouts[i].channels > 9
+
+    def whiten(self, rows: FloatArray, weights: FloatArray) -> FloatArray:
+        """Weights and whitens rows of shape (segments, length, channels, columns); masked channels stay unwhitened."""
+        whitener = self.noise.whitener(self.length, self.dt)
+        out = rows * (weights / np.sqrt(self.noise.variance))[..., None]
+        for c in np.flatnonzero(self.noise.slow > 0.0):
+            full = np.all(weights[:, :, c] > 0.0, axis=1)
+            scaled = rows[full, :, c] * weights[full, :, c, None]
+            out[full, :, c] = np.matmul(whitener[c], scaled)
+        return out
+
+    def step_states(self, theta: FloatArray, free: Free, lin: Linearised, z: FloatArray) -> list[FloatArray]:
+        """Initial states after the parameter step `z`, shapes as `states`; does not store them."""
+        n_pre, k = self._shape(theta, free)
+        offset, slope = lin.back
+        da = -(offset + slope @ z)
+        limit = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)[:k]
+        da = np.clip(da, -limit, limit)
+        out, place = [], 0
+        for x0 in self.states(n_pre):
+            out.append(_retract(x0, da[place : place + len(x0)]))
+            place += len(x0)
+        return out
+
+    def adopt(self, theta: FloatArray, free: Free, states: list[FloatArray]) -> None:
+        """Stores initial states that belong to the model of `theta` and `free`."""
+        self.set_states(self._shape(theta, free)[0], states)
+
+
+def _weights(rollout: Rollout, segments: Segments, channels: int) -> FloatArray:
+    rows = segments.starts[:, None] + np.arange(segments.length)
+    return rollout.valid[rows][..., :channels].astype(np.float64)
+
+
+def _retract(x0: FloatArray, da: FloatArray) -> FloatArray:
+    out = x0.copy()
+    half = 0.5 * da[:, :3]
+    dq = np.column_stack([np.ones(len(half)), half])
+    dq /= np.linalg.norm(dq, axis=1, keepdims=True)
+    w, v = x0[:, 0], x0[:, 1:4]
+    dw, dv = dq[:, 0], dq[:, 1:]
+    out[:, 0] = w * dw - np.sum(v * dv, axis=1)
+    out[:, 1:4] = w[:, None] * dv + dw[:, None] * v + np.cross(v, dv)
+    k = da.shape[1]
+    out[:, 4 : 4 + k - 3] += da[:, 3:]
+    return out
+
+
+def _join(parts: list[Linearised]) -> Linearised:
+    if len(parts) == 1:
+        return parts[0]
+
+    def cat(name: str) -> FloatArray:
+        return np.concatenate([getattr(p, name) for p in parts])
+
+    back = (np.concatenate([p.back[0] for p in parts]), np.concatenate([p.back[1] for p in parts]))
+    fields = ("gram", "grad", "cost", "rows", "residuals", "weights", "window", "time")
+    return replace(parts[0], back=back, **{f: cat(f) for f in fields})
