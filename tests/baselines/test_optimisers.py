@@ -1,0 +1,217 @@
+"""Every optimiser through the one door: optimum, honest account, bounds, seeds, hostile costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from quadid.baselines.optimisers import NAMES, NEED_RESIDUAL, Result, Stop, minimise
+from quadid.errors import ParameterError
+
+FloatArray = NDArray[np.float64]
+Batch = Callable[[FloatArray], FloatArray]
+
+LOWER, UPPER = np.log([0.25, 0.2, 0.5]), np.log([4.0, 3.0, 8.0])
+TRUTH = np.log([1.3, 0.7, 2.0])
+START = np.log([0.6, 1.4, 4.0])
+TIME = np.linspace(0.0, 4.0, 40)
+
+
+def response(log_x: FloatArray) -> FloatArray:
+    """A damped oscillation with amplitude, decay and frequency exp(log_x); (k, 3) -> (k, 40)."""
+    amplitude, decay, frequency = np.exp(log_x).T[:, :, None]
+    return np.asarray(amplitude * np.exp(-decay * TIME) * np.cos(frequency * TIME))
+
+
+MEASURED = response(TRUTH[None])[0]
+
+
+def residual(log_x: FloatArray) -> FloatArray:
+    return np.asarray(response(log_x) - MEASURED)
+
+
+def cost(log_x: FloatArray) -> FloatArray:
+    return np.asarray(np.mean(residual(log_x) ** 2, axis=1))
+
+
+class Counted:
+    """Counts the rows it is given and notes any outside the box."""
+
+    def __init__(self, function: Batch) -> None:
+        self.function, self.rows, self.outside = function, 0, 0
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        self.rows += len(x)
+        self.outside += int(np.count_nonzero((x < LOWER) | (x > UPPER)))
+        return self.function(x)
+
+
+def run(name: str, budget: int = 3000, seed: int = 1, cost_batch: Batch = cost, **more: Any) -> Result:
+    return minimise(name, cost_batch, START, LOWER, UPPER, budget, seed, residual=residual, **more)
+
+
+SEARCHING = [name for name in NAMES if name != "initial"]
+RELIABLE = [name for name in SEARCHING if name != "pso_algorithm_1"]
+
+
+@pytest.mark.parametrize("name", RELIABLE)
+def test_finds_the_parameters_of_a_damped_oscillation(name: str) -> None:
+    for seed in range(2):
+        result = run(name, seed=seed)
+        np.testing.assert_allclose(result.x, TRUTH, atol=1e-5)
+        assert result.cost == cost(result.x[None])[0]
+
+
+def test_the_papers_algorithm_finds_them_from_most_seeds_and_sticks_to_a_wall_from_some() -> None:
+    errors = [np.max(np.abs(run("pso_algorithm_1", 1500, seed).x - TRUTH)) for seed in range(10)]
+    assert sum(error < 1e-2 for error in errors) >= 7
+    assert max(errors) > 0.5
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("budget", [16, 47, 300])
+def test_every_evaluation_is_counted_and_none_is_overdrawn(name: str, budget: int) -> None:
+    costs, residuals = Counted(cost), Counted(residual)
+    result = minimise(name, costs, START, LOWER, UPPER, budget, 0, residual=residuals)
+    assert result.evaluations == costs.rows + residuals.rows <= budget
+    assert costs.outside == residuals.outside == 0
+    assert result.cost <= cost(START[None])[0]
+    if result.stop is Stop.BUDGET and name not in NEED_RESIDUAL:
+        assert result.evaluations == budget
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_seed_decides_the_result(name: str) -> None:
+    a, b = run(name, 200, 3), run(name, 200, 3)
+    np.testing.assert_array_equal(a.x, b.x)
+    assert (a.cost, a.evaluations, a.stop) == (b.cost, b.evaluations, b.stop)
+
+
+@pytest.mark.parametrize("name", ["cma_es", "differential_evolution", "pso"])
+def test_other_seeds_search_elsewhere(name: str) -> None:
+    assert not np.array_equal(run(name, 200, 3).x, run(name, 200, 4).x)
+
+
+@pytest.mark.parametrize("name", SEARCHING)
+def test_an_optimum_on_the_wall_is_found(name: str) -> None:
+    edge = np.array([1.0, 1.0, 1.0])
+
+    def slope(x: FloatArray) -> FloatArray:
+        return np.asarray(x + edge)
+
+    result = minimise(
+        name, lambda x: np.sum(slope(x) ** 2, axis=1), [0.0] * 3, [-0.5] * 3, [2.0] * 3, 2000, 0, residual=slope
+    )
+    np.testing.assert_allclose(result.x, -0.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [name for name in RELIABLE if name not in ("quasi_newton", "least_squares")])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_simulation_that_diverges_in_part_of_the_box_is_survived(name: str, bad: float) -> None:
+    def broken(x: FloatArray) -> FloatArray:
+        return np.where(x[:, 2] > np.log(3.0), bad, cost(x))
+
+    np.testing.assert_allclose(run(name, cost_batch=broken).x, TRUTH, atol=1e-2)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_where_nothing_is_finite_the_start_comes_back_with_an_infinite_cost(name: str) -> None:
+    result = minimise(
+        name, lambda x: np.full(len(x), math.nan), START, LOWER, UPPER, 200, 0,
+        residual=lambda x: np.full((len(x), 5), math.nan),
+    )  # fmt: skip
+    np.testing.assert_array_equal(result.x, START)
+    assert math.isinf(result.cost)
+
+
+def test_gradient_methods_say_that_they_met_a_cliff() -> None:
+    cliff: Batch = lambda x: np.where(x[:, :1] > START[0], math.nan, residual(x))  # noqa: E731
+    result = minimise("least_squares", cost, START, LOWER, UPPER, 200, 0, residual=cliff)
+    assert result.stop is Stop.NO_GRADIENT
+    assert result.evaluations < 10
+
+
+def test_least_squares_needs_few_evaluations_and_differences_are_in_the_account() -> None:
+    result = run("least_squares")
+    assert result.stop is Stop.CONVERGED
+    assert 3 * (len(START) + 1) < result.evaluations < 100
+
+
+def test_polish_is_called_with_the_best_of_the_swarm_and_its_evaluations_count() -> None:
+    calls: list[FloatArray] = []
+
+    def polish(inner: Batch, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        calls.append(x)
+        np.testing.assert_allclose([lower, upper], [LOWER, UPPER])
+        np.testing.assert_allclose(inner(x[None]), residual(x[None]), atol=1e-12)
+        inner(np.tile(TRUTH, (9, 1)))
+        return TRUTH
+
+    plain = run("pso_polish", 400)
+    result = run("pso_polish", 400, polish=polish)
+    assert len(calls) == 1
+    assert result.cost < 1e-25
+    assert result.stop is Stop.CONVERGED
+    assert plain.evaluations != result.evaluations
+
+
+def test_a_polish_that_spends_the_budget_keeps_its_best_point() -> None:
+    def greedy(inner: Batch, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        inner(TRUTH[None])
+        while True:
+            inner(x[None])
+
+    result = run("pso_polish", 200, polish=greedy)
+    assert (result.stop, result.evaluations) == (Stop.BUDGET, 200)
+    assert result.cost < 1e-25
+
+
+def test_seconds_are_the_callers() -> None:
+    ticks = iter([10.0, 12.5])
+    assert run("initial", clock=lambda: next(ticks)).seconds == 2.5
+    assert math.isnan(run("initial").seconds)
+    assert run("initial").stop is Stop.NOT_RUN
+
+
+@pytest.mark.parametrize("name", ["cma_es", "differential_evolution", "least_squares"])
+def test_nothing_is_printed_written_or_taken_from_the_global_generator(
+    name: str, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = random_state()
+    run(name, 300)
+    assert random_state() == before
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+def random_state() -> bytes:
+    """State of numpy's global generator, which pycma would use and seed if it were left to."""
+    return bytes(np.asarray(np.random.mtrand.get_state(legacy=False)["state"]["key"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": "psso"}, "did you mean 'pso'"),
+        ({"budget": 15}, "at least 16"),
+        ({"x0": UPPER + 1.0}, "inside the box"),
+        ({"x0": np.zeros(2)}, "inside the box"),
+        ({"lower": UPPER}, "lower below upper"),
+        ({"name": "least_squares", "residual": None}, "pass residual="),
+        ({"cost_batch": lambda x: np.zeros((len(x), 2))}, "cost_batch returned shape"),
+        ({"name": "least_squares", "residual": lambda x: np.zeros(3)}, "residual returned shape"),
+    ],
+)
+def test_what_cannot_be_minimised_is_refused(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {
+        "name": "pso", "cost_batch": cost, "x0": START, "lower": LOWER, "upper": UPPER, "budget": 100, "seed": 0,
+    } | change  # fmt: skip
+    with pytest.raises(ParameterError, match=message):
+        minimise(**arguments)
