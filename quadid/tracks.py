@@ -54,7 +54,7 @@ class Plan(NamedTuple):
 
 
 def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling: Sampling, rate: float | None) -> Plan:
-    """Prepares all channels; `t`, `speeds` [rad/s] and `sampling` are the rotor signal, `rate` [Hz] None for the log's."""
+    """Prepares all channels; `t`, `speeds` [rad/s], `sampling`: rotor signal; `rate` [Hz]: None for the log's own."""
     raw = {"rotor_speed": (t, speeds)}
     for name in (*REQUIRED[1:], *OPTIONAL):
         channel = recording.channels.get(name)

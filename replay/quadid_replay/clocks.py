@@ -5,6 +5,11 @@ A log has one `LogClock`; stamps are fed in file order and come back as recordin
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one means a reboot or a clock step."""
 STEP_AHEAD = 30.0
@@ -59,7 +64,6 @@ class LogClock:
         self.wild = 0
         self._offset = 0.0
         self._newest: float | None = None
-        self._first = 0
         self._suspects: list[float] = []
 
     def time(self, raw: float) -> float | None:
@@ -76,6 +80,18 @@ class LogClock:
             self._newest = max(self._newest, raw)
             return raw + self._offset
         return self._suspect(raw)
+
+    def times(self, raw: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Maps many stamps in file order; returns recording times (NaN where refused) and which were accepted."""
+        if len(raw) and self._newest is None and bool(np.isfinite(raw).all()):
+            newest = np.maximum.accumulate(raw)
+            steps = raw[1:] - newest[:-1]
+            if len(raw) < 2 or (steps.min() > -STEP_BACK and steps.max() < STEP_AHEAD):
+                self._newest = float(newest[-1])
+                return raw, np.ones(len(raw), dtype=np.bool_)
+        mapped = [self.time(float(stamp)) for stamp in raw]
+        out = np.array([np.nan if t is None else t for t in mapped], dtype=np.float64)
+        return out, np.isfinite(out)
 
     def _suspect(self, raw: float) -> float | None:
         """Collects stamps of a possible new time base and moves to it when enough agree."""

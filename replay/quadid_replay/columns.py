@@ -1,14 +1,18 @@
-"""Growing columns: what a reader keeps of a log while it streams through it, and nothing else."""
+"""Growing columns: what a reader keeps of a log while it streams through it; and the recording made of them."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.window import CHANNELS, Channel
+from quadid.errors import LogError
+from quadid.resample import sample_period
+from quadid.window import Channel, Recording
+from quadid_replay.clocks import LogClock
 from quadid_replay.frames import continuous_sign, unit_quaternions
 
 FloatArray = NDArray[np.float64]
@@ -22,8 +26,26 @@ _REASONS = {
 }
 
 
+class RawChannel(NamedTuple):
+    """A channel as a reader found it: core units and frames, recording time, nothing dropped yet.
+
+    Attributes:
+        name: key of `quadid.window.CHANNELS`.
+        t: times [s] in file order, shape (n,).
+        values: shape (n, columns).
+        source: topic, message or column names, for people.
+        refused: samples whose stamp the clock refused.
+    """
+
+    name: str
+    t: FloatArray
+    values: FloatArray
+    source: str
+    refused: int = 0
+
+
 class Columns:
-    """Times and values of one channel, appended sample by sample as packed doubles.
+    """Times and values of one signal, appended sample by sample as packed doubles.
 
     Args:
         width: number of values a sample.
@@ -48,28 +70,24 @@ class Columns:
         self._t.append(t)
         self._values.extend(values)
 
-    def extend(self, t: FloatArray, values: FloatArray) -> None:
-        """Appends many samples: times (n,), values (n, width)."""
-        self._t.frombytes(np.ascontiguousarray(t, dtype=np.float64).tobytes())
-        self._values.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-
     def arrays(self) -> tuple[FloatArray, FloatArray]:
-        """Returns times (n,) and values (n, width) [as added]."""
+        """Returns times (n,) and values (n, width), as added."""
         t = np.frombuffer(self._t, dtype=np.float64) if self._t else np.empty(0)
         values = np.frombuffer(self._values, dtype=np.float64) if self._values else np.empty(0)
         return t, values.reshape(-1, self.width)
 
 
-def clean_channel(name: str, t: FloatArray, values: FloatArray, source: str, refused: int = 0) -> Channel | None:
-    """Makes a channel of raw samples in core units and frames: drops and counts what cannot be used.
+def clean_channel(raw: RawChannel) -> Channel | None:
+    """Makes a channel of raw samples: drops and counts what cannot be used.
 
     Dropped: values or times that are not finite, repeated stamps, samples running backwards, quaternions that are none.
     Returns None when nothing remains.
     """
-    faults = {"bad_stamp": refused}
+    t, values = raw.t, raw.values
+    faults = {"bad_stamp": raw.refused}
     finite = np.isfinite(t) & np.isfinite(values).all(axis=1)
     faults["not_finite"] = int(np.count_nonzero(~finite))
-    if name == "attitude":
+    if raw.name == "attitude":
         values, good = unit_quaternions(values)
         faults["not_attitude"] = int(np.count_nonzero(finite & ~good))
         finite &= good
@@ -81,16 +99,48 @@ def clean_channel(name: str, t: FloatArray, values: FloatArray, source: str, ref
     faults["duplicate"] = int(np.count_nonzero(t[1:] == newest[:-1]))
     faults["backwards"] = int(np.count_nonzero(~forward)) - faults["duplicate"]
     t, values = t[forward], values[forward]
-    if name == "attitude":
+    if raw.name == "attitude":
         values = continuous_sign(values)
-    return Channel(name, t, values, source, {k: n for k, n in faults.items() if n})
+    return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
 
 
-def channel_width(name: str) -> int:
-    """Returns the number of columns of a channel with a fixed number of them."""
-    width = CHANNELS[name][0]
-    assert width is not None
-    return width
+def assemble(
+    name: str, kind: str, raw: Sequence[RawChannel], clock: LogClock, notes: Sequence[str], sha256: str
+) -> Recording:
+    """Cleans the channels and makes the recording; of several sources of one channel the first usable one is kept.
+
+    Raises:
+        LogError: no channel holds a usable sample.
+    """
+    channels: dict[str, Channel] = {}
+    for entry in raw:
+        if entry.name in channels or len(entry.t) == 0:
+            continue
+        channel = clean_channel(entry)
+        if channel is not None:
+            channels[entry.name] = channel
+    if not channels:
+        why = f" ({notes[0]})" if notes else ""
+        raise LogError(
+            f"{name}: no usable flight data in it{why}", "gyro, attitude, accelerometer or rotor signals",
+            "see docs/logs.md for the messages that are read",
+        )  # fmt: skip
+    warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
+    return Recording(name, kind, channels, tuple(clock.breaks), warnings, sha256)
+
+
+def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:
+    """Orders sources of one channel: as given, but one that is `advantage` times faster than the best goes first."""
+    best: list[RawChannel] = []
+    for entry in raw:
+        if len(entry.t) < 2:
+            continue
+        period = sample_period(np.sort(entry.t))
+        if best and not period * advantage < sample_period(np.sort(best[0].t)):
+            best.append(entry)
+        else:
+            best.insert(0, entry)
+    return best
 
 
 def fault_warnings(channels: Mapping[str, Channel]) -> list[str]:

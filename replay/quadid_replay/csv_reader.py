@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from quadid.errors import LogError, nearest
 from quadid.resample import COINCIDENT, sample_period
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
-from quadid_replay.columns import clean_channel, fault_warnings
+from quadid_replay.columns import RawChannel, assemble
 from quadid_replay.frames import from_euler
 from quadid_replay.recognise import HEAD_BYTES, header_line
 
@@ -48,24 +49,17 @@ def read_csv(path: Path, sha256: str = "") -> Recording:
     if ignored:
         notes.append(f"columns not used: {', '.join(ignored)} ({nearest(ignored[0], _known())})")
     clock = LogClock()
-    t, accepted = _recording_time(table[:, names.index("t")], clock)
-    refused = len(table) - int(np.count_nonzero(accepted))
-    rows = table[accepted]
-    channels: dict[str, Channel] = {}
+    t, accepted = clock.times(table[:, names.index("t")])
+    refused = len(t) - int(np.count_nonzero(accepted))
+    t, rows = t[accepted], table[accepted]
+    raw = []
     for name, columns in layout.items():
         values = rows[:, [names.index(c) for c in columns]]
         blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
-        if columns == EULER:
-            values = from_euler(values)
-        channel = clean_channel(name, t[~blank], values[~blank], " ".join(columns), refused)
-        if channel is not None:
-            channels[name] = channel
-    if not channels:
-        raise LogError(f"{path.name}: no channel holds a finite number", "columns " + ", ".join(_known()))
-    warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
-    return Recording(
-        path.name, "csv", channels, tuple(clock.breaks), warnings, sha256, _uniform_step(channels)
-    )  # fmt: skip
+        values = from_euler(values) if columns == EULER else values
+        raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(columns), refused))
+    recording = assemble(path.name, "csv", raw, clock, notes, sha256)
+    return replace(recording, grid=_uniform_step(recording.channels))
 
 
 def _header(path: Path) -> tuple[list[str], str]:
@@ -178,17 +172,7 @@ def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad:
     return np.array(good, dtype=np.float64).reshape(-1, width)
 
 
-def _recording_time(raw: FloatArray, clock: LogClock) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Runs the stamps through the clock; returns the times of the accepted rows and which rows those are."""
-    steps = np.diff(raw)
-    if np.isfinite(raw).all() and (len(raw) < 2 or (steps.min() > -0.5 and steps.max() < 10.0)):
-        return raw, np.ones(len(raw), dtype=np.bool_)
-    times = [clock.time(float(stamp)) for stamp in raw]
-    accepted = np.array([time is not None for time in times])
-    return np.array([time for time in times if time is not None], dtype=np.float64), accepted
-
-
-def _uniform_step(channels: dict[str, Channel]) -> float | None:
+def _uniform_step(channels: Mapping[str, Channel]) -> float | None:
     """Returns the step [s] when every channel lies on one uniform grid (gaps aside), else None."""
     longest = max(channels.values(), key=lambda c: len(c.t))
     if len(longest.t) < 3:

@@ -27,6 +27,10 @@ def open_log(path: str | Path, preset: str = "auto") -> Recording:
         from quadid_replay.csv_reader import read_csv
 
         return read_csv(file, sha256)
+    if kind == "dataflash":
+        from quadid_replay.dataflash_reader import read_dataflash
+
+        return read_dataflash(file, sha256)
     raise LogError(f"{file.name}: {kind} is not supported yet", "CSV")
 
 

@@ -1,0 +1,238 @@
+"""ArduPilot DataFlash logs: which record holds which channel, and its units.
+
+Body FRD and world NED are ArduPilot's own; ATT is in degrees, RCOU in microseconds.  Time is TimeUS or TimeMS,
+since boot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.window import Recording
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import RawChannel, assemble, fastest_first
+from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
+from quadid_replay.frames import from_euler
+from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
+
+FloatArray = NDArray[np.float64]
+
+_ATTITUDE = ("Roll", "Pitch", "Yaw")
+_GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
+_QUATERNION = ("Q1", "Q2", "Q3", "Q4")
+_VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
+
+
+class _Source(NamedTuple):
+    """Records of one kind: recording times (NaN where refused), which rows to use, and how many stamps were refused."""
+
+    name: str
+    t: FloatArray
+    rows: NDArray[np.bool_]
+    refused: int
+
+
+def read_dataflash(path: Path, sha256: str = "") -> Recording:
+    """Reads a DataFlash log, whole or damaged.
+
+    Raises:
+        LogError: nothing usable in it.
+    """
+    index = index_dataflash(path)
+    clock = LogClock()
+    times = _recording_times(index, clock)
+    parameters = _parameters(index)
+    raw = [
+        *fastest_first(_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR"))),
+        *fastest_first(_vectors(index, times, "accel", _ACCEL, ("IMU", "ACC"))),
+        *_attitude(index, times),
+        *_reference(index, times),
+        *_states(index, times, parameters),
+        *_battery(index, times),
+        *_outputs(index, times, parameters),
+        *_esc(index, times, parameters),
+    ]
+    return assemble(path.name, "dataflash", raw, clock, _damage(index), sha256)
+
+
+def _damage(index: DataflashIndex) -> list[str]:
+    notes = []
+    if index.skipped:
+        notes.append(f"{index.skipped} of {len(index.data)} bytes are damaged and were skipped")
+    if index.damaged:
+        notes.append(f"damaged message descriptions: {', '.join(sorted(set(index.damaged))[:8])}")
+    if index.cut:
+        notes.append("the file ends inside a record: it was cut; everything before is used")
+    return notes
+
+
+def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatArray]:
+    """Runs the stamps of all records that are used through one clock, in file order."""
+    stamps: dict[str, FloatArray] = {}
+    for name in (
+        "IMU",
+        "GYR",
+        "ACC",
+        "ATT",
+        "XKF1",
+        "NKF1",
+        "EKF1",
+        "BAT",
+        "CURR",
+        "RCOU",
+        "ESC",
+        "CTUN",
+        "XKQ1",
+        "NKQ1",
+    ):
+        for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)):
+            if index.has(name, column):
+                stamps[name] = index.column(name, column) * unit
+    if not stamps:
+        return {}
+    order = np.argsort(np.concatenate([index.rows(name) for name in stamps]), kind="stable")
+    mapped, _ = clock.times(np.concatenate(list(stamps.values()))[order])
+    unsorted = np.empty_like(mapped)
+    unsorted[order] = mapped
+    ends = np.cumsum([len(s) for s in stamps.values()])
+    return dict(zip(stamps, np.split(unsorted, ends[:-1]), strict=True))
+
+
+def _parameters(index: DataflashIndex) -> dict[str, float]:
+    if not index.has("PARM", "Name", "Value"):
+        return {}
+    return dict(zip(index.text("PARM", "Name"), index.column("PARM", "Value"), strict=True))
+
+
+def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
+    """Returns the rows of instance 0 (or the only one) with an accepted stamp; None when columns are missing."""
+    if name not in times or not index.has(name, *columns):
+        return None
+    rows = np.isfinite(times[name])
+    for instance in ("I", "Instance", "C"):
+        if index.has(name, instance):
+            rows &= index.column(name, instance) == 0
+    return _Source(name, times[name][rows], rows, int(np.count_nonzero(~np.isfinite(times[name]))))
+
+
+def _stack(index: DataflashIndex, source: _Source, columns: tuple[str, ...]) -> FloatArray:
+    return np.column_stack([index.column(source.name, column)[source.rows] for column in columns])
+
+
+def _vectors(
+    index: DataflashIndex, times: dict[str, FloatArray], channel: str, columns: tuple[str, ...], names: tuple[str, ...]
+) -> list[RawChannel]:
+    out = []
+    for name in names:
+        source = _source(index, times, name, columns)
+        if source is not None:
+            t = source.t
+            if index.has(name, "SampleUS"):  # the raw sensor's own clock is finer than the time of writing
+                sample = index.column(name, "SampleUS")[source.rows] * 1e-6
+                t = (
+                    t + (sample - sample[:1]) - (t - t[:1])
+                    if np.abs((sample - sample[:1]) - (t - t[:1])).max() < 0.1
+                    else t
+                )
+            out.append(RawChannel(channel, t, _stack(index, source, columns), f"{name} instance 0", source.refused))
+    return out
+
+
+def _attitude(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    out = []
+    source = _source(index, times, "ATT", _ATTITUDE)
+    if source is not None:
+        angles = np.radians(_stack(index, source, _ATTITUDE))
+        out.append(RawChannel("attitude", source.t, from_euler(angles), "ATT (degrees)", source.refused))
+    for name in ("XKQ1", "NKQ1"):
+        source = _source(index, times, name, _QUATERNION)
+        if source is not None:
+            out.append(RawChannel("attitude", source.t, _stack(index, source, _QUATERNION), name, source.refused))
+    return fastest_first(out)
+
+
+def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    """Desired angles of ATT with the last throttle output of CTUN."""
+    columns = ("DesRoll", "DesPitch", "DesYaw")
+    desired, throttle = _source(index, times, "ATT", columns), None
+    column, unit = ("ThO", 1.0) if index.has("CTUN", "ThO") else ("ThrOut", 1e-3)
+    if index.has("CTUN", column):
+        throttle = _source(index, times, "CTUN", (column,))
+    if desired is None or throttle is None or len(throttle.t) == 0:
+        return []
+    level = _stack(index, throttle, (column,))[:, 0] * unit
+    latest = np.searchsorted(throttle.t, desired.t, side="right") - 1
+    known = latest >= 0
+    angles = np.radians(_stack(index, desired, columns)[known])
+    angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    values = np.column_stack([angles, level[latest[known]]])
+    return [RawChannel("attitude_reference", desired.t[known], values, f"ATT Des*, CTUN {column}", desired.refused)]
+
+
+def _states(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+    names = ["XKF1", "NKF1", "EKF1"]
+    if parameters.get("AHRS_EKF_TYPE") == 2.0:
+        names = ["NKF1", "XKF1", "EKF1"]
+    out = []
+    for channel, columns in (("velocity", _VELOCITY), ("position", _POSITION)):
+        for name in names:
+            source = _source(index, times, name, columns)
+            if source is not None:
+                values = _stack(index, source, columns)
+                out.append(RawChannel(channel, source.t, values, f"{name} {' '.join(columns)}", source.refused))
+    return out
+
+
+def _battery(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    out = []
+    for name in ("BAT", "CURR"):
+        source = _source(index, times, name, ("Volt",))
+        if source is not None:
+            volts = _stack(index, source, ("Volt",))
+            if len(volts) and np.median(volts) > 100.0:  # old CURR counts centivolts
+                volts = volts * 0.01
+            if len(volts) and np.max(volts) > 0.0:
+                out.append(RawChannel("battery", source.t, volts, f"{name} Volt", source.refused))
+    return out
+
+
+def _outputs(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+    description = index.formats.get("RCOU")
+    if description is None:
+        return []
+    columns = tuple(c for c in description.columns if c.lstrip("Ch").isdigit())
+    source = _source(index, times, "RCOU", columns)
+    if source is None or not columns:
+        return []
+    pulses = _stack(index, source, columns)
+    motors = [i for i in ardupilot_motor_outputs(parameters, _frame(index)) if i < len(columns)]
+    motors = motors or active_outputs(pulses)
+    if not motors:
+        return []
+    label = "RCOU " + " ".join(columns[i] for i in motors)
+    return [RawChannel("motor_command", source.t, pulses[:, motors], label, source.refused)]
+
+
+def _frame(index: DataflashIndex) -> str:
+    texts = index.text("MSG", "Message") if index.has("MSG", "Message") else []
+    return next((text.split(":", 1)[1].strip() for text in texts if text.startswith("Frame:")), "")
+
+
+def _esc(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+    """ESC telemetry comes one motor at a time; instances are output columns."""
+    number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
+    if number is None or not index.has("ESC", "RPM"):
+        return []
+    instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
+    motors = ardupilot_motor_outputs(parameters, _frame(index)) or sorted({int(i) for i in instance})
+    series = []
+    for motor in motors:
+        rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)
+        rising = np.concatenate([[True], np.diff(t[rows]) > 0.0])[: int(rows.sum())]
+        series.append((t[rows][rising], rpm[rows][rising] * RPM))
+    at, values = merge_instances(series)
+    return [RawChannel("rotor_speed", at, np.abs(values), f"ESC RPM of {len(motors)} motors")]

@@ -1,0 +1,91 @@
+"""Which logged outputs are motors, and rows of rotor speeds from telemetry that comes one motor at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+RPM = 2.0 * np.pi / 60.0
+"""One revolution per minute [rad/s]."""
+_LOWEST_PULSE, _HIGHEST_PULSE = 700.0, 2300.0
+_FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8, "OCTAQUAD": 8, "OCTA_QUAD": 8, "DODECAHEXA": 12}
+_PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
+
+
+def ardupilot_motor_outputs(parameters: Mapping[str, float], frame: str = "") -> list[int]:
+    """Returns the output columns (0 is the first) of motors 1, 2, 3 …; empty when the log does not say.
+
+    SERVOn_FUNCTION 33..40 and 82..85 are motors 1..8 and 9..12; older logs only tell the frame in a message.
+
+    Args:
+        parameters: ArduPilot parameters of the log.
+        frame: text after ``Frame:`` in the log's messages, such as ``QUAD/X``.
+    """
+    motors: dict[int, int] = {}
+    for output in range(1, 33):
+        function = int(parameters.get(f"SERVO{output}_FUNCTION", 0))
+        if 33 <= function <= 40:
+            motors[function - 33] = output - 1
+        elif 82 <= function <= 85:
+            motors[function - 82 + 8] = output - 1
+    if motors and sorted(motors) == list(range(len(motors))):
+        return [motors[i] for i in range(len(motors))]
+    return list(range(_FRAMES.get(frame.split("/")[0].strip().upper(), 0)))
+
+
+def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
+    """Returns the columns of motors 1, 2, 3 … in one bank of outputs.
+
+    PWM_<bank>_FUNCn 101..112 are motors 1..12.
+
+    Args:
+        parameters: PX4 parameters of the log.
+        bank: ``MAIN`` or ``AUX``.
+    """
+    motors = {}
+    for output in range(1, 17):
+        function = int(parameters.get(f"PWM_{bank}_FUNC{output}", 0))
+        if 101 <= function <= 112:
+            motors[function - 101] = output - 1
+    return [motors[i] for i in range(len(motors))] if sorted(motors) == list(range(len(motors))) else []
+
+
+def px4_rotor_count(parameters: Mapping[str, float]) -> int:
+    """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
+    count = int(parameters.get("CA_ROTOR_COUNT", 0))
+    return count or _PX4_TYPES.get(int(parameters.get("MAV_TYPE", 0)), 0)
+
+
+def active_outputs(pulses: FloatArray) -> list[int]:
+    """Returns the leading outputs that look like motors: pulses [us] in range that vary; shape (n, outputs)."""
+    columns = 0
+    for column in pulses.T:
+        plausible = (column > _LOWEST_PULSE) & (column < _HIGHEST_PULSE)
+        if plausible.mean() < 0.9 or np.ptp(column[plausible]) < 20.0:
+            break
+        columns += 1
+    return list(range(max((n for n in (3, 4, 6, 8, 12) if n <= columns), default=0)))
+
+
+def merge_instances(series: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Makes rows of signals that arrive one instance at a time.
+
+    Rows stand at the times of the instance with fewest samples; the others are interpolated linearly, never beyond
+    their ends.
+
+    Args:
+        series: for each instance times [s] (increasing) and values.
+
+    Returns:
+        Times (n,) and values (n, instances).
+    """
+    if not series or any(len(t) < 2 for t, _ in series):
+        return np.empty(0), np.empty((0, len(series)))
+    reference = min((t for t, _ in series), key=len)
+    first, last = max(t[0] for t, _ in series), min(t[-1] for t, _ in series)
+    at = reference[(reference >= first) & (reference <= last)]
+    return at, np.column_stack([np.interp(at, t, values) for t, values in series])
