@@ -3,9 +3,10 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
-# The first of these that is new enough; `make PYTHON=/path/to/python` overrides. The ROS wheels end at 3.13.
-PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
-	$$p -c 'import sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
+# A Python that the ROS wheels know (to 3.13), else any that is new enough; `make PYTHON=/path/to/python` overrides.
+try_python = for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= $(1))' 2>/dev/null && echo $$p && break; done
+PYTHON ?= $(or $(shell $(call try_python,(3, 13))),$(shell $(call try_python,(3, 99))))
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 # What is installed, one stamp a step; a step runs again only when what it reads has changed.
@@ -26,7 +27,7 @@ help: ## list the targets
 # --- the environment
 
 $(BIN)/python:
-	@test -n "$(PYTHON)" || { echo "No Python 3.11 to 3.13 with its venv module found: install one, or say make PYTHON=..." >&2; exit 1; }
+	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with its venv module found: install one (Debian: python3-venv), or say make PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(RUNTIME): pyproject.toml | $(BIN)/python
@@ -63,9 +64,12 @@ demo: venv ## fly, identify and diagnose three flights, write the report
 
 # --- check
 
-.PHONY: test lint typecheck format
-test: $(MESSAGES) lint typecheck ## everything that CI checks, but the browser
-	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser"
+.PHONY: test test-slow lint typecheck format
+test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and the browser's
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser and not slow"
+
+test-slow: $(MESSAGES) ## the tests that take minutes each
+	$(BIN)/pytest -m slow
 
 lint: $(DEV) ## style, format, and which room may import which
 	$(BIN)/ruff check .

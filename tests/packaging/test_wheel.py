@@ -1,0 +1,68 @@
+"""What `pip install .` brings: four packages with their data, one version, and imports that cost nothing."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
+
+import pytest
+
+PACKAGES = ("quadid", "quadid_replay", "quadid_node", "quadid_cli")
+HEAVY = ("numba", "scipy", "pandas", "plotly", "dask", "distributed", "zenoh", "pymavlink", "mcap", "pyulog", "rclpy")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> list[str]:
+    """Names of the files in a freshly built wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)],
+        cwd=repository,
+        check=True,
+        capture_output=True,
+    )
+    (built,) = folder.glob("quadid-*.whl")
+    with zipfile.ZipFile(built) as archive:
+        return archive.namelist()
+
+
+def test_all_packages_are_at_the_top_and_typed(wheel: list[str]) -> None:
+    assert {name.split("/")[0] for name in wheel if ".dist-info" not in name} == set(PACKAGES)
+    for package in PACKAGES:
+        assert f"{package}/__init__.py" in wheel
+        assert f"{package}/py.typed" in wheel
+
+
+def test_data_files_are_in_and_markers_are_out(wheel: list[str], repository: Path) -> None:
+    """Every tracked file of a package that is not Python source is data that the package reads."""
+    folders = {"quadid": "quadid", "replay": "replay/quadid_replay", "quadid_node": "quadid_node/quadid_node"}
+    folders["cli"] = "cli/quadid_cli"
+    tracked = subprocess.run(
+        ["git", "ls-files", *folders.values()], cwd=repository, check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert "quadid/vehicles/pelican.yaml" in tracked
+    for path in tracked:
+        name = re.sub(r"^(replay|cli|quadid_node(?=/quadid_node/))/", "", path)
+        assert (name in wheel) == (Path(path).name != "COLCON_IGNORE"), path
+
+
+def test_one_version_everywhere(repository: Path) -> None:
+    import quadid
+
+    version = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert quadid.__version__ == version
+    for manifest in ("msgs/package.xml", "quadid_node/package.xml"):
+        assert ElementTree.parse(repository / manifest).findtext("version") == version, manifest
+    assert f'version="{version}"' in (repository / "quadid_node" / "setup.py").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_importing_a_package_imports_nothing_heavy(package: str) -> None:
+    code = f"import sys, {package}; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"
+    printed = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert printed.split() == []

@@ -1,0 +1,79 @@
+"""The checkout as source of a colcon workspace: two packages, laid out as `ros2 run` and `ros2 launch` expect them."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import absent
+
+
+def colcon(scratch: Path, *arguments: str, **environment: str) -> str:
+    """Run this environment's colcon in a scratch folder; its output, or the test fails with it."""
+    if importlib.util.find_spec("colcon_core") is None:
+        absent(f"colcon is not installed in {sys.prefix}: run 'make dev'")
+    path = f"{Path(sys.prefix, 'bin')}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        [sys.executable, "-m", "colcon", "--log-base", str(scratch / "log"), *arguments],
+        cwd=scratch,
+        env={**os.environ, "PATH": path, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def assert_layout(prefix: Path, package: Path) -> None:
+    """What `ros2 run quadid_node identify` and `ros2 launch quadid_node identify.launch.py` look up under a prefix."""
+    assert (prefix / "share/ament_index/resource_index/packages/quadid_node").is_file()
+    assert (prefix / "share/quadid_node/package.xml").is_file()
+    for executable in ("identify", "replay"):
+        assert os.access(prefix / "lib/quadid_node" / executable, os.X_OK)
+    for folder in ("launch", "config"):
+        expected = {path.name for path in (package / folder).iterdir() if path.suffix in (".py", ".yaml")}
+        assert expected
+        assert {path.name for path in (prefix / "share/quadid_node" / folder).iterdir()} == expected
+
+
+@pytest.mark.parametrize("depth", ["root", "workspace"])
+def test_colcon_finds_exactly_two_packages(depth: str, tmp_path: Path, repository: Path) -> None:
+    base = repository
+    if depth == "workspace":
+        base = tmp_path / "ws"
+        (base / "src").mkdir(parents=True)
+        (base / "src" / "quadid").symlink_to(repository)
+    listed = colcon(tmp_path, "list", "--base-paths", str(base)).splitlines()
+    found = {line.split("\t")[0]: line.split("\t")[2] for line in listed}
+    assert found == {"quadid_msgs": "(ros.ament_cmake)", "quadid_node": "(ros.ament_python)"}
+
+
+@pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copied", "symlinked"])
+def test_node_builds_and_lands_where_ros2_looks(options: list[str], tmp_path: Path, repository: Path) -> None:
+    package = repository / "quadid_node"
+    before = sorted(path.name for path in package.iterdir())
+    colcon(tmp_path, "build", *options, "--base-paths", str(package))
+    assert_layout(tmp_path / "install" / "quadid_node", package)
+    assert sorted(path.name for path in package.iterdir()) == before, "the build left something in the checkout"
+
+
+@pytest.mark.slow
+def test_whole_workspace_builds(tmp_path: Path, repository: Path) -> None:
+    """Messages and node by one `colcon build`, as in a ROS installation; about a minute."""
+    colcon(
+        tmp_path,
+        *("build", "--base-paths", str(repository), "--cmake-args", "-DBUILD_TESTING=OFF", "-Wno-dev"),
+        *(f"-DPython3_EXECUTABLE={sys.executable}", f"-DCMAKE_PROJECT_INCLUDE={repository}/tools/wheel_targets.cmake"),
+        AMENT_PREFIX_PATH=sys.prefix,
+        CMAKE_PREFIX_PATH=sys.prefix,
+    )
+    assert_layout(tmp_path / "install" / "quadid_node", repository / "quadid_node")
+    messages = tmp_path / "install" / "quadid_msgs"
+    assert (messages / "share/ament_index/resource_index/rosidl_interfaces/quadid_msgs").is_file()
+    assert (messages / "share/quadid_msgs/msg/ParameterSet.json").is_file()  # carries the type hash
