@@ -1,0 +1,305 @@
+"""Equations of motion of the flown vehicle: Newton-Euler about the CG in body axes, attitude as a rotation matrix.
+
+World NED, body FRD, SI.  State vector `y`:
+
+====== ============================================================================
+0:3    position of the CG, world [m]
+3:6    velocity of the CG, world [m/s]
+6:15   rotation matrix R, body to world, row by row
+15:18  body rates nu = (p, q, r) [rad/s]
+18:21  integral of the specific force at the IMU, body axes [m/s]
+21:25  suspended load: swing north, east [rad], their rates [rad/s]
+25:29  flexible arms: roll torque, its rate, pitch torque, its rate [N m], [N m/s]
+29:33  slosh: displacement forward, right [m], their rates [m/s]
+====== ============================================================================
+
+The last twelve are integrated only when `Oddity.dynamic` is set.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.flight.jit import kernel
+from quadid.vehicle import GRAVITY
+
+FloatArray = NDArray[np.float64]
+STATES = 33
+RIGID_STATES = 21
+
+
+class Body(NamedTuple):
+    """Mass and geometry.  Everything but the rotor coefficients is measured from the CG.
+
+    Attributes:
+        mass: before any change [kg].
+        inertia, inverse: tensor and its inverse, shape (2, 3, 3): before and after `mass_change` [kg m^2].
+        rotor_inertia: J_r of the gyroscopic torque [kg m^2].
+        spin_up: J of tau_z += J dOmega_r/dt [kg m^2]; the paper's nominal model has none.
+        arms: rotor positions from the CG, shape (n, 3) [m].
+        spins: shape (n,), +1 or -1.
+        b, d: thrust and drag torque coefficient.
+        dead_speed: f = b (omega - dead_speed)^2 [rad/s].
+        centre: geometric centre from the CG [m].
+        imu: IMU from the CG [m].
+    """
+
+    mass: float
+    inertia: FloatArray
+    inverse: FloatArray
+    rotor_inertia: float
+    spin_up: float
+    arms: FloatArray
+    spins: FloatArray
+    b: float
+    d: float
+    dead_speed: float
+    centre: FloatArray
+    imu: FloatArray
+
+
+class Air(NamedTuple):
+    """Aerodynamics beside thrust and drag torque; all zero in the nominal truth.  Contract section 6.
+
+    Attributes:
+        drag_x, drag_y: k_x, k_y of rotor_drag [1/s].
+        parasitic: c [1/m].
+        moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the CG.
+        damping_p, damping_q: l_p, m_q [1/s].
+        axial: k_z [1/s].
+        wind_north, wind_east: velocity of the air [m/s].
+        ground_radius: effective rotor radius of the Cheeseman-Bennett ground effect [m].
+        hover_sum: sum of the rotor speeds in hover [rad/s].
+    """
+
+    drag_x: float
+    drag_y: float
+    parasitic: float
+    moment_x: float
+    moment_y: float
+    damping_p: float
+    damping_q: float
+    axial: float
+    wind_north: float
+    wind_east: float
+    ground_radius: float
+    hover_sum: float
+
+
+class Oddity(NamedTuple):
+    """Effects outside the catalogue that enter the equations of motion; all zero by default.
+
+    Attributes:
+        dynamic: True integrates load, arms and slosh.
+        load_share: suspended mass / vehicle mass; load_length [m]; load_damping: ratio; load_depth: hook below CG [m].
+        flex_share: share of the roll and pitch torque that passes the flexible arms; flex_speed: natural frequency
+            [rad/s]; flex_damping: ratio.
+        slosh_share: moving fluid / vehicle mass; slosh_speed [rad/s]; slosh_damping: ratio; slosh_depth below CG [m].
+        lift_gain: thrust grows by this fraction per m/s of horizontal airspeed [s/m].
+        lift_roll: rolling acceleration per product of forward and sideways airspeed [rad/m^2].
+    """
+
+    dynamic: bool = False
+    load_share: float = 0.0
+    load_length: float = 1.0
+    load_damping: float = 0.0
+    load_depth: float = 0.0
+    flex_share: float = 0.0
+    flex_speed: float = 1.0
+    flex_damping: float = 0.0
+    slosh_share: float = 0.0
+    slosh_speed: float = 1.0
+    slosh_damping: float = 0.0
+    slosh_depth: float = 0.0
+    lift_gain: float = 0.0
+    lift_roll: float = 0.0
+
+
+@kernel
+def rotor_wrench(omega: FloatArray, efficiency: FloatArray, body: Body, out: FloatArray) -> None:
+    """Sums what the rotors do, each at its own arm.
+
+    Args:
+        omega: rotor speeds, shape (n,) [rad/s].
+        efficiency: factor on thrust (column 0) and drag torque (column 1) of each rotor, shape (n, 2).
+        body: geometry.
+        out: sum of speeds [rad/s], thrust along -z [N], roll, pitch, yaw torque about the CG [N m], Omega_r [rad/s].
+    """
+    total = thrust = roll = pitch = yaw = spin_sum = 0.0
+    for i in range(omega.shape[0]):
+        speed = omega[i]
+        working = max(speed - body.dead_speed, 0.0)
+        force = efficiency[i, 0] * body.b * working * working
+        total += speed
+        thrust += force
+        # arm x (0, 0, -force)
+        roll -= body.arms[i, 1] * force
+        pitch += body.arms[i, 0] * force
+        yaw += body.spins[i] * efficiency[i, 1] * body.d * speed * speed
+        spin_sum += body.spins[i] * speed
+    out[0] = total
+    out[1] = thrust
+    out[2] = roll
+    out[3] = pitch
+    out[4] = yaw
+    out[5] = spin_sum
+
+
+@kernel
+def derivative(
+    y: FloatArray,
+    wrench: FloatArray,
+    power: float,
+    mass_factor: float,
+    changed: int,
+    push: FloatArray,
+    body: Body,
+    air: Air,
+    odd: Oddity,
+    dy: FloatArray,
+) -> None:
+    """Right-hand side of the equations of motion; kept whole because it reads like the free-body diagram.
+
+    Args:
+        y: state, shape (33,).
+        wrench: output of `rotor_wrench`, and the spin-up torque about z [N m] as seventh entry.
+        power: factor on thrust and drag torque of all rotors (battery, thrust drop).
+        mass_factor: present mass / original mass.
+        changed: 0 before, 1 after `mass_change`; selects the inertia.
+        push: outside disturbance: specific force in world axes [m/s^2], angular acceleration in body axes [rad/s^2].
+        body: mass and geometry.
+        air: aerodynamics.
+        odd: effects outside the catalogue.
+        dy: derivative, written.
+    """
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13], y[14]
+    p, q, r = y[15], y[16], y[17]
+    # velocity relative to the air, body axes
+    north, east, down = y[3] - air.wind_north, y[4] - air.wind_east, y[5]
+    u = r00 * north + r10 * east + r20 * down
+    v = r01 * north + r11 * east + r21 * down
+    w = r02 * north + r12 * east + r22 * down
+
+    thrust, roll, pitch = power * wrench[1], power * wrench[2], power * wrench[3]
+    yaw = power * wrench[4] + wrench[6]
+    if air.ground_radius != 0.0:
+        height = max(-y[2], 0.5 * abs(air.ground_radius))
+        ratio = air.ground_radius / (4.0 * height)
+        gain = 1.0 / (1.0 - ratio * ratio)
+        thrust, roll, pitch = gain * thrust, gain * roll, gain * pitch
+    if odd.lift_gain != 0.0:
+        thrust *= 1.0 + odd.lift_gain * np.sqrt(u * u + v * v)
+    if odd.flex_share != 0.0:
+        straight_roll, straight_pitch = roll, pitch
+        roll += odd.flex_share * (y[25] - straight_roll)
+        pitch += odd.flex_share * (y[27] - straight_pitch)
+        stiff = odd.flex_speed * odd.flex_speed
+        dy[25], dy[27] = y[26], y[28]
+        dy[26] = stiff * (straight_roll - y[25]) - 2.0 * odd.flex_damping * odd.flex_speed * y[26]
+        dy[28] = stiff * (straight_pitch - y[27]) - 2.0 * odd.flex_damping * odd.flex_speed * y[28]
+
+    activity = wrench[0] / air.hover_sum
+    force_x = -body.mass * air.drag_x * u * activity
+    force_y = -body.mass * air.drag_y * v * activity
+    # in-plane rotor force at height h above the CG: (0, 0, -h) x F
+    roll += air.moment_y * force_y
+    pitch -= air.moment_x * force_x
+    # thrust lost in climb acts at the geometric centre
+    lost = -body.mass * air.axial * w * activity
+    roll += body.centre[1] * lost
+    pitch -= body.centre[0] * lost
+    force_z = -thrust + lost
+    if air.parasitic != 0.0:
+        flat_plate = body.mass * air.parasitic * np.sqrt(u * u + v * v + w * w)
+        force_x -= flat_plate * u
+        force_y -= flat_plate * v
+        force_z -= flat_plate * w
+
+    mass = body.mass * mass_factor
+    # specific force, body axes
+    f_x = force_x / mass + r00 * push[0] + r10 * push[1] + r20 * push[2]
+    f_y = force_y / mass + r01 * push[0] + r11 * push[1] + r21 * push[2]
+    f_z = force_z / mass + r02 * push[0] + r12 * push[1] + r22 * push[2]
+    if odd.load_share != 0.0:
+        pull = odd.load_share * GRAVITY
+        pull_n, pull_e = pull * y[21], pull * y[22]
+        pull_x = r00 * pull_n + r10 * pull_e
+        pull_y = r01 * pull_n + r11 * pull_e
+        f_x += pull_x
+        f_y += pull_y
+        f_z += r02 * pull_n + r12 * pull_e
+        # hook below the CG: (0, 0, depth) x F
+        roll -= odd.load_depth * body.mass * pull_y
+        pitch += odd.load_depth * body.mass * pull_x
+    if odd.slosh_share != 0.0:
+        stiff = odd.slosh_speed * odd.slosh_speed
+        drag = 2.0 * odd.slosh_damping * odd.slosh_speed
+        # the fluid falls behind the specific force at its own depth and pulls the vehicle after it
+        spring_x = stiff * y[29] + drag * y[31]
+        spring_y = stiff * y[30] + drag * y[32]
+        f_x += odd.slosh_share * spring_x
+        f_y += odd.slosh_share * spring_y
+        roll += body.mass * odd.slosh_share * (-odd.slosh_depth * spring_y - y[30] * f_z)
+        pitch += body.mass * odd.slosh_share * (odd.slosh_depth * spring_x + y[29] * f_z)
+        dy[29], dy[30] = y[31], y[32]
+        dy[31] = -spring_x - f_x
+        dy[32] = -spring_y - f_y
+
+    # J nu' = tau - nu x (J nu) + J_r Omega_r (nu x z), full tensor
+    inertia, inverse = body.inertia[changed], body.inverse[changed]
+    h_x = inertia[0, 0] * p + inertia[0, 1] * q + inertia[0, 2] * r
+    h_y = inertia[1, 0] * p + inertia[1, 1] * q + inertia[1, 2] * r
+    h_z = inertia[2, 0] * p + inertia[2, 1] * q + inertia[2, 2] * r
+    gyroscopic = body.rotor_inertia * wrench[5]
+    m_x = roll + gyroscopic * q - (q * h_z - r * h_y)
+    m_y = pitch - gyroscopic * p - (r * h_x - p * h_z)
+    m_z = yaw - (p * h_y - q * h_x)
+    p_dot = inverse[0, 0] * m_x + inverse[0, 1] * m_y + inverse[0, 2] * m_z - air.damping_p * p + push[3]
+    q_dot = inverse[1, 0] * m_x + inverse[1, 1] * m_y + inverse[1, 2] * m_z - air.damping_q * q + push[4]
+    r_dot = inverse[2, 0] * m_x + inverse[2, 1] * m_y + inverse[2, 2] * m_z + push[5]
+    if odd.lift_roll != 0.0:
+        p_dot += odd.lift_roll * u * v
+
+    dy[0], dy[1], dy[2] = y[3], y[4], y[5]
+    dy[3] = r00 * f_x + r01 * f_y + r02 * f_z
+    dy[4] = r10 * f_x + r11 * f_y + r12 * f_z
+    dy[5] = r20 * f_x + r21 * f_y + r22 * f_z + GRAVITY
+    # R' = R [nu]x
+    for row in range(6, 15, 3):
+        a, b, c = y[row], y[row + 1], y[row + 2]
+        dy[row] = b * r - c * q
+        dy[row + 1] = c * p - a * r
+        dy[row + 2] = a * q - b * p
+    dy[15], dy[16], dy[17] = p_dot, q_dot, r_dot
+    # specific force at the IMU: f + nu' x l + nu x (nu x l)
+    l_x, l_y, l_z = body.imu[0], body.imu[1], body.imu[2]
+    along = p * l_x + q * l_y + r * l_z
+    spin2 = p * p + q * q + r * r
+    dy[18] = f_x + q_dot * l_z - r_dot * l_y + p * along - spin2 * l_x
+    dy[19] = f_y + r_dot * l_x - p_dot * l_z + q * along - spin2 * l_y
+    dy[20] = f_z + p_dot * l_y - q_dot * l_x + r * along - spin2 * l_z
+    if odd.load_share != 0.0:
+        stiff = GRAVITY / odd.load_length
+        rub = 2.0 * odd.load_damping * np.sqrt(stiff)
+        dy[21], dy[22] = y[23], y[24]
+        dy[23] = -stiff * y[21] - rub * y[23] - dy[3] / odd.load_length
+        dy[24] = -stiff * y[22] - rub * y[24] - dy[4] / odd.load_length
+
+
+@kernel
+def orthonormalise(y: FloatArray, at: int) -> None:
+    """Pulls the rotation matrix stored from index `at` of `y` back to SO(3): R <- R (3 I - R'R) / 2.
+
+    One Newton step of the polar projection; enough after every integration step.
+    """
+    gram = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            gram[i, j] = y[at + i] * y[at + j] + y[at + 3 + i] * y[at + 3 + j] + y[at + 6 + i] * y[at + 6 + j]
+    for row in range(at, at + 9, 3):
+        a, b, c = y[row], y[row + 1], y[row + 2]
+        for j in range(3):
+            y[row + j] = 1.5 * y[row + j] - 0.5 * (a * gram[0, j] + b * gram[1, j] + c * gram[2, j])

@@ -1,0 +1,244 @@
+"""The closed loop: sensors, pilot, stabiliser, rotors and airframe, marched through a flight at 1 kHz.
+
+Within one step the order is that of a real autopilot: sensors are read, the stabiliser computes, the command leaves.
+Whatever is logged at an instant is therefore the value just before the command of that instant acts.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.flight.airframe import Body, orthonormalise
+from quadid.flight.jit import kernel
+from quadid.flight.rotors import Drive, load_input, spin_up_kick
+
+FloatArray = NDArray[np.float64]
+NO_TIME = 1e300
+EPSILON = 1e-11
+
+
+class Plan(NamedTuple):
+    """Clock of a flight.
+
+    Attributes:
+        steps: number of steps; dt: length of a step [s]; start: time of the first step [s].
+        control_every, pilot_every, log_every: steps between stabiliser, pilot and log instants.
+        first_log: step of the first log row; rows: number of rows.
+    """
+
+    steps: int
+    dt: float
+    start: float
+    control_every: int
+    pilot_every: int
+    log_every: int
+    first_log: int
+    rows: int
+
+
+class OnBoard(NamedTuple):
+    """Sensor errors the stabiliser sees, too.
+
+    Attributes:
+        gyro_matrix, gyro_bias: measured = matrix true + bias.
+        accel_matrix, accel_bias: the same of the accelerometer.
+        pull: gain k of the attitude filter towards the accelerometer's tilt [1/s].
+        gyro_shake, accel_shake: rms of vibration in hover [rad/s], [m/s^2]; shake_phase: shape (6, rotors) [rad].
+    """
+
+    gyro_matrix: FloatArray
+    gyro_bias: FloatArray
+    accel_matrix: FloatArray
+    accel_bias: FloatArray
+    pull: float
+    gyro_shake: float
+    accel_shake: float
+    shake_phase: FloatArray
+
+
+class Events(NamedTuple):
+    """What happens at some time, or over time; fractions are losses.
+
+    Attributes:
+        mass_time, mass_fraction: mass grows by the fraction.
+        drop_time, drop_fraction: all rotors lose thrust and drag torque.
+        sag_fraction, sag_start, sag_end: linear loss from start to end.
+        faint_rotor: rotor that fails now and then (-1: none); faint_share: thrust lost meanwhile;
+            faint_times: shape (k, 2), start and end [s].
+    """
+
+    mass_time: float
+    mass_fraction: float
+    drop_time: float
+    drop_fraction: float
+    sag_fraction: float
+    sag_start: float
+    sag_end: float
+    faint_rotor: int
+    faint_share: float
+    faint_times: FloatArray
+
+
+class Track(NamedTuple):
+    """Output of the loop.
+
+    At every step: `gyro` body rates with vibration (k, 3), `accel` running integral of the specific force at the IMU
+    (k, 3), `attitude` quaternion of the AHRS without noise (k, 4), both before the step's command acts.  At every
+    control instant: `command` (c, n).  At every log row: `state` (rows, 33), `rotor` (rows, n), `reference` (rows, 4).
+    """
+
+    gyro: FloatArray
+    accel: FloatArray
+    attitude: FloatArray
+    command: FloatArray
+    state: FloatArray
+    rotor: FloatArray
+    reference: FloatArray
+
+
+@kernel
+def quaternion_of(m: FloatArray, out: FloatArray) -> None:
+    """Writes the unit quaternion (w >= 0) of rotation matrix `m` (3, 3) into `out`, by the largest component."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    if trace > 0.0:
+        s = 2.0 * np.sqrt(1.0 + trace)
+        out[0], out[1] = 0.25 * s, (m[2, 1] - m[1, 2]) / s
+        out[2], out[3] = (m[0, 2] - m[2, 0]) / s, (m[1, 0] - m[0, 1]) / s
+    else:
+        i = 0
+        if m[1, 1] > m[0, 0]:
+            i = 1
+        if m[2, 2] > m[i, i]:
+            i = 2
+        j, k = (i + 1) % 3, (i + 2) % 3
+        s = 2.0 * np.sqrt(max(1.0 + m[i, i] - m[j, j] - m[k, k], 1e-12))
+        sign = 1.0 if m[k, j] >= m[j, k] else -1.0
+        out[0] = sign * (m[k, j] - m[j, k]) / s
+        out[1 + i] = sign * 0.25 * s
+        out[1 + j] = sign * (m[j, i] + m[i, j]) / s
+        out[1 + k] = sign * (m[k, i] + m[i, k]) / s
+
+
+@kernel
+def turned(m: FloatArray, angle: FloatArray, out: FloatArray) -> None:
+    """Writes m exp([angle]x) into `out`: attitude `m` seen with a small body-frame rotation error [rad] (Rodrigues)."""
+    x, y, z = angle[0], angle[1], angle[2]
+    square = x * x + y * y + z * z
+    size = np.sqrt(square)
+    a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if size > 1e-4:
+        a, b = np.sin(size) / size, (1.0 - np.cos(size)) / square
+    for i in range(3):
+        u, v, w = m[i, 0], m[i, 1], m[i, 2]
+        along = u * x + v * y + w * z
+        out[i, 0] = u + a * (v * z - w * y) + b * (along * x - square * u)
+        out[i, 1] = v + a * (w * x - u * z) + b * (along * y - square * v)
+        out[i, 2] = w + a * (u * y - v * x) + b * (along * z - square * w)
+
+
+@kernel
+def shake(phase: FloatArray, omega: FloatArray, offsets: FloatArray, row: int, hover: float) -> float:
+    """Vibration of one axis with unit rms in hover: every rotor's imbalance, growing with speed squared."""
+    total = 0.0
+    for i in range(omega.shape[0]):
+        strength = omega[i] / hover
+        total += strength * strength * np.sin(phase[i] + offsets[row, i])
+    return float(total * np.sqrt(2.0 / omega.shape[0]))
+
+
+@kernel
+def pull_attitude(error: FloatArray, estimate: FloatArray, force: FloatArray, amount: float) -> None:
+    """Turns the attitude filter's world-frame error towards the accelerometer's idea of down.
+
+    With n = -f/|f| (down, says the accelerometer) and d the estimate's down, both in body axes, a complementary filter
+    adds k (n x d) to its body rate.  Seen from the world the error matrix turns by R_hat k (n x d) dt.
+
+    Args:
+        error: E in R_hat = E R, nine numbers; in place.
+        estimate: R_hat, shape (3, 3).
+        force: measured specific force [m/s^2].
+        amount: k dt.
+    """
+    size = np.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+    if size < 1e-6:
+        return
+    n_x, n_y, n_z = -force[0] / size, -force[1] / size, -force[2] / size
+    d_x, d_y, d_z = estimate[2, 0], estimate[2, 1], estimate[2, 2]
+    e_x, e_y, e_z = n_y * d_z - n_z * d_y, n_z * d_x - n_x * d_z, n_x * d_y - n_y * d_x
+    w_x = amount * (estimate[0, 0] * e_x + estimate[0, 1] * e_y + estimate[0, 2] * e_z)
+    w_y = amount * (estimate[1, 0] * e_x + estimate[1, 1] * e_y + estimate[1, 2] * e_z)
+    w_z = amount * (estimate[2, 0] * e_x + estimate[2, 1] * e_y + estimate[2, 2] * e_z)
+    for j in range(3):
+        a, b, c = error[j], error[3 + j], error[6 + j]
+        error[j] = a + w_y * c - w_z * b
+        error[3 + j] = b + w_z * a - w_x * c
+        error[6 + j] = c + w_x * b - w_y * a
+    orthonormalise(error, 0)
+
+
+@kernel
+def power_at(t: float, after_drop: bool, events: Events) -> float:
+    """Factor on thrust and drag torque of all rotors at time t [s]."""
+    factor = 1.0
+    if after_drop:
+        factor -= events.drop_fraction
+    if events.sag_fraction != 0.0:
+        part = (t - events.sag_start) / (events.sag_end - events.sag_start)
+        factor *= 1.0 - events.sag_fraction * min(max(part, 0.0), 1.0)
+    return factor
+
+
+@kernel
+def apply_due(
+    now: float,
+    plan: Plan,
+    head: int,
+    issued: int,
+    ramp_end: float,
+    arrival: FloatArray,
+    y: FloatArray,
+    omega: FloatArray,
+    level: FloatArray,
+    slope: FloatArray,
+    memory: FloatArray,
+    changed: int,
+    track: Track,
+    body: Body,
+    drive: Drive,
+) -> tuple[int, float]:
+    """Lets every command that has reached the rotors take effect; returns the queue's head and the ramp's end."""
+    if ramp_end <= now + EPSILON:
+        slope[:] = 0.0
+        ramp_end = NO_TIME
+    while head < issued and arrival[head] <= now + EPSILON:
+        before = 0.0
+        for i in range(omega.shape[0]):
+            before += body.spins[i] * omega[i]
+        load_input(drive, track.command[head], level, slope, memory, plan.dt)
+        if drive.ramp > 0.0:
+            ramp_end = arrival[head] + drive.ramp
+        elif drive.tau == 0.0 and drive.slew == 0.0:
+            after = 0.0
+            for i in range(omega.shape[0]):
+                omega[i] = level[i]
+                after += body.spins[i] * omega[i]
+            if body.spin_up != 0.0:
+                spin_up_kick(y, after - before, changed, body)
+        head += 1
+    return head, ramp_end
+
+
+@kernel
+def efficiencies(base: FloatArray, memory: FloatArray, drive: Drive, events: Events, t: float, out: FloatArray) -> None:
+    """Writes the factors on thrust and drag torque of every rotor at time t, shape (n, 2)."""
+    for i in range(base.shape[0]):
+        out[i, 0] = base[i, 0] * (1.0 + drive.hysteresis * memory[i])
+        out[i, 1] = base[i, 1]
+    if events.faint_rotor >= 0:
+        for k in range(events.faint_times.shape[0]):
+            if events.faint_times[k, 0] <= t < events.faint_times[k, 1]:
+                out[events.faint_rotor, 0] *= 1.0 - events.faint_share
+                out[events.faint_rotor, 1] *= 1.0 - events.faint_share

@@ -1,0 +1,180 @@
+"""The march through a flight: one numerical kernel, kept whole because it is the order of events."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.flight.airframe import Air, Body, Oddity
+from quadid.flight.jit import kernel
+from quadid.flight.loop import (
+    EPSILON,
+    NO_TIME,
+    Events,
+    OnBoard,
+    Plan,
+    Track,
+    apply_due,
+    efficiencies,
+    power_at,
+    pull_attitude,
+    quaternion_of,
+    shake,
+    turned,
+)
+from quadid.flight.pilot import Pilot, fly_by_hand
+from quadid.flight.rotors import Drive, advance
+from quadid.flight.stabiliser import stabilise
+
+FloatArray = NDArray[np.float64]
+FLEW, CRASHED = 0, 1
+
+
+@kernel
+def march(
+    plan: Plan,
+    body: Body,
+    air: Air,
+    odd: Oddity,
+    drive: Drive,
+    events: Events,
+    on_board: OnBoard,
+    pilot: Pilot,
+    gains: FloatArray,
+    mixer: FloatArray,
+    sticks: FloatArray,
+    gyro_noise: FloatArray,
+    tilt_noise: FloatArray,
+    arrival: FloatArray,
+    pushes: FloatArray,
+    efficiency: FloatArray,
+    y: FloatArray,
+    omega: FloatArray,
+    track: Track,
+) -> tuple[int, float]:
+    """Flies the closed loop.
+
+    Args:
+        plan: clock.
+        body: mass and geometry.
+        air: aerodynamics.
+        odd: effects outside the catalogue.
+        drive: from command to rotor speed.
+        events: what happens at some time.
+        on_board: sensor errors.
+        pilot: how firmly the vehicle is held in place.
+        gains: of the stabiliser, see `pack_gains`.
+        mixer: of the stabiliser, see `mixer_matrix`.
+        sticks: shape (pilot instants, 4).
+        gyro_noise: shape (control instants, 3) [rad/s].
+        tilt_noise: AHRS error as body rotation vector, shape (control instants, 3) [rad].
+        arrival: when each command reaches the rotors [s], non-decreasing, shape (control instants,).
+        pushes: disturbance, see `airframe.derivative`: shape (1, 6) for a constant one, or one row a step.
+        efficiency: factors on thrust and drag torque, shape (rotors, 2).
+        y: state at the start, shape (33,); in place.
+        omega: rotor speeds at the start [rad/s]; in place.
+        track: written.
+
+    Returns:
+        `FLEW` or `CRASHED` (hit the ground, overturned or diverged), and the time of the end [s].
+    """
+    rotors = omega.shape[0]
+    dt = plan.dt
+    level, slope = omega.copy(), np.zeros(rotors)
+    memory, phase, integral, trim = np.zeros(rotors), np.zeros(rotors), np.zeros(3), np.zeros(1)
+    reference, measured = np.zeros(4), np.zeros(3)
+    present = efficiency.copy()
+    error = np.zeros(9)
+    error[0] = error[4] = error[8] = 1.0
+    truth, ahrs, seen = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    force, shaken, powers = np.zeros(3), np.zeros(3), np.ones(3)
+    work = np.zeros((10, max(33, rotors)))
+    hover = air.hover_sum / rotors
+    dropped, changed, head, issued, ramp_end, row = False, 0, 0, 0, NO_TIME, 0
+    mass_factor = 1.0
+
+    for n in range(plan.steps):
+        now = plan.start + n * dt
+        # --- sensors, just before the command of this instant acts
+        for i in range(3):
+            for j in range(3):
+                truth[i, j] = y[6 + 3 * i + j]
+        for axis in range(3):
+            rate = y[15 + axis]
+            if on_board.gyro_shake > 0.0:
+                rate += on_board.gyro_shake * shake(phase, omega, on_board.shake_phase, axis, hover)
+            track.gyro[n, axis] = rate
+            track.accel[n, axis] = y[18 + axis] + shaken[axis]
+        if on_board.pull != 0.0:
+            for i in range(3):
+                for j in range(3):
+                    ahrs[i, j] = (
+                        error[3 * i] * truth[0, j] + error[3 * i + 1] * truth[1, j] + error[3 * i + 2] * truth[2, j]
+                    )
+            if n > 0:
+                for i in range(3):
+                    force[i] = on_board.accel_bias[i]
+                    for j in range(3):
+                        raw = (track.accel[n, j] - track.accel[n - 1, j]) / dt
+                        force[i] += on_board.accel_matrix[i, j] * raw
+                pull_attitude(error, ahrs, force, on_board.pull * dt)
+        else:
+            ahrs[:] = truth
+        quaternion_of(ahrs, track.attitude[n])
+
+        # --- pilot and stabiliser
+        if n % plan.pilot_every == 0:
+            stick = sticks[min(n // plan.pilot_every, sticks.shape[0] - 1)]
+            fly_by_hand(pilot, y[0:3], y[3:6], truth, stick, trim, reference)
+            tilted = truth[2, 2] < 0.1 or y[2] > 0.0 or not np.isfinite(y[15] + y[2] + y[3])
+            if tilted:
+                return CRASHED, now
+        if row < plan.rows and n == plan.first_log + row * plan.log_every:
+            track.state[row] = y
+            track.reference[row] = reference
+            track.rotor[row] = omega
+            row += 1
+        if n % plan.control_every == 0:
+            c = n // plan.control_every
+            turned(ahrs, tilt_noise[c], seen)
+            for i in range(3):
+                measured[i] = on_board.gyro_bias[i] + gyro_noise[c, i]
+                for j in range(3):
+                    measured[i] += on_board.gyro_matrix[i, j] * track.gyro[n, j]
+            stabilise(gains, mixer, reference, seen, measured, plan.control_every * dt, integral, track.command[c])
+            issued = c + 1
+
+        # --- the step, cut wherever something jumps
+        left, end = now, now + dt
+        push = pushes[min(n, pushes.shape[0] - 1)]
+        while end - left > EPSILON:
+            head, ramp_end = apply_due(
+                left, plan, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive
+            )
+            if changed == 0 and events.mass_time <= left + EPSILON:
+                changed, mass_factor = 1, 1.0 + events.mass_fraction
+            if events.drop_time <= left + EPSILON:
+                dropped = True
+            stop = min(end, ramp_end)
+            if head < issued:
+                stop = min(stop, arrival[head])
+            if changed == 0:
+                stop = min(stop, events.mass_time)
+            if not dropped:
+                stop = min(stop, events.drop_time)
+            h = end - left if end - stop < EPSILON else stop - left
+            if drive.hysteresis != 0.0 or events.faint_rotor >= 0:
+                efficiencies(efficiency, memory, drive, events, left, present)
+            powers[0] = power_at(left, dropped, events)
+            powers[1] = power_at(left + 0.5 * h, dropped, events)
+            powers[2] = power_at(left + h, dropped, events)
+            for i in range(rotors):
+                phase[i] += 0.5 * h * omega[i]
+            advance(y, omega, level, slope, present, powers, mass_factor, changed, push, drive, body, air, odd, h, work)
+            for i in range(rotors):
+                phase[i] += 0.5 * h * omega[i]
+            left += h
+        if on_board.accel_shake > 0.0:
+            for axis in range(3):
+                shaken[axis] += dt * on_board.accel_shake * shake(phase, omega, on_board.shake_phase, 3 + axis, hover)
+    return FLEW, plan.start + plan.steps * dt

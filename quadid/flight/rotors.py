@@ -1,0 +1,211 @@
+"""From command to rotor speed, and one exact-in-time Runge-Kutta step of the whole vehicle.
+
+Between two changes of the command every rotor speed is known in closed form (a straight line, or the first-order
+response to one), so only the airframe is integrated numerically and no step ever straddles a jump.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.flight.airframe import RIGID_STATES, STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
+from quadid.flight.jit import kernel
+
+FloatArray = NDArray[np.float64]
+
+
+class Drive(NamedTuple):
+    """The way from command to rotor speed.
+
+    Attributes:
+        tau: first-order lag [s]; 0 for none.
+        ramp: time in which the input moves to a new command [s]; 0 steps (held commands).
+        slew: largest rate of rotor speed [rad/s^2]; 0 for no limit.
+        ceiling: rotor speed that cannot be exceeded [rad/s]; 0 for none.
+        grain: commands are rounded to multiples of this [rad/s]; 0 for none.
+        hysteresis: thrust is (1 +- hysteresis) after the last change was up or down.
+    """
+
+    tau: float
+    ramp: float
+    slew: float = 0.0
+    ceiling: float = 0.0
+    grain: float = 0.0
+    hysteresis: float = 0.0
+
+
+@kernel
+def rotor_speed(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: float, s: float, out: FloatArray) -> None:
+    """Evaluates rotor speeds after time s of one piece of input.
+
+    Solves tau omega' = u - omega with u(s) = level + slope s:
+    omega(s) = u(s) - slope tau + (omega(0) - level + slope tau) exp(-s / tau).
+
+    Args:
+        omega: speeds at s = 0 [rad/s], shape (n,).
+        level: input at s = 0 [rad/s].
+        slope: its rate [rad/s^2].
+        tau: lag [s]; 0 makes the speed equal to the input.
+        s: time since the start of the piece [s].
+        out: speeds, written.
+    """
+    if tau > 0.0:
+        fade = np.exp(-s / tau)
+        for i in range(omega.shape[0]):
+            lag = slope[i] * tau
+            out[i] = level[i] + slope[i] * s - lag + (omega[i] - level[i] + lag) * fade
+    else:
+        for i in range(omega.shape[0]):
+            out[i] = level[i] + slope[i] * s
+
+
+@kernel
+def load_input(
+    drive: Drive, goal: FloatArray, level: FloatArray, slope: FloatArray, memory: FloatArray, dt: float
+) -> None:
+    """Starts a new piece of input towards a command that has just reached the rotors.
+
+    Args:
+        drive: lag, ramp, limits.
+        goal: the command [rad/s], shape (n,).
+        level: present input on entry, input at the start of the piece on return [rad/s].
+        slope: rate of the input [rad/s^2]; written.
+        memory: +1 or -1, direction of the last change, shape (n,); written.
+        dt: step [s] (unused without ramp).
+    """
+    for i in range(goal.shape[0]):
+        target = goal[i]
+        if drive.grain > 0.0:
+            target = np.rint(target / drive.grain) * drive.grain
+        if drive.ceiling > 0.0:
+            target = min(target, drive.ceiling)
+        if target != level[i]:
+            memory[i] = 1.0 if target > level[i] else -1.0
+        if drive.ramp > 0.0:
+            slope[i] = (target - level[i]) / drive.ramp
+        else:
+            level[i] = target
+            slope[i] = 0.0
+
+
+@kernel
+def limit_slew(drive: Drive, omega: FloatArray, level: FloatArray, slope: FloatArray, h: float) -> None:
+    """Replaces the piece over the next step by one that respects the slew limit (first-order accurate in h)."""
+    for i in range(omega.shape[0]):
+        wish = level[i] + slope[i] * h
+        step = min(max(wish - omega[i], -drive.slew * h), drive.slew * h)
+        level[i] = omega[i]
+        slope[i] = step / h
+
+
+@kernel
+def spin_up_torque(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: float, s: float, body: Body) -> float:
+    """Torque J dOmega_r/dt [N m] at time s of a piece, where the speeds are `omega`; zero when J is zero."""
+    if body.spin_up == 0.0:
+        return 0.0
+    rate = 0.0
+    for i in range(omega.shape[0]):
+        change = slope[i]
+        if tau > 0.0:
+            change = (level[i] + slope[i] * s - omega[i]) / tau
+        rate += body.spins[i] * change
+    return body.spin_up * rate
+
+
+@kernel
+def advance(
+    y: FloatArray,
+    omega: FloatArray,
+    level: FloatArray,
+    slope: FloatArray,
+    efficiency: FloatArray,
+    powers: FloatArray,
+    mass_factor: float,
+    changed: int,
+    push: FloatArray,
+    drive: Drive,
+    body: Body,
+    air: Air,
+    odd: Oddity,
+    h: float,
+    work: FloatArray,
+) -> None:
+    """Moves the vehicle by h with the classical Runge-Kutta scheme of order four; the input has no jump inside.
+
+    Args:
+        y: state of `airframe`, in place.
+        omega: rotor speeds [rad/s], in place.
+        level: input at the start of the step [rad/s]; moves along.
+        slope: its rate [rad/s^2].
+        efficiency: factors on thrust and drag torque, shape (n, 2).
+        powers: factor on thrust at the start, middle and end, shape (3,).
+        mass_factor: present mass / original mass.
+        changed: 0 before, 1 after `mass_change`.
+        push: outside disturbance, see `airframe.derivative`.
+        drive: from command to rotor speed.
+        body: mass and geometry.
+        air: aerodynamics.
+        odd: effects outside the catalogue.
+        h: step [s].
+        work: scratch, shape (at least 10, max(33, n)).
+    """
+    rotors = omega.shape[0]
+    states = STATES if odd.dynamic else RIGID_STATES
+    w0, w1, w2 = work[0], work[1], work[2]
+    mid, end = work[3, :rotors], work[4, :rotors]
+    k1, k2, k3, k4, probe = work[5], work[6], work[7], work[8], work[9]
+    tau = drive.tau
+    if drive.slew > 0.0:
+        limit_slew(drive, omega, level, slope, h)
+        tau = 0.0
+    rotor_speed(omega, level, slope, tau, 0.5 * h, mid)
+    rotor_speed(omega, level, slope, tau, h, end)
+    rotor_wrench(omega, efficiency, body, w0)
+    rotor_wrench(mid, efficiency, body, w1)
+    rotor_wrench(end, efficiency, body, w2)
+    w0[6] = spin_up_torque(omega, level, slope, tau, 0.0, body)
+    w1[6] = spin_up_torque(mid, level, slope, tau, 0.5 * h, body)
+    w2[6] = spin_up_torque(end, level, slope, tau, h, body)
+
+    derivative(y, w0, powers[0], mass_factor, changed, push, body, air, odd, k1)
+    for i in range(states):
+        probe[i] = y[i] + 0.5 * h * k1[i]
+    derivative(probe, w1, powers[1], mass_factor, changed, push, body, air, odd, k2)
+    for i in range(states):
+        probe[i] = y[i] + 0.5 * h * k2[i]
+    derivative(probe, w1, powers[1], mass_factor, changed, push, body, air, odd, k3)
+    for i in range(states):
+        probe[i] = y[i] + h * k3[i]
+    derivative(probe, w2, powers[2], mass_factor, changed, push, body, air, odd, k4)
+    for i in range(states):
+        y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+    orthonormalise(y, 6)
+    for i in range(rotors):
+        omega[i] = end[i]
+        level[i] += slope[i] * h
+
+
+@kernel
+def spin_up_kick(y: FloatArray, jump: float, changed: int, body: Body) -> None:
+    """Applies the impulse of a sudden change of Omega_r: J nu jumps by (0, 0, J_spin_up jump).
+
+    The accelerometer's integral receives the matching velocity jump at the IMU.
+
+    Args:
+        y: state, in place.
+        jump: change of Omega_r [rad/s].
+        changed: selects the inertia.
+        body: constants.
+    """
+    impulse = body.spin_up * jump
+    inverse = body.inverse[changed]
+    d_p, d_q, d_r = inverse[0, 2] * impulse, inverse[1, 2] * impulse, inverse[2, 2] * impulse
+    y[15] += d_p
+    y[16] += d_q
+    y[17] += d_r
+    y[18] += d_q * body.imu[2] - d_r * body.imu[1]
+    y[19] += d_r * body.imu[0] - d_p * body.imu[2]
+    y[20] += d_p * body.imu[1] - d_q * body.imu[0]
