@@ -31,6 +31,14 @@ def open_log(path: str | Path, preset: str = "auto") -> Recording:
         from quadid_replay.dataflash_reader import read_dataflash
 
         return read_dataflash(file, sha256)
+    if kind == "ulog":
+        from quadid_replay.ulog_reader import read_ulog
+
+        return read_ulog(file, sha256)
+    if kind == "tlog":
+        from quadid_replay.tlog_reader import read_tlog
+
+        return read_tlog(file, sha256)
     raise LogError(f"{file.name}: {kind} is not supported yet", "CSV")
 
 

@@ -1,0 +1,189 @@
+"""MAVLink telemetry logs: one vehicle's messages to channels on its boot clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega
+
+from quadid.errors import LogError
+from quadid.window import Recording
+from quadid_replay.clocks import LogClock, WrapCounter
+from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
+from quadid_replay.esc_messages import extend_dialect
+from quadid_replay.mavlink_frames import FrameCount, iterate_frames
+from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count
+from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES, Reading, boot_seconds, unix_seconds
+
+_DIALECT = extend_dialect(ardupilotmega)
+_WANTED = {n for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS or m.msgname in STATE_MESSAGES}
+_INVALID, _ARDUPILOT = 8, 3
+_ROTORCRAFT = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
+_WIDTH = {"esc": 12, "servo": 16, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
+
+
+class _VehicleLog:
+    """What one MAVLink component told: signals by (channel, message), parameters, type, clock."""
+
+    def __init__(self) -> None:
+        self.clock = LogClock()
+        self.signals: dict[tuple[str, str], Columns] = {}
+        self.parameters: dict[str, float] = {}
+        self.kind = 0
+        self.autopilot = _INVALID
+        self.rotors = 0
+        self._servo_clock = WrapCounter()
+        self._newest_boot: float | None = None
+        self._receive_offset: float | None = None
+        self._unix_offset: float | None = None
+        self._esc_rows: dict[str, tuple[float | None, int, list[float]]] = {}
+
+    def take(self, m: Any, received: float) -> None:
+        """Takes one decoded message received at UNIX time `received` [s]."""
+        name = m.get_type()
+        if name == "HEARTBEAT":
+            self.kind, self.autopilot = m.type, m.autopilot
+        elif name == "PARAM_VALUE":
+            self.parameters[str(m.param_id)] = float(m.param_value)
+        elif name == "ESC_INFO":
+            self.rotors = max(self.rotors, int(m.count))
+        elif name == "SYSTEM_TIME":
+            if m.time_unix_usec > 1e14:
+                self._unix_offset = m.time_unix_usec * 1e-6 - m.time_boot_ms * 1e-3
+        elif name != "RAW_IMU" or self.autopilot == _ARDUPILOT:  # elsewhere RAW_IMU counts in sensor units
+            readings = READERS[name](m)
+            if readings:
+                t = self._time(m, received)
+                for reading in readings:
+                    self._note(t, reading)
+
+    def _time(self, m: Any, received: float) -> float | None:
+        """Returns recording time: boot time where the message has it, else receive time mapped onto it."""
+        boot = boot_seconds(m)
+        if m.get_type() == "SERVO_OUTPUT_RAW" and boot is not None and self._newest_boot is not None:
+            boot = self._servo_clock.unwrap_near(boot * 1e6, self._newest_boot * 1e6) * 1e-6
+        if boot is None:
+            unix = unix_seconds(m)
+            if unix is not None and self._unix_offset is not None:
+                boot = unix - self._unix_offset
+            else:
+                boot = received - (self._receive_offset if self._receive_offset is not None else 0.0)
+        else:
+            if self._newest_boot is not None and boot < self._newest_boot - 1.0:
+                self._receive_offset = None  # perhaps a reboot: the offset belongs to the old boot
+            delay = received - boot
+            self._receive_offset = delay if self._receive_offset is None else min(self._receive_offset, delay)
+            self._newest_boot = boot
+        return self.clock.time(boot)
+
+    def _note(self, t: float | None, reading: Reading) -> None:
+        width = _WIDTH.get(reading.signal, 3)
+        columns = self.signals.setdefault((reading.signal, reading.source), Columns(width))
+        if reading.signal == "esc":
+            self._note_escs(t, reading, columns)
+        else:
+            columns.add(t, [*reading.values, *([0.0] * (width - len(reading.values)))])
+
+    def _note_escs(self, t: float | None, reading: Reading, columns: Columns) -> None:
+        """Joins the messages of one round (four ESCs each, rising index) to one row at the time of the first."""
+        key = reading.source
+        started, last, row = self._esc_rows.get(key, (None, columns.width, []))
+        if reading.place <= last:
+            if row:
+                columns.add(started, row)
+            started, row = t, [float("nan")] * columns.width
+        end = min(reading.place + len(reading.values), columns.width)
+        row[reading.place : end] = reading.values[: end - reading.place]
+        self._esc_rows[key] = (started, reading.place, row)
+
+    def finish(self) -> None:
+        """Adds the last round of ESC messages, which no other followed."""
+        for (signal, source), columns in self.signals.items():
+            started, _, row = self._esc_rows.get(source, (None, 0, []))
+            if signal == "esc" and row:
+                columns.add(started, row)
+
+
+def read_tlog(path: Path, sha256: str = "") -> Recording:
+    """Reads a telemetry log, whole or damaged; of several vehicles the one that tells most.
+
+    Raises:
+        LogError: no vehicle in it tells anything usable.
+    """
+    count = FrameCount()
+    vehicles: dict[tuple[int, int], _VehicleLog] = {}
+    bad = 0
+    decoder = _DIALECT.MAVLink(None)
+    for frame in iterate_frames(path, count):
+        if frame.message not in _WANTED:
+            continue
+        try:
+            message = decoder.decode(bytearray(frame.data))
+        except _DIALECT.MAVError:
+            bad += 1
+            continue
+        vehicles.setdefault((frame.system, frame.component), _VehicleLog()).take(message, frame.received)
+    if not any(v.signals for v in vehicles.values()):
+        raise LogError(
+            f"{path.name}: {count.frames} MAVLink frames but no measurements of a vehicle",
+            "IMU, attitude, servo or ESC messages", "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
+        )  # fmt: skip
+    for vehicle in vehicles.values():
+        vehicle.finish()
+    who = max(vehicles, key=lambda key: sum(len(c) for c in vehicles[key].signals.values()))
+    notes = _notes(count, bad, path.stat().st_size)
+    others = [key for key, v in vehicles.items() if key != who and v.signals]
+    if others:
+        notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")
+    raw = _channels(vehicles[who], notes)
+    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, sha256)
+
+
+def _notes(count: FrameCount, bad: int, size: int) -> list[str]:
+    notes = []
+    if count.skipped:
+        notes.append(f"{count.skipped} of {size} bytes are damaged and were skipped")
+    if bad:
+        notes.append(f"{bad} frames with a wrong checksum were refused")
+    if count.cut:
+        notes.append("the file ends inside a frame: it was cut; everything before is used")
+    return notes
+
+
+def _channels(vehicle: _VehicleLog, notes: list[str]) -> list[RawChannel]:
+    raw: list[RawChannel] = []
+    for channel, messages in PREFERENCE.items():
+        found = []
+        for message in messages:
+            for (signal, source), columns in vehicle.signals.items():
+                if signal == channel and source.split(" ")[0] == message:
+                    found.append(RawChannel(channel, *columns.arrays(), source, columns.refused))
+        raw += fastest_first(found, 2.0)
+    return raw + _motors(vehicle, notes)
+
+
+def _motors(vehicle: _VehicleLog, notes: list[str]) -> list[RawChannel]:
+    """ESC rpm of as many rotors as the vehicle has; outputs that are motors."""
+    if vehicle.kind and vehicle.kind not in _ROTORCRAFT:
+        notes.append(f"the vehicle calls itself MAV_TYPE {vehicle.kind}, no multirotor: its outputs are not used")
+        return []
+    rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or _ROTORCRAFT.get(vehicle.kind, 0)
+    raw: list[RawChannel] = []
+    for (signal, source), columns in vehicle.signals.items():
+        t, values = columns.arrays()
+        if signal == "esc":
+            known = ~np.isnan(values).all(axis=0) & (np.nan_to_num(values) != 0.0).any(axis=0)
+            width = rotors or int(np.count_nonzero(known))
+            raw.append(RawChannel("rotor_speed", t, values[:, :width], f"{source} (rpm)", columns.refused))
+        elif signal == "servo":
+            motors = ardupilot_motor_outputs(vehicle.parameters) or list(range(rotors)) or active_outputs(values)
+            label = f"{source} {' '.join(str(i + 1) for i in motors)}"
+            if motors:
+                raw.append(RawChannel("motor_command", t, values[:, motors], label, columns.refused))
+        elif signal == "actuator" and rotors:
+            raw.append(RawChannel("motor_command", t, values[:, :rotors], f"{source} (normalized)", columns.refused))
+    order: Iterable[RawChannel] = sorted(raw, key=lambda r: "ACTUATOR" not in r.source)
+    return list(order)

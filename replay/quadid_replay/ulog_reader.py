@@ -1,0 +1,233 @@
+"""PX4 ULog: which topic holds which channel.
+
+Body FRD and world NED are PX4's own; time is microseconds since boot, `timestamp_sample` where a topic has it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+
+from quadid.errors import LogError
+from quadid.window import Recording
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import RawChannel, assemble, fastest_first
+from quadid_replay.frames import to_euler
+from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.ulog_check import UlogDamage, check_ulog
+
+FloatArray = NDArray[np.float64]
+
+_TOPICS = [
+    "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",
+    "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
+    "esc_status",
+]  # fmt: skip
+_XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
+
+
+class _Log(NamedTuple):
+    """Topic instances by (name, instance), parameters, and the clock that counts wild stamps."""
+
+    topics: dict[tuple[str, int], dict[str, NDArray[Any]]]
+    parameters: dict[str, float]
+    clock: LogClock
+
+
+def read_ulog(path: Path, sha256: str = "") -> Recording:
+    """Reads a ULog, whole or damaged.
+
+    Raises:
+        LogError: nothing usable in it, or a file made to exhaust memory.
+    """
+    damage = check_ulog(path)
+    log = _load(path)
+    raw = [
+        *fastest_first(_gyro(log), 2.0),
+        *fastest_first(_accel(log), 2.0),
+        *_simple(log, "attitude", "vehicle_attitude", tuple(f"q[{i}]" for i in range(4))),
+        *_reference(log),
+        *_simple(log, "velocity", "vehicle_local_position", ("vx", "vy", "vz"), "v_xy_valid"),
+        *_simple(log, "position", "vehicle_local_position", ("x", "y", "z"), "xy_valid"),
+        *_battery(log),
+        *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
+        *_esc(log),
+    ]
+    return assemble(path.name, "ulog", raw, log.clock, _notes(damage, path.stat().st_size), sha256)
+
+
+def _notes(damage: UlogDamage, size: int) -> list[str]:
+    notes = []
+    if damage.skipped:
+        notes.append(f"{damage.skipped} of {size} bytes are damaged and were skipped")
+    if damage.cut:
+        notes.append("the file ends inside a record: it was cut; everything before is used")
+    return notes
+
+
+def _load(path: Path) -> _Log:
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints
+            ulog = ULog(str(path), message_name_filter_list=_TOPICS)
+    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
+        raise LogError(
+            f"{path.name}: its definitions are damaged ({type(error).__name__}: {str(error)[:80]})",
+            "a PX4 ULog", "copy the file again from the vehicle",
+        ) from error  # fmt: skip
+    topics = {(d.name, d.multi_id): d.data for d in reversed(ulog.data_list)}
+    parameters = {
+        str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)
+    }  # fmt: skip
+    return _Log(topics, parameters, LogClock())
+
+
+def _raw(
+    log: _Log, channel: str, key: tuple[str, int], values: FloatArray, stamp: str = "timestamp_sample", note: str = ""
+) -> RawChannel:
+    """Makes a channel of one topic instance; stamps far from their neighbours are refused.
+
+    A ULog is written by one boot, so each topic has its own clock and a step back is damage, not a reboot.
+    """
+    data = log.topics[key]
+    raw = data[stamp if stamp in data and np.any(data[stamp]) else "timestamp"].astype(np.float64) * 1e-6
+    t, accepted = LogClock().times(raw)
+    accepted &= t == raw
+    log.clock.wild += int(np.count_nonzero(~accepted))
+    source = f"{key[0]}{f' {key[1]}' if key[1] else ''}{f' ({note})' if note else ''}"
+    return RawChannel(channel, t[accepted], values[accepted], source)
+
+
+def _stack(data: dict[str, NDArray[Any]], columns: tuple[str, ...]) -> FloatArray:
+    return np.column_stack([data[c].astype(np.float64) for c in columns])
+
+
+def _has(log: _Log, key: tuple[str, int], *columns: str) -> bool:
+    return key in log.topics and "timestamp" in log.topics[key] and all(c in log.topics[key] for c in columns)
+
+
+def _simple(log: _Log, channel: str, topic: str, columns: tuple[str, ...], valid: str = "") -> list[RawChannel]:
+    key = (topic, 0)
+    if not _has(log, key, *columns):
+        return []
+    values = _stack(log.topics[key], columns)
+    if valid and _has(log, key, valid):
+        values[log.topics[key][valid] == 0] = np.nan
+        if np.isnan(values).all():
+            return []
+    return [_raw(log, channel, key, values)]
+
+
+def _gyro(log: _Log) -> list[RawChannel]:
+    out = _means(log, "gyro", "sensor_combined", "gyro_rad", "gyro_integral_dt")
+    out += _means(log, "gyro", "vehicle_imu", "delta_angle", "delta_angle_dt")
+    for entry in _simple(log, "gyro", "vehicle_angular_velocity", _XYZ):
+        out.append(entry._replace(source="vehicle_angular_velocity (filtered on board)"))
+    return out
+
+
+def _accel(log: _Log) -> list[RawChannel]:
+    out = _means(log, "accel", "sensor_combined", "accelerometer_m_s2", "accelerometer_integral_dt")
+    out += _means(log, "accel", "vehicle_imu", "delta_velocity", "delta_velocity_dt")
+    for entry in _simple(log, "accel", "vehicle_acceleration", _XYZ):
+        out.append(entry._replace(source="vehicle_acceleration (filtered on board)"))
+    return out
+
+
+def _means(log: _Log, channel: str, topic: str, field: str, interval: str) -> list[RawChannel]:
+    """Means over an interval [us] that ends at the stamp count at its middle; increments are divided by it first."""
+    key = (topic, 0)
+    columns = tuple(f"{field}[{i}]" for i in range(3))
+    if not _has(log, key, *columns, interval):
+        return []
+    data = log.topics[key]
+    width = data[interval].astype(np.float64) * 1e-6
+    values = _stack(data, columns)
+    if field.startswith("delta"):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = values / width[:, None]
+    shift = -0.5 * width
+    if channel == "accel" and _has(log, key, "accelerometer_timestamp_relative"):
+        relative = data["accelerometer_timestamp_relative"].astype(np.float64) * 1e-6
+        shift = np.where(np.abs(relative) < 1.0, shift + relative, np.nan)  # a huge one marks an invalid sample
+    entry = _raw(log, channel, key, np.column_stack([values, shift]))
+    return [entry._replace(t=entry.t + entry.values[:, 3], values=entry.values[:, :3])]
+
+
+def _reference(log: _Log) -> list[RawChannel]:
+    key = ("vehicle_attitude_setpoint", 0)
+    columns = tuple(f"q_d[{i}]" for i in range(4))
+    if not _has(log, key, *columns, "thrust_body[2]"):
+        return []
+    throttle = -log.topics[key]["thrust_body[2]"].astype(np.float64)
+    values = np.column_stack([to_euler(_stack(log.topics[key], columns)), throttle])
+    return [_raw(log, "attitude_reference", key, values, "timestamp")]
+
+
+def _battery(log: _Log) -> list[RawChannel]:
+    key = ("battery_status", 0)
+    if not _has(log, key, "voltage_v") or not np.any(log.topics[key]["voltage_v"] > 0.0):
+        return []
+    return [_raw(log, "battery", key, _stack(log.topics[key], ("voltage_v",)), "timestamp")]
+
+
+def _actuator_motors(log: _Log) -> list[RawChannel]:
+    key = ("actuator_motors", 0)
+    columns = tuple(f"control[{i}]" for i in range(12))
+    if not _has(log, key, *columns):
+        return []
+    values = _stack(log.topics[key], columns)
+    count = px4_rotor_count(log.parameters) or int(np.count_nonzero(np.isfinite(values).any(axis=0)))
+    values = values[:, :count]
+    factor = log.parameters.get("THR_MDL_FAC", 0.0)
+    note = "normalized"
+    if factor > 0.0:  # as PX4 itself turns relative thrust into the signal that goes to the ESC
+        rest = 1.0 - factor
+        values = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(values, 0.0)) - rest) / (2.0 * factor)
+        note = f"normalized, THR_MDL_FAC {factor:g} undone"
+    return [_raw(log, "motor_command", key, values, "timestamp", note)]
+
+
+def _actuator_outputs(log: _Log) -> list[RawChannel]:
+    """Pulse widths; of the banks MAIN and AUX and several instances, the first whose motor columns look like pulses."""
+    count = px4_rotor_count(log.parameters)
+    for instance in range(4):
+        key = ("actuator_outputs", instance)
+        columns = tuple(f"output[{i}]" for i in range(16))
+        if not _has(log, key, *columns):
+            continue
+        values = _stack(log.topics[key], columns)
+        for bank in ("AUX", "MAIN"):
+            motors = px4_motor_outputs(log.parameters, bank)
+            if motors and len(active_outputs(values[:, motors])) == len(motors):
+                return [_raw(log, "motor_command", key, values[:, motors], "timestamp", f"us, {bank}")]
+        motors = active_outputs(values)
+        if motors and (not count or len(motors) >= count):
+            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], "timestamp", "us")]
+    return []
+
+
+def _esc(log: _Log) -> list[RawChannel]:
+    key = ("esc_status", 0)
+    count = px4_rotor_count(log.parameters)
+    if not _has(log, key, "esc[0].esc_rpm"):
+        return []
+    data = log.topics[key]
+    present = [i for i in range(8) if f"esc[{i}].esc_rpm" in data and np.any(data[f"esc[{i}].esc_rpm"])]
+    order = {i: i for i in present}
+    for i in present:  # newer logs say which motor an ESC drives
+        functions = data.get(f"esc[{i}].actuator_function")
+        if functions is not None and len(functions) and 101 <= int(functions[-1]) <= 112:
+            order[i] = int(functions[-1]) - 101
+    present.sort(key=lambda i: order[i])
+    if not present or (count and len(present) != count):
+        return []
+    values = np.abs(_stack(data, tuple(f"esc[{i}].esc_rpm" for i in present))) * RPM
+    return [_raw(log, "rotor_speed", key, values, "timestamp", "rpm")]
