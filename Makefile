@@ -71,10 +71,13 @@ test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and 
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow
 
-lint: $(DEV) ## style, format, and which room may import which
+lint: $(DEV) ## style, format, which room may import which, shell, container
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/shellcheck .ci/run $(wildcard tools/*.sh docker/*.sh)
+	$(BIN)/hadolint --config docker/hadolint.yaml docker/Dockerfile
+	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.compose-spec docker/compose.yaml
 
 typecheck: $(DEV) ## mypy --strict
 	$(BIN)/mypy

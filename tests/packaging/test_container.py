@@ -1,0 +1,64 @@
+"""The container files as far as they can be checked without an engine; `make lint` checks their syntax."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+
+@pytest.fixture(scope="module")
+def dockerfile(repository: Path) -> str:
+    text = (repository / "docker" / "Dockerfile").read_text(encoding="utf-8")
+    return re.sub(r"\\\n", " ", text)
+
+
+@pytest.fixture(scope="module")
+def services(repository: Path) -> dict[str, Any]:
+    composed: dict[str, Any] = yaml.safe_load((repository / "docker" / "compose.yaml").read_text(encoding="utf-8"))
+    found: dict[str, Any] = composed["services"]
+    return found
+
+
+def test_everything_copied_exists_and_passes_the_ignore_file(dockerfile: str, repository: Path) -> None:
+    lines = (repository / "docker" / "Dockerfile.dockerignore").read_text(encoding="utf-8").splitlines()
+    allowed = [line[1:] for line in lines if line.startswith("!")]
+    copied = [source for line in re.findall(r"^COPY (.+)$", dockerfile, re.MULTILINE) for source in line.split()[:-1]]
+    assert copied
+    for source in copied:
+        assert (repository / source).exists(), source
+        assert any(fnmatch(source, pattern) for pattern in allowed), f"{source} is kept out by Dockerfile.dockerignore"
+
+
+def test_the_packages_of_the_wheel_are_all_copied(dockerfile: str, repository: Path) -> None:
+    import tomllib
+
+    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
+    for package in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        folder = package.split("/")[0]
+        assert f"COPY {folder} src/{folder}" in dockerfile
+
+
+def test_the_last_user_is_not_root(dockerfile: str) -> None:
+    (user,) = re.findall(r"^USER (\S+)$", dockerfile, re.MULTILINE)
+    assert user not in ("0", "root")
+
+
+def test_launch_arguments_of_the_node_service_exist(services: dict[str, Any], repository: Path) -> None:
+    package, launch, *arguments = services["node"]["command"].split()[2:]
+    assert package == "quadid_node"
+    text = (repository / package / "launch" / launch).read_text(encoding="utf-8")
+    assert arguments
+    for argument in arguments:
+        assert f'"{argument.split(":=")[0]}": (' in text, argument
+
+
+def test_only_the_router_is_reachable_and_only_from_this_machine(services: dict[str, Any]) -> None:
+    for name, service in services.items():
+        ports = service.get("ports", [])
+        assert bool(ports) == (name == "router")
+        assert all(port.startswith("127.0.0.1:") for port in ports)
