@@ -26,6 +26,10 @@ class Convergence(str, Enum):
     STUCK = "no step reduced the cost any further"
 
 
+LONGEST_STEP = 3.0
+"""No scaled parameter moves farther than this in one step."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """Gaussian prior on the scaled parameters: ``mean`` of the parameter, ``sigma`` in scaled units."""
@@ -107,48 +111,75 @@ def polish(
         tolerance: stop when every step is below this fraction of the parameter's standard deviation.
     """
     prior = prior or default_prior(shooting, free)
-    damping = 0.0
     lin = shooting.linearise(theta, free)
     if robust:
         shooting.robust = list(robust_weights(shooting, lin))
         lin = shooting.linearise(theta, free)
-    spent, outcome = 1, Convergence.BUDGET
+    damping, spent, outcome, settled = 0.0, 1, Convergence.BUDGET, False
     cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
-    states_settled = False
     while spent < iterations:
         precision, pull, _ = prior_terms(free, prior, theta)
         h = lin.gram.sum(axis=0) + np.diag(precision)
         g = lin.grad.sum(axis=0) + pull
-        z = -np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
-        z = np.clip(z, -1.0, 1.0) if not states_settled else np.clip(z, -3.0, 3.0)
-        sigma = np.sqrt(np.diag(np.linalg.inv(h)))
+        z = bounded_step(free, theta, h + damping * np.diag(np.diag(h)), g)
+        z *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(z), initial=0.0)), 1e-12))
         moved = free.move(theta, z)
-        actual = _scaled_difference(free, theta, moved)
-        states = shooting.step_states(theta, free, lin, actual)
-        previous = shooting.states(shooting._shape(theta, free)[0])
-        shooting.adopt(moved, free, states)
+        actual = scaled_difference(free, theta, moved)
+        kept = shooting.snapshot()
+        shooting.adopt(moved, free, shooting.step_states(theta, free, lin, actual))
         trial = shooting.linearise(moved, free)
         spent += 1
         trial_cost = float(trial.cost.sum()) + prior_terms(free, prior, moved)[2]
-        if not trial_cost <= cost * (1.0 + 1e-9) + 1e-9 and states_settled:
-            shooting.adopt(theta, free, previous)
+        # The first step also moves the initial states away from single noisy samples; it may cost a little.
+        if not trial_cost <= cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9:
+            shooting.restore(kept)
             damping = max(4.0 * damping, 1e-2)
             if damping > 1e6:
                 outcome = Convergence.STUCK
                 break
             continue
-        small = bool(np.all(np.abs(actual) <= tolerance * np.maximum(sigma, 1e-12)))
-        theta, lin, cost, damping = moved, trial, trial_cost, damping * 0.2 if damping > 1e-4 else 0.0
-        if states_settled and small:
+        gain, sigma = cost - trial_cost, 1.0 / np.sqrt(np.diag(h))
+        small = bool(np.all(np.abs(actual) <= tolerance * sigma)) or 0.0 <= gain < tolerance**2
+        theta, lin, cost, damping = moved, trial, trial_cost, (damping * 0.2 if damping > 1e-4 else 0.0)
+        if settled and small:
             outcome = Convergence.CONVERGED
             break
-        states_settled = True
+        settled = True
         if robust:
             shooting.robust = list(robust_weights(shooting, lin))
     return Polished(theta, lin, cost, spent, outcome)
 
 
-def _scaled_difference(free: Free, theta: FloatArray, moved: FloatArray) -> FloatArray:
+def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
+    """Minimises ``2 g z + z h z`` over steps that keep every parameter within its bounds (active set).
+
+    Parameters whose step would leave the bounds are fixed there and the others solved again.
+    """
+    low, high = np.empty(len(g)), np.empty(len(g))
+    for j, e in enumerate(free.entries):
+        value = theta[e.index]
+        if free.is_log[j]:
+            low[j], high[j] = np.log(e.lower / value), np.log(e.upper / value)
+        else:
+            low[j], high[j] = (e.lower - value) / e.typical, (e.upper - value) / e.typical
+    fixed = np.zeros(len(g), dtype=bool)
+    z = np.zeros(len(g))
+    for _ in range(len(g) + 1):
+        loose = ~fixed
+        if not loose.any():
+            break
+        rhs = g[loose] + h[np.ix_(loose, fixed)] @ z[fixed]
+        z[loose] = -np.linalg.solve(h[np.ix_(loose, loose)], rhs)
+        out = loose & ((z < low - 1e-12) | (z > high + 1e-12))
+        if not out.any():
+            break
+        z[out] = np.clip(z[out], low[out], high[out])
+        fixed |= out
+    return np.clip(z, low, high)
+
+
+def scaled_difference(free: Free, theta: FloatArray, moved: FloatArray) -> FloatArray:
+    """The scaled step that leads from `theta` to `moved`, shape (P,)."""
     old, new = theta[free.index], moved[free.index]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(free.is_log, np.log(new / old), (new - old) / free.scale)

@@ -8,7 +8,7 @@ the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -163,6 +163,53 @@ class Shooting:
         moves = any(n.startswith(_VELOCITY_NAMES) for n in free.names) or any(theta[i] != 0.0 for i in _VELOCITY_INDEX)
         tangents = {9: 9 if moves else 6, 12: 9, 15: 12}[self.channels]
         return (self.lead if warm else 1), tangents
+
+    @property
+    def has_velocity(self) -> bool:
+        """True when velocity or position is measured in every window."""
+        return self.channels > 9
+
+    def snapshot(self) -> dict[int, list[FloatArray]]:
+        """Copy of the current initial states, for `restore`."""
+        return dict(self._x0)
+
+    def restore(self, kept: dict[int, list[FloatArray]]) -> None:
+        """Puts back what `snapshot` gave."""
+        self._x0 = dict(kept)
+
+    def swarm_cost(self, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
+        """Cost of many parameter vectors at once on at most `most` segments, spread evenly.
+
+        The directions of the initial states are taken at `theta` and projected out (variable projection): within a
+        short segment they hardly depend on the parameters.
+
+        Returns:
+            A function of parameter vectors (m, size) giving costs (m,).
+        """
+        n_pre, k = self._shape(theta, free)
+        every = -(-self.count // most)
+        jobs = []
+        for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
+            cut = Segments(segments.length, segments.lead, np.ascontiguousarray(segments.starts[::every]))
+            x0 = np.ascontiguousarray(self.states(n_pre)[i][::every])
+            _, columns = self._columns(rollout, cut, theta, self.free([]), x0, n_pre, k)
+            weights = _weights(rollout, cut, self.channels) / np.sqrt(self.noise.variance)
+            flat = (columns[..., :k] * weights[..., None]).reshape(len(x0), -1, k)
+            flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / _RIDGE[:k])[None], len(flat), axis=0)], axis=1)
+            basis = np.linalg.qr(flat)[0][:, : -k]
+            jobs.append((rollout, cut, x0, weights, np.ascontiguousarray(basis.transpose(0, 2, 1))))
+
+        def cost(thetas: FloatArray) -> FloatArray:
+            total = np.zeros(len(thetas))
+            for rollout, cut, x0, weights, basis in jobs:
+                out, _ = rollout.roll(cut, thetas, x0, None, n_pre)
+                flat = (out[..., : self.channels, :] * weights[..., None]).reshape(*out.shape[:2], -1, LANES)
+                inside = np.matmul(basis, flat)
+                part = np.sum(flat * flat, axis=(1, 2)) - np.sum(inside * inside, axis=(1, 2))
+                total += part.reshape(-1)[: len(thetas)]
+            return total
+
+        return cost
 
     def linearise(self, theta: FloatArray, free: Free) -> Linearised:
         """Linearises all segments at `theta` and the current initial states; eliminates the initial states."""

@@ -103,7 +103,7 @@ class SwarmOptions:
 
     @property
     def chi(self) -> float:
-        """Constriction coefficient, Clerc & Kennedy Eq. (4.15) with kappa = 1."""
+        """Constriction coefficient of Clerc & Kennedy with kappa = 1: 2 / |2 - phi - sqrt(phi^2 - 4 phi)|."""
         phi = self.c1 + self.c2
         return 2.0 / abs(2.0 - phi - math.sqrt(phi * phi - 4.0 * phi))
 

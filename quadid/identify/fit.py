@@ -1,0 +1,250 @@
+"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.effects import EFFECTS
+from quadid.errors import NotIdentifiableError, WindowError
+from quadid.identify.noise import NoiseModel, estimate_noise
+from quadid.identify.polish import Convergence, Polished, Prior, default_prior, polish
+from quadid.identify.shooting import Free, Shooting
+from quadid.identify.swarm import Stop, Swarm, SwarmOptions
+from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
+from quadid.model.layout import LOSS, Layout
+from quadid.model.rollout import CHANNEL_NAMES
+from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+SWARM_SECONDS = 0.2
+FIT_SECONDS = 1.0
+SWARM_SEGMENTS = 400
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit.
+
+    Attributes:
+        particles, iterations: swarm size and most iterations; 0 iterations start from the initial guess.
+        swarm: variant of the swarm.
+        polish: run Gauss-Newton after the swarm.
+        seed: decides every random number.
+        seconds: length of the shooting segments of the final fit [s].
+        robust: down-weight outliers.
+    """
+
+    particles: int = 64
+    iterations: int = 60
+    swarm: SwarmOptions = field(default_factory=SwarmOptions)
+    polish: bool = True
+    seed: int = 0
+    seconds: float = FIT_SECONDS
+    robust: bool = True
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of an identification.
+
+    Attributes:
+        vehicle: the vehicle as given.
+        theta: full parameter vector.
+        parameters: free parameters with intervals and status.
+        noise: estimated sensor noise.
+        uncertainty: covariance of the scaled parameters.
+        outcome: how the polish ended.
+        evaluations: parameter vectors simulated over the data (finite differences included).
+        warnings: what a user should know.
+    """
+
+    vehicle: Vehicle
+    theta: FloatArray
+    parameters: ParameterSet
+    noise: NoiseModel
+    uncertainty: Uncertainty
+    outcome: Convergence
+    evaluations: int
+    warnings: tuple[str, ...] = ()
+
+
+def check_windows(windows: Sequence[Window]) -> None:
+    """Raises when `windows` lack what identification needs, saying what is missing and how to get it."""
+    if not windows:
+        raise WindowError("no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight")
+    if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
+        raise NotIdentifiableError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
+    if len({round(w.dt, 9) for w in windows}) > 1:
+        raise WindowError("windows on different grids", "one grid step for all", "give --rate")
+
+
+def fit(
+    windows: Sequence[Window], vehicle: Vehicle, options: FitOptions | None = None, names: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> Fit:  # fmt: skip
+    """Identifies parameters from flight data.
+
+    Args:
+        windows: training data on one grid.
+        vehicle: geometry, mass, initial guess, bounds and known effects.
+        options: swarm, seed, segment length.
+        names: parameters to free; by default the paper's six.
+        progress: called with a stage and a fraction done.
+
+    Raises:
+        WindowError: unusable data.
+        NotIdentifiableError: a needed channel is missing.
+    """
+    options = options or FitOptions()
+    report = progress or (lambda stage, share: None)
+    check_windows(windows)
+    layout = Layout(vehicle)
+    free_names = list(names or NOMINAL_NAMES)
+    theta = layout.initial(vehicle)
+    short = Shooting(windows, vehicle, SWARM_SECONDS, layout=layout)
+    evaluations = 0
+    if options.iterations > 0:
+        theta, evaluations = swarm_search(short, theta, short.free(free_names), options, report)
+    if not options.polish:
+        return _finish(short, theta, free_names, Convergence.BUDGET, evaluations)
+    report("polish", 0.0)
+    free = short.free(free_names)
+    first = polish(short, theta, free, iterations=8)
+    short.noise = residual_noise(short, first)
+    first = polish(short, first.theta, free, iterations=8)
+    noise, spent = noise_floor(short, first.theta, free)
+    report("polish", 0.4)
+    final = Shooting(windows, vehicle, options.seconds, noise, layout)
+    result = polish(final, first.theta, final.free(free_names), robust=options.robust)
+    if not np.isfinite(result.cost):
+        result = first
+    report("polish", 1.0)
+    evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
+    return _finish(final, result.theta, free_names, result.outcome, evaluations, result)
+
+
+def _finish(
+    shooting: Shooting, theta: FloatArray, names: list[str], outcome: Convergence, evaluations: int,
+    polished: Polished | None = None,
+) -> Fit:  # fmt: skip
+    free = shooting.free(names)
+    prior = default_prior(shooting, free)
+    lin = polished.lin if polished is not None else shooting.linearise(theta, free)
+    unc = uncertainty(lin, free, prior, theta)
+    initial = shooting.layout.initial(shooting.vehicle)
+    parameters = parameter_set(free, theta, initial, unc)
+    return Fit(
+        shooting.vehicle, theta, parameters, shooting.noise, unc, outcome, evaluations,
+        _warnings(free, theta, unc, prior),
+    )  # fmt: skip
+
+
+def _warnings(free: Free, theta: FloatArray, unc: Uncertainty, prior: Prior) -> tuple[str, ...]:
+    out = []
+    for e in free.entries:
+        value = theta[e.index]
+        if value <= e.lower * (1 + 1e-9) or value >= e.upper * (1 - 1e-9):
+            out.append(f"{e.name} = {value:.4g} {e.unit} rests on its bound [{e.lower:.4g}, {e.upper:.4g}]")
+    grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
+    if grown:
+        out.append(
+            "residuals are larger or more correlated than noise, so intervals were widened: " + ", ".join(grown)
+            + "; quadid diagnose names the cause"
+        )  # fmt: skip
+    return tuple(out)
+
+
+def swarm_search(
+    shooting: Shooting, theta: FloatArray, free: Free, options: FitOptions, report: Progress
+) -> tuple[FloatArray, int]:
+    """Global search by the particle swarm on a thinned set of segments.
+
+    Returns:
+        Full vector of the best particle, and the number of parameter vectors simulated.
+    """
+    lower, upper = _box(free)
+    start = _to_box(free, theta[free.index])
+    cost = shooting.swarm_cost(theta, free, SWARM_SEGMENTS)
+    guess = np.clip(start, lower, upper)[None]
+    settings = replace(options.swarm, iterations=options.iterations, initial_points=guess)
+    swarm = Swarm(lower, upper, options.particles, options.seed, settings)
+    done = 0
+    while swarm.stop is Stop.RUNNING:
+        points = swarm.ask()
+        thetas = np.repeat(theta[None], len(points), axis=0)
+        thetas[:, free.index] = _from_box(free, points)
+        swarm.tell(cost(thetas))
+        done += 1
+        report("swarm", min(done / (options.iterations + 1), 1.0))
+    best = theta.copy()
+    best[free.index] = _from_box(free, swarm.best[None])[0]
+    return best, done * options.particles
+
+
+def _box(free: Free) -> tuple[FloatArray, FloatArray]:
+    low = _to_box(free, np.array([e.lower for e in free.entries]))
+    high = _to_box(free, np.array([e.upper for e in free.entries]))
+    return low, high
+
+
+def _to_box(free: Free, values: FloatArray) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(free.is_log, np.log(values), values / free.scale)
+
+
+def _from_box(free: Free, points: FloatArray) -> FloatArray:
+    return np.where(free.is_log, np.exp(points), points * free.scale)
+
+
+def residual_noise(shooting: Shooting, polished: Polished) -> NoiseModel:
+    """Noise from the residuals of a polish, all structure counted as noise (a starting point)."""
+    lin = polished.lin
+    used = float(lin.rows.sum())
+    freedom = max(used - lin.gram.shape[1], 1.0) / max(used, 1.0)
+    return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
+
+
+def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
+    """Everything the catalogue can free at once on these data: the model that leaves only noise."""
+    # Left out: what is neutral in a product (moments of a drag that is absent), needs a time, or doubles another cause.
+    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "rotor_drag_moment", "command_delay"}
+    if not shooting.has_velocity:
+        skip.add("parasitic_drag")
+    out = list(NOMINAL_NAMES)
+    for name in layout.entries:
+        effect = name.split(".")[0]
+        if effect in EFFECTS and effect not in skip and not name.endswith(".time"):
+            out.append(name)
+    losses = [n for n, e in layout.entries.items() if e.index >= LOSS]
+    return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
+
+
+def noise_floor(shooting: Shooting, theta: FloatArray, free: Free, iterations: int = 4) -> tuple[NoiseModel, int]:
+    """Sensor noise from a deliberately flexible fit on short segments, and the vectors simulated for it.
+
+    Args:
+        shooting: short segments; its initial states are left as they were.
+        theta: nominal optimum.
+        free: nominal free parameters (kept free).
+        iterations: linearisations to spend.
+    """
+    names = list(dict.fromkeys([*free.names, *flexible_names(shooting.layout, shooting)]))
+    wide = shooting.free(names)
+    keep = shooting.snapshot()
+    result = polish(shooting, theta, wide, iterations=iterations)
+    noise = residual_noise(shooting, result)
+    shooting.restore(keep)
+    return noise, result.iterations * (len(names) + 10)
+
+
+def channel_names(channels: int) -> tuple[str, ...]:
+    """Names of the residual channels in order."""
+    return CHANNEL_NAMES[:channels]

@@ -1,0 +1,116 @@
+"""What the data say about each parameter: covariance corrected for autocorrelation, intervals, status."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.polish import Prior, prior_terms
+from quadid.identify.shooting import Free, Linearised
+from quadid.parameters import Parameter, ParameterSet, Status
+
+FloatArray = NDArray[np.float64]
+
+Z95 = 1.959963984540054
+LAG_SECONDS = 2.0
+"""Scores of segments up to this far apart may be correlated."""
+KNOWN = 0.03
+"""A log-scale standard deviation below this is identified whatever its correlations."""
+RATIO_SIGMA = 0.05
+RATIO_GAIN = 0.25
+"""A ratio is known when its standard deviation is below RATIO_SIGMA and below RATIO_GAIN of the parameter's own."""
+PRIOR_SHARE = 0.5
+"""A parameter whose posterior is wider than this share of its prior is prior-dominated."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of the scaled parameters.
+
+    Attributes:
+        covariance: posterior with prior, corrected, shape (P, P).
+        inflation: factor on each standard deviation from autocorrelated or excess residuals, shape (P,).
+        prior_sigma: standard deviation of the prior, shape (P,).
+    """
+
+    covariance: FloatArray
+    inflation: FloatArray
+    prior_sigma: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviation of each scaled parameter, shape (P,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def uncertainty(lin: Linearised, free: Free, prior: Prior, theta: FloatArray) -> Uncertainty:
+    """Posterior covariance, widened where the segment scores are larger or more correlated than the noise model says.
+
+    The widening is the ratio of the heteroscedasticity- and autocorrelation-consistent ("sandwich") variance (Newey and
+    West, Econometrica 55 (1987) 703) to the model's; it is applied only where it exceeds its own sampling error, so
+    that well-modelled data keep the efficient interval.
+    """
+    precision, _, _ = prior_terms(free, prior, theta)
+    covariance = np.linalg.inv(lin.gram.sum(axis=0) + np.diag(precision))
+    inflation = np.ones(len(free.entries))
+    if len(lin.grad) >= 10:
+        meat, lags = _meat(lin)
+        ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
+        sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
+        inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
+    return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
+
+
+def _meat(lin: Linearised) -> tuple[FloatArray, int]:
+    """Bartlett-weighted sum of score products over segments of the same window, and the number of lags used."""
+    step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
+    lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
+    scores = lin.grad - lin.grad.mean(axis=0)
+    meat = scores.T @ scores
+    for lag in range(1, min(lags, len(scores) - 1) + 1):
+        near = (lin.window[lag:] == lin.window[:-lag]) & (lin.time[lag:] - lin.time[:-lag] < (lag + 0.5) * step)
+        cross = scores[lag:][near].T @ scores[:-lag][near]
+        meat += (1.0 - lag / (lags + 1.0)) * (cross + cross.T)
+    return meat, lags
+
+
+def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncertainty) -> ParameterSet:
+    """Parameters with units, intervals (log scale for nominal ones) and status."""
+    sigma = unc.sigma
+    out = []
+    for j, e in enumerate(free.entries):
+        value, half = float(theta[e.index]), Z95 * float(sigma[j])
+        log = bool(free.is_log[j])
+        ci = (value * math.exp(-half), value * math.exp(half)) if log else (value - half * e.typical, value + half * e.typical)
+        status, partner = _status(j, free, unc)
+        out.append(
+            Parameter(
+                e.name, e.unit, value, float(sigma[j]) * (value if log else e.typical), float(initial[e.index]),
+                (e.lower, e.upper), status, partner, ci,
+            )
+        )  # fmt: skip
+    scale = free.jacobian(theta)
+    return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
+
+
+def _status(j: int, free: Free, unc: Uncertainty) -> tuple[Status, str | None]:
+    sigma = unc.sigma
+    if not free.is_log[j]:
+        dominated = sigma[j] > PRIOR_SHARE * unc.prior_sigma[j]
+        return (Status.PRIOR_DOMINATED if dominated else Status.IDENTIFIED), None
+    if sigma[j] <= KNOWN:
+        return Status.IDENTIFIED, None
+    if sigma[j] > PRIOR_SHARE * unc.prior_sigma[j]:
+        return Status.PRIOR_DOMINATED, None
+    best, partner = math.inf, None
+    for k in np.flatnonzero(free.is_log):
+        if k != j and sigma[k] > 0.3 * sigma[j]:
+            spread = math.sqrt(max(unc.covariance[j, j] + unc.covariance[k, k] - 2.0 * unc.covariance[j, k], 0.0))
+            if spread < best:
+                best, partner = spread, free.entries[int(k)].name
+    if best <= min(RATIO_SIGMA, RATIO_GAIN * sigma[j]):
+        return Status.RATIO_ONLY, partner
+    return Status.IDENTIFIED, None
