@@ -68,11 +68,15 @@ EFFECTS: dict[str, Effect] = {
         # The vehicle file gives the cutoff; neutral is an infinite cutoff, written by leaving the effect out.
         Effect("imu_lag", (P("cutoff", "Hz", float("inf"), 1.0, float("inf"), 8.0),), "The IMU is filtered and late."),
         Effect("attitude_delay", (P("delay", "s", 0.0, 0.0, 0.12, 0.03),), "The attitude estimate is late."),
-        Effect("rotor_drag", _axes("k_x k_y", "1/s", 3.0, 0.25), "The turning rotors drag against sideways flight."),
-        Effect("parasitic_drag", (P("c", "1/m", 0.0, -0.5, 0.5, 0.03),), "The frame has air drag."),
+        Effect(
+            "rotor_drag",
+            (P("k_x", "1/s", 0.0, -0.1, 3.0, 0.25), P("k_y", "1/s", 0.0, -0.1, 3.0, 0.25)),
+            "The turning rotors drag against sideways flight.",
+        ),
+        Effect("parasitic_drag", (P("c", "1/m", 0.0, 0.0, 0.5, 0.03),), "The frame has air drag."),
         Effect("rotor_drag_moment", _axes("h_x h_y", "m", 0.3, 0.02), "Rotor drag acts above or below the CG."),
         Effect("rate_damping", _axes("l_p m_q", "1/s", 30.0, 1.0), "Rotation is damped by the air."),
-        Effect("axial_inflow", (P("k_z", "1/s", 0.0, -3.0, 3.0, 0.25),), "Thrust falls when climbing."),
+        Effect("axial_inflow", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25),), "Thrust falls when climbing."),
         Effect("wind", _axes("north east", "m/s", 30.0, 3.0), "The air moves.", per_log=True),
         Effect(
             "weak_rotor",
@@ -92,9 +96,7 @@ EFFECTS: dict[str, Effect] = {
             "All rotors lost thrust at one moment.",
             per_log=True,
         ),
-        Effect(
-            "battery_sag", (P("fraction", "", 0.0, -0.6, 0.6, 0.1),), "Thrust fades over the flight.", per_log=True
-        ),
+        Effect("battery_sag", (P("fraction", "", 0.0, -0.6, 0.6, 0.1),), "Thrust fades over the flight.", per_log=True),
         Effect(
             "thrust_curve", (P("dead_speed", "rad/s", 0.0, -1000.0, 1000.0, 40.0),), "Thrust is not purely quadratic."
         ),

@@ -91,6 +91,8 @@ class Linearised:
     Attributes:
         gram: shape (segments, P, P); grad: (segments, P); cost: (segments,), all for scaled parameters z:
             ``cost(z) = cost + 2 grad z + z gram z``.
+        occam: what freeing unmeasured initial velocities costs, shape (segments,): the log-determinant that turns the
+            profile deviance into the marginal one; added when models are compared, zero where velocity matters not.
         rows: independent residuals of each segment, measured samples less fitted initial-state directions.
         residuals: predicted - measured at the linearisation point, channel units, (segments, length, channels).
         weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
@@ -101,6 +103,7 @@ class Linearised:
     gram: FloatArray
     grad: FloatArray
     cost: FloatArray
+    occam: FloatArray
     rows: FloatArray
     residuals: FloatArray
     weights: FloatArray
@@ -257,6 +260,12 @@ class Shooting:
         segments: Segments, k: int,
     ) -> Linearised:  # fmt: skip
         count, length, channels, width = columns.shape
+        if not (np.isfinite(base).all() and np.isfinite(columns).all()):
+            # The simulation ran away at this point: an infinite cost, which every search steps back from.
+            base, columns = np.zeros_like(base), np.zeros_like(columns)
+            away = np.inf
+        else:
+            away = 0.0
         stacked = np.concatenate([columns, base[..., None]], axis=3)
         white = self.whiten(stacked, weights)
         flat = white.reshape(count, length * channels, width + 1)
@@ -265,11 +274,13 @@ class Shooting:
         ga, gb, cost = h[:, :k, width].copy(), h[:, k:width, width], h[:, width, width].copy()
         informed = np.einsum("sii->si", haa).copy()
         haa[:, range(k), range(k)] += 1.0 / _RIDGE[:k] ** 2
+        occam = np.zeros(count)
         if k >= 9 and not self._has_velocity(i):
             v = x0[:, 7:10]
             haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
             ga[:, 6:9] += v / VELOCITY_PRIOR**2
             cost += np.sum(v * v, axis=1) / VELOCITY_PRIOR**2
+            occam = _log_determinant_beyond(haa, 6) + 6.0 * np.log(VELOCITY_PRIOR)
         solved = np.linalg.solve(haa, np.concatenate([hab, ga[..., None]], axis=2))
         slope, offset = solved[..., :-1], solved[..., -1]
         hab_t = hab.transpose(0, 2, 1)
@@ -277,7 +288,8 @@ class Shooting:
         return Linearised(
             gram=hbb - hab_t @ slope,
             grad=gb - np.einsum("skp,sk->sp", hab, offset),
-            cost=cost - np.sum(ga * offset, axis=1),
+            cost=cost - np.sum(ga * offset, axis=1) + away,
+            occam=occam,
             rows=np.count_nonzero(weights, axis=(1, 2)) - fitted,
             residuals=base,
             weights=weights,
@@ -317,6 +329,12 @@ class Shooting:
         self.set_states(self._shape(theta, free)[0], states)
 
 
+def _log_determinant_beyond(h: FloatArray, first: int) -> FloatArray:
+    """Log-determinant of the Schur complement of the leading `first` directions in each matrix of h."""
+    whole, lead = np.linalg.slogdet(h)[1], np.linalg.slogdet(h[:, :first, :first])[1]
+    return np.asarray(whole - lead)
+
+
 def _weights(rollout: Rollout, segments: Segments, channels: int) -> FloatArray:
     rows = segments.starts[:, None] + np.arange(segments.length)
     return rollout.valid[rows][..., :channels].astype(np.float64)
@@ -344,5 +362,5 @@ def _join(parts: list[Linearised]) -> Linearised:
         return np.concatenate([getattr(p, name) for p in parts])
 
     back = (np.concatenate([p.back[0] for p in parts]), np.concatenate([p.back[1] for p in parts]))
-    fields = ("gram", "grad", "cost", "rows", "residuals", "weights", "window", "time")
+    fields = ("gram", "grad", "cost", "occam", "rows", "residuals", "weights", "window", "time")
     return replace(parts[0], back=back, **{f: cat(f) for f in fields})

@@ -1,0 +1,105 @@
+"""The causes a diagnosis may name: which entries of the parameter vector each frees, and how its search starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.effects import EFFECTS
+from quadid.model import layout as ix
+from quadid.model.layout import NEVER, Layout
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One cause that may be added to the model.
+
+    Attributes:
+        effect: name of the effect.
+        names: entries it frees.
+        starts: non-neutral starting values of those entries, for causes that cannot be linearised at neutral.
+        family: look-alikes; when one of a family is short-listed all of it is refitted.
+        requires: effect that must be in the model first.
+        timed: index of its time entry, when it begins at an unknown moment.
+    """
+
+    effect: str
+    names: tuple[str, ...]
+    starts: tuple[tuple[float, ...], ...] = ()
+    family: str = ""
+    requires: str | None = None
+    timed: int | None = None
+    label: str = field(default="")
+
+    def __post_init__(self) -> None:
+        """Labels the candidate by its effect, and by its rotor for `weak_rotor`."""
+        if not self.label:
+            object.__setattr__(self, "label", self.effect)
+
+
+_FAMILY = {
+    "motor_lag": "late",
+    "command_delay": "late",
+    "imu_lag": "late",
+    "attitude_delay": "late",
+    "rotor_drag": "drag",
+    "parasitic_drag": "drag",
+    "mass_change": "step",
+    "thrust_drop": "step",
+    "battery_sag": "step",
+    "weak_rotor": "corner",
+    "cg_offset": "corner",
+}
+_STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "motor_lag": ((0.02,),),
+    "command_delay": ((0.015,),),
+    "imu_lag": ((0.10,),),
+    "attitude_delay": ((0.02,),),
+    "rotor_drag": ((0.2, 0.2),),
+    "parasitic_drag": ((0.03,),),
+    "axial_inflow": ((0.2,),),
+    "ground_effect": ((1.0,),),
+}
+
+
+def candidates(layout: Layout, has_velocity: bool, has_position: bool) -> list[Candidate]:
+    """All causes that these data could show.
+
+    Args:
+        layout: parameter vector of the vehicle.
+        has_velocity, has_position: which optional channels are measured.
+    """
+    out = []
+    for effect in EFFECTS:
+        if (effect == "wind" and not has_velocity) or (effect == "ground_effect" and not has_position):
+            continue
+        if effect == "weak_rotor":
+            for i in range(layout.rotors):
+                name = f"weak_rotor.loss_{i + 1}"
+                out.append(Candidate(effect, (name,), family="corner", label=f"weak_rotor {i + 1}"))
+            continue
+        names = tuple(n for n in layout.entries if n.split(".")[0] == effect and not n.endswith(".time"))
+        timed = {"mass_change": ix.MASS_TIME, "thrust_drop": ix.DROP_TIME}.get(effect)
+        requires = "rotor_drag" if effect in ("rotor_drag_moment", "wind") else None
+        out.append(
+            Candidate(effect, names, _STARTS.get(effect, ()), _FAMILY.get(effect, effect), requires, timed)
+        )
+    return out
+
+
+def all_names(listed: list[Candidate]) -> list[str]:
+    """Entries of all candidates, each once."""
+    return list(dict.fromkeys(n for c in listed for n in c.names))
+
+
+def unset_times(theta: FloatArray, active: set[str]) -> FloatArray:
+    """Vector whose unused change times lie before the log, so that the derivative to their fraction covers all of it."""
+    out = theta.copy()
+    for effect, index in (("mass_change", ix.MASS_TIME), ("thrust_drop", ix.DROP_TIME)):
+        if effect not in active:
+            out[index] = -NEVER
+    return out
