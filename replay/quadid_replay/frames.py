@@ -28,11 +28,11 @@ def flip_world(vectors: FloatArray) -> FloatArray:
 def flip_attitude(q: FloatArray) -> FloatArray:
     """Turns attitudes between FLU->ENU and FRD->NED, quaternions wxyz, shape (n, 4).
 
-    q' = q_world q q_body with q_world = (0, 1, 1, 0)/sqrt(2) and q_body = (0, 1, 0, 0), in closed form.  Twice gives
-    -q, the same attitude.
+    q' = -q_world q q_body with q_world = (0, 1, 1, 0)/sqrt(2) and q_body = (0, 1, 0, 0), in closed form; its own
+    inverse, sign included.
     """
     w, x, y, z = q.T
-    return np.asarray(-_HALF * np.column_stack([w + z, x + y, x - y, w - z]))
+    return np.asarray(_HALF * np.column_stack([w + z, x + y, x - y, w - z]))
 
 
 def from_euler(angles: FloatArray) -> FloatArray:

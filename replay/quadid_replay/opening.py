@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 from quadid.errors import LogError
 from quadid.window import Recording
-from quadid_replay.recognise import ALLOWED, HEAD_BYTES, recognise
+from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
 
 def open_log(path: str | Path, preset: str = "auto") -> Recording:
@@ -23,23 +24,24 @@ def open_log(path: str | Path, preset: str = "auto") -> Recording:
     file = Path(path)
     head, sha256 = _head_and_hash(file)
     kind = recognise(head, file.name)
+    if kind == "mcap":
+        from quadid_replay.mcap_reader import read_mcap
+
+        return read_mcap(file, sha256, preset)
+    return _reader(kind)(file, sha256)
+
+
+def _reader(kind: Format) -> Callable[[Path, str], Recording]:
+    """Imports only the library that this format needs."""
     if kind == "csv":
-        from quadid_replay.csv_reader import read_csv
-
-        return read_csv(file, sha256)
-    if kind == "dataflash":
-        from quadid_replay.dataflash_reader import read_dataflash
-
-        return read_dataflash(file, sha256)
-    if kind == "ulog":
-        from quadid_replay.ulog_reader import read_ulog
-
-        return read_ulog(file, sha256)
-    if kind == "tlog":
-        from quadid_replay.tlog_reader import read_tlog
-
-        return read_tlog(file, sha256)
-    raise LogError(f"{file.name}: {kind} is not supported yet", "CSV")
+        from quadid_replay.csv_reader import read_csv as read
+    elif kind == "dataflash":
+        from quadid_replay.dataflash_reader import read_dataflash as read
+    elif kind == "ulog":
+        from quadid_replay.ulog_reader import read_ulog as read
+    else:
+        from quadid_replay.tlog_reader import read_tlog as read
+    return read
 
 
 def _head_and_hash(file: Path) -> tuple[bytes, str]:

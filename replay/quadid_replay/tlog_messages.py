@@ -5,7 +5,6 @@ MAVLink bodies are FRD and worlds NED, as the core's; only units differ (mG, mra
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +14,8 @@ from quadid_replay.frames import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import RPM
 
 MILLI = 1e-3
+_UNIX_US = 1e14
+"""Stamps above this [us] count from the UNIX epoch."""
 
 
 class Reading(NamedTuple):
@@ -138,13 +139,12 @@ def boot_seconds(m: Any) -> float | None:
     if stamp is not None:
         return float(stamp) * MILLI
     stamp = getattr(m, "time_usec", None)
-    if stamp is None or stamp > 1e14 or stamp == 0:
+    if stamp is None or stamp > _UNIX_US:
         return None
-    seconds = float(stamp) * 1e-6
-    return seconds if math.isfinite(seconds) else None
+    return float(stamp) * 1e-6
 
 
 def unix_seconds(m: Any) -> float | None:
     """Returns the message's own stamp as UNIX time [s], or None when it does not count that."""
     stamp = getattr(m, "time_usec", None)
-    return float(stamp) * 1e-6 if stamp is not None and stamp > 1e14 else None
+    return float(stamp) * 1e-6 if stamp is not None and stamp > _UNIX_US else None

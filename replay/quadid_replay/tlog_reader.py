@@ -63,14 +63,18 @@ class _VehicleLog:
     def _time(self, m: Any, received: float) -> float | None:
         """Returns recording time: boot time where the message has it, else receive time mapped onto it."""
         boot = boot_seconds(m)
+        if boot == 0.0 and self._newest_boot is not None and self._newest_boot > 1.0:
+            boot = None  # zero stands for unknown
         if m.get_type() == "SERVO_OUTPUT_RAW" and boot is not None and self._newest_boot is not None:
             boot = self._servo_clock.unwrap_near(boot * 1e6, self._newest_boot * 1e6) * 1e-6
         if boot is None:
             unix = unix_seconds(m)
             if unix is not None and self._unix_offset is not None:
                 boot = unix - self._unix_offset
+            elif self._receive_offset is not None:
+                boot = received - self._receive_offset
             else:
-                boot = received - (self._receive_offset if self._receive_offset is not None else 0.0)
+                return None  # nothing told the boot time yet
         else:
             if self._newest_boot is not None and boot < self._newest_boot - 1.0:
                 self._receive_offset = None  # perhaps a reboot: the offset belongs to the old boot

@@ -1,0 +1,199 @@
+"""ROS 2 MCAP: picks the topics, decodes them, and brings their stamps onto one clock."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap_ros2._dynamic import generate_dynamic
+
+from quadid.errors import LogError
+from quadid.resample import fresh_rows
+from quadid.window import Recording
+from quadid_replay.cdr_blocks import BlockReader, Read
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
+from quadid_replay.mcap_messages import SIGNALS, TYPES, MessageType, type_name
+from quadid_replay.mcap_records import McapFile, Topic
+from quadid_replay.motors import active_outputs
+from quadid_replay.presets import AUTO, preset_rank
+
+_EPOCH_NS = 10**17
+"""Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
+_OTHER_CLOCK = 3600.0
+"""Stamps this far [s] from the log time belong to another clock (boot or simulation time)."""
+
+
+class _Source(NamedTuple):
+    """A topic that is read: its description and reader."""
+
+    topic: Topic
+    kind: MessageType
+    read: Callable[[bytes], Read]
+
+
+class _Stamps:
+    """Turns stamps of headers and of PX4 into recording time."""
+
+    def __init__(self) -> None:
+        self.clock = LogClock()
+        self.base_ns: int | None = None
+        self._offsets: dict[str, float] = {}
+
+    def time(self, group: str, seconds: int, nanoseconds: int, log_time: int) -> float | None:
+        """Returns recording time of a stamp; log time stands in for a stamp of zero."""
+        if self.base_ns is None:
+            self.base_ns = log_time // 10**9 * 10**9 if log_time > _EPOCH_NS else 0
+        logged = (log_time - self.base_ns) * 1e-9
+        if seconds == 0 and nanoseconds == 0:
+            return self.clock.time(logged)
+        stamped = (seconds * 10**9 + nanoseconds - self.base_ns) * 1e-9
+        offset = self._offsets.get(group)
+        if offset is None:
+            # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
+            offset = logged - stamped if abs(logged - stamped) > _OTHER_CLOCK else 0.0
+            self._offsets[group] = offset
+        return self.clock.time(stamped + offset)
+
+
+def read_mcap(path: Path, sha256: str = "", preset: str = AUTO) -> Recording:
+    """Reads a ROS 2 MCAP log, whole or damaged.
+
+    Args:
+        path: the file.
+        sha256: hash of its bytes.
+        preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
+
+    Raises:
+        LogError: no topic of a known type, unknown preset, or a file made to exhaust memory.
+    """
+    preset_rank(preset, "gyro", "")  # an unknown preset is an error even where no topic would match
+    file = McapFile(path)
+    notes: list[str] = []
+    sources = _sources(file, preset, notes)
+    if not sources:
+        raise _no_topic(path, file, preset)
+    columns, stamps, failed = _decode(file, sources)
+    notes = [*file.damage(), *notes]
+    if failed:
+        notes.append(f"{failed} messages could not be decoded and were dropped")
+    if stamps.base_ns:
+        notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
+    return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes, sha256)
+
+
+def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source]:
+    """Picks the topics whose type is known and whose name the preset lists for one of its channels."""
+    sources = {}
+    for number, topic in file.topics.items():
+        kind = TYPES.get(type_name(topic.type))
+        if kind is None or topic.encoding != "cdr":
+            continue
+        listed = [preset_rank(preset, channel, topic.name) for channel in {c for c, _ in SIGNALS.values()}]
+        if all(rank is None for rank in listed):
+            continue
+        try:
+            decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+        except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
+            notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
+            continue
+        sources[number] = _Source(topic, kind, _reader(kind, decode))
+    return sources
+
+
+def _reader(kind: MessageType, decode: Callable[[bytes], Any]) -> Callable[[bytes], Read]:
+    stamp = kind.stamp
+    if stamp is None:
+        return BlockReader(decode, kind.blocks, kind.extra).read
+
+    def read(data: bytes) -> Read:
+        message = decode(data)
+        return Read(*stamp(message), kind.blocks(message), kind.extra(message))
+
+    return read
+
+
+def _decode(file: McapFile, sources: dict[int, _Source]) -> tuple[dict[tuple[int, str], Columns], _Stamps, int]:
+    """Streams through the messages and keeps the numbers; returns columns by topic and signal, clock, failures."""
+    columns: dict[tuple[int, str], Columns] = {}
+    stamps, failed = _Stamps(), 0
+    for number, log_time, data in file.messages(sources.keys()):
+        source = sources[number]
+        try:
+            message = source.read(data)
+            signals = source.kind.signals(message.blocks, message.extra)
+        except (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            failed += 1
+            continue
+        group = "header" if source.kind.stamp is None else "px4"
+        t = stamps.time(group, message.seconds, message.nanoseconds, log_time)
+        for name, values in signals:
+            kept = columns.get((number, name))
+            if kept is None:
+                kept = columns[number, name] = Columns(len(values))
+            if len(values) == kept.width:
+                kept.add(t, values)
+            else:
+                failed += 1
+    return columns, stamps, failed
+
+
+def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, _Source], preset: str) -> list[RawChannel]:
+    """Makes channels of the columns; of several topics for one channel the best comes first."""
+    ranked: dict[str, list[tuple[int, RawChannel]]] = {}
+    for (number, signal), kept in columns.items():
+        channel, convert = SIGNALS[signal]
+        topic = sources[number].topic
+        rank = preset_rank(preset, channel, topic.name)
+        t, values = kept.arrays()
+        values = _motor_columns(signal, values)
+        if rank is None or len(t) == 0 or values.shape[1] == 0 or _unused(signal, topic, values):
+            continue
+        source = f"{topic.name} ({type_name(topic.type)})"
+        rank += 5 if signal == "pose_attitude" else 0
+        ranked.setdefault(channel, []).append((rank, RawChannel(channel, t, convert(values), source, kept.refused)))
+    out = []
+    for entries in ranked.values():
+        ordered = [entry for _, entry in sorted(entries, key=lambda pair: pair[0])]
+        if ordered[0].name in ("gyro", "accel"):
+            ordered.sort(key=_repeats)
+        out += ordered if preset != AUTO else fastest_first(ordered, 1.5)
+    return out
+
+
+def _motor_columns(signal: str, values: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Keeps the columns that are motors, of messages with room for more."""
+    if signal == "outputs":
+        return values[:, active_outputs(values)]
+    if signal == "actuator_motors":
+        return values[:, np.isfinite(values).any(axis=0)]
+    return values
+
+
+def _unused(signal: str, topic: Topic, values: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
+    """Fields that a driver left alone: a constant identity attitude, efforts that are no commands, body twists."""
+    if signal in ("attitude", "pose_attitude"):
+        return bool(np.all(values == values[0]) and np.isin(values[0], (0.0, 1.0)).all())
+    if signal == "motor_command" and type_name(topic.type) == "sensor_msgs/JointState":
+        return bool(np.nanmin(values) < -0.05 or not np.any(values))
+    return signal == "velocity" and "body" in topic.name
+
+
+def _repeats(entry: RawChannel) -> bool:
+    """Tells a topic that repeats readings, as MAVROS' imu/data repeats the acceleration."""
+    return len(fresh_rows(entry.values)) < 0.9 * len(entry.values)
+
+
+def _no_topic(path: Path, file: McapFile, preset: str) -> LogError:
+    found = ", ".join(f"{t.name} [{type_name(t.type) or t.encoding}]" for t in list(file.topics.values())[:8])
+    damage = "; ".join(file.damage())
+    reason = f" ({damage})" if damage else ""
+    return LogError(
+        f"{path.name}: no topic to read with preset '{preset}' among: {found or 'none'}{reason}",
+        "topics of types " + ", ".join(list(TYPES)[:6]) + " …",
+        "choose another preset, or record the topics of docs/logs.md",
+    )

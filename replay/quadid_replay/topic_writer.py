@@ -1,0 +1,113 @@
+"""Writes ROS 2 messages of any type to MCAP without ROS: profile ros2, schemas ros2msg, CDR, zstd chunks with CRC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+from mcap_ros2._dynamic import serialize_dynamic
+
+from quadid.errors import LogError
+from quadid_replay.cdr_blocks import BlockWriter
+from quadid_replay.schemas import has_definition, schema_text
+from quadid_replay.writing import open_for_writing
+
+_CHUNK_BYTES = 1 << 20
+
+
+class TopicWriter:
+    """An MCAP file being written.  Use as a context manager; the file is complete only after `close`.
+
+    Args:
+        file: path, or a binary stream that stays open.
+
+    Raises:
+        LogError: the file cannot be written.
+    """
+
+    def __init__(self, file: str | Path | BinaryIO) -> None:
+        self._owned = open_for_writing(file) if isinstance(file, str | Path) else None
+        self._writer = Writer(
+            self._owned or file,  # type: ignore[arg-type]
+            chunk_size=_CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+        )
+        self._writer.start(profile="ros2", library="quadid")
+        self._encoders: dict[str, Callable[[Any], bytes]] = {}
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[int, int] = {}
+        self._open = True
+
+    def write(self, topic: str, kind: str, message: Any, stamp_ns: int) -> None:
+        """Writes one message.
+
+        Args:
+            topic: name, such as ``quadid/parameters``.
+            kind: ``package/msg/Type``, one of `quadid_replay.schemas`.
+            message: object or dict with the message's fields, nested likewise; absent fields take their defaults.
+            stamp_ns: log and publish time [ns].
+
+        Raises:
+            LogError: no definition of this type, or a message that does not fit it.
+        """
+        try:
+            data = self.encoder(kind)(message)
+        except (ValueError, TypeError, AttributeError, LookupError) as error:
+            raise LogError(
+                f"message for {topic} does not fit {kind}: {error}", "the fields of its definition"
+            ) from error
+        self.write_cdr(topic, kind, data, stamp_ns)
+
+    def write_cdr(self, topic: str, kind: str, data: bytes, stamp_ns: int) -> None:
+        """Writes one message that is CDR already."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._writer.register_channel(topic, "cdr", self._schema(kind))
+            self._channels[topic] = channel
+        sequence = self._sequence.get(channel, 0)
+        self._sequence[channel] = sequence + 1
+        self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+
+    def encoder(self, kind: str) -> Callable[[Any], bytes]:
+        """Returns the function that makes CDR of a message of this type."""
+        if kind not in self._encoders:
+            self._encoders[kind] = serialize_dynamic(kind, _definition(kind))[kind]
+        return self._encoders[kind]
+
+    def blocks(self, kind: str, build: Callable[[list[list[float]]], Any], sizes: Sequence[int]) -> BlockWriter:
+        """Returns a fast writer for messages that differ in stamp and runs of doubles only; see `cdr_blocks`."""
+        return BlockWriter(self.encoder(kind), build, sizes)
+
+    def close(self) -> None:
+        """Writes index and footer; the file is readable without `close` too, but as a damaged one."""
+        if self._open:
+            self._open = False
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            if self._owned is not None:
+                self._owned.close()
+
+    def _schema(self, kind: str) -> int:
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", _definition(kind).encode())
+        return self._schemas[kind]
+
+    def __enter__(self) -> TopicWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _definition(kind: str) -> str:
+    if not has_definition(kind):
+        raise LogError(
+            f"no definition of message type {kind}", "the types in quadid_replay/schemas", "add its .msg there"
+        )
+    return schema_text(kind)
