@@ -1,0 +1,38 @@
+"""Errors as one line for people: what was found, what is allowed, what to do."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from quadid.errors import QuadidError
+
+
+class Failure(NamedTuple):
+    """One line without line breaks, and the exit code that goes with it."""
+
+    line: str
+    exit_code: int
+
+
+def explain(error: Exception) -> Failure | None:
+    """Returns the line for an error that the user can act on, or None for a defect of the program."""
+    if isinstance(error, QuadidError):
+        return Failure(_one_line(str(error)), error.exit_code)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return Failure(
+            _one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
+        )
+    # typer brings its own copy of click or uses the one installed; both have this method on errors of usage.
+    told = getattr(error, "format_message", None)
+    if callable(told):
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context is not None else "quadid"
+        return Failure(_one_line(f"{str(told()).rstrip('.')}; see `{path} --help`"), 2)
+    return None
+
+
+def _one_line(text: str) -> str:
+    """Joins lines and drops control characters, which a log's content must not send to a terminal."""
+    joined = " ".join(text.split())
+    return "".join(c if c.isprintable() else "?" for c in joined)

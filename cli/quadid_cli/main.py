@@ -1,0 +1,108 @@
+"""The `quadid` command: finds the asked-for command, runs it, and turns errors into one line and an exit code.
+
+Commands are imported only when they are called: ``quadid foo`` imports `quadid_cli.foo` and calls its function ``foo``,
+a plain function with typer annotations (see `quadid_cli.options` for the options that all share).
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+COMMANDS: dict[str, str] = {
+    "demo": "Fly, log, identify and diagnose a simulated Pelican; write a report.",
+    "simulate": "Fly the closed-loop vehicle and log it, to a file or live.",
+    "inspect": "What a log holds: channels, rates, gaps, faults, excitation, what is missing.",
+    "identify": "Identify the parameters of a vehicle from its flight logs.",
+    "score": "Open-loop prediction error of a vehicle file on logs.",
+    "compare": "All optimisers and subspace methods side by side on the same data.",
+    "diagnose": "What the simulation gets wrong, why, and what the better model gains.",
+    "excite": "Which manoeuvre to fly next, and what it would gain.",
+    "reproduce": "The paper's tables and figures.",
+    "replay": "Drive the online session from a log.",
+    "serve": "The online service on a MAVLink link, no ROS needed.",
+    "watch": "Live terminal view of one or many vehicles.",
+    "history": "Stored parameter sets: what, when, from which data, who approved.",
+    "export": "The parameters for another program.",
+    "fleet": "Identify a folder of logs in parallel.",
+}
+"""Every command with its one-line help, in the order of `quadid --help`."""
+
+
+def _available() -> dict[str, str]:
+    """Commands whose module is installed."""
+    return {n: text for n, text in COMMANDS.items() if importlib.util.find_spec(f"quadid_cli.{n}") is not None}
+
+
+class LazyGroup(TyperGroup):
+    """Lists every command from a table, and imports one only to run it."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for name, text in _available().items():
+            self.commands[name] = TyperCommand(name, help=text, rich_markup_mode=None)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Finds the command asked for, imported and complete."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, None if command is None else load(str(command.name)), rest
+
+
+def load(name: str) -> Any:
+    """Imports one command, ready to run."""
+    module = importlib.import_module(f"quadid_cli.{name}")
+    alone = typer.Typer(rich_markup_mode=None, add_completion=False)
+    alone.command(name, help=COMMANDS[name] if not getattr(module, name).__doc__ else None)(getattr(module, name))
+    return get_command(alone)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from quadid import __version__
+
+        typer.echo(f"quadid {__version__}")
+        raise typer.Exit
+
+
+app = typer.Typer(name="quadid", cls=LazyGroup, rich_markup_mode=None)
+
+
+@app.callback(
+    epilog="All quantities SI; world NED, body FRD. Exit codes: 0 done, 2 bad input, 3 the data cannot answer."
+)
+def _quadid(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Identifies the parameters of a multirotor simulation from flight data, and names what it still gets wrong."""
+
+
+def app_main() -> int:
+    """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer."""
+    try:
+        result = get_command(app).main(sys.argv[1:] or ["--help"], prog_name="quadid", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our pipe left; nothing more can be said there, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (KeyboardInterrupt, typer.Abort):
+        print("quadid: stopped", file=sys.stderr)
+        return 130
+    except Exception as error:
+        from quadid_cli.failure import explain
+
+        reason = explain(error)
+        if reason is None:
+            raise
+        print(f"quadid: {reason.line}", file=sys.stderr)
+        return reason.exit_code
+    return result if isinstance(result, int) else 0

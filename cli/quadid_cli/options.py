@@ -1,0 +1,52 @@
+"""Options that several commands share, so that they are called and described the same everywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Logs = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="LOG...",
+        help="Flight logs: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
+    ),
+]
+VehicleName = Annotated[
+    str, typer.Option("--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.")
+]
+Validate = Annotated[
+    list[str] | None,
+    typer.Option("--validate", metavar="LOG", help="A log that is scored but not fitted; may be given again."),
+]
+JsonTarget = Annotated[
+    str | None,
+    typer.Option(
+        "--json", metavar="FILE", help="Write the result as JSON; '-' for stdout, which then carries nothing else."
+    ),
+]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for written files.")]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default 50 Hz.")]
+OwnRate = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default the log's own.")
+]
+Start = Annotated[
+    float | None,
+    typer.Option("--start", metavar="S", help="Use every log from this many seconds after its first IMU sample."),
+]
+Stop = Annotated[
+    float | None,
+    typer.Option("--stop", metavar="S", help="Use every log up to this many seconds after its first IMU sample."),
+]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Decides every random number.")]
+Preset = Annotated[
+    str,
+    typer.Option(
+        "--preset", metavar="NAME", help="Topic names of ROS logs: auto, canonical, mavros, px4, ardupilot, rotors."
+    ),
+]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
+]

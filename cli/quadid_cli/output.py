@@ -1,0 +1,87 @@
+"""Written results: folders that are checked before long work, and JSON that any parser accepts."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from quadid.errors import QuadidError
+
+
+class OutputError(QuadidError):
+    """A place that cannot be written to."""
+
+
+def out_folder(folder: Path) -> Path:
+    """Makes the folder where it does not exist, and returns its absolute path.
+
+    Raises:
+        OutputError: it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made ({error.strerror})", "a folder", "choose another --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder} is not writable", "a folder you may write to", "choose another --out")
+    return folder.resolve()
+
+
+def check_file(path: Path | str | None, option: str) -> None:
+    """Raises OutputError when a file to be written later cannot be; ``-`` and None are fine."""
+    if path is None or str(path) == "-":
+        return
+    file = Path(path)
+    if file.is_dir():
+        raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
+    if not os.access(file if file.exists() else folder, os.W_OK):
+        raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Writes a file whole or not at all; returns its absolute path."""
+    target = path.absolute()
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(
+            f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
+        ) from error
+    return target
+
+
+def write_json(result: Mapping[str, Any], target: str | None) -> None:
+    """Writes a result as JSON to a file, or to stdout for ``-``; numbers that JSON has no word for become null."""
+    if target is None:
+        return
+    text = json.dumps(plain(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    if target == "-":
+        sys.stdout.write(text)
+    else:
+        write_text(Path(target), text)
+
+
+def plain(value: Any) -> Any:
+    """Turns numpy numbers and arrays, paths and tuples into what JSON holds; NaN and infinities into None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -1,0 +1,61 @@
+"""What people see: tables, notes, progress; colours and bars on a terminal only, nothing beside JSON on stdout."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Advance = Callable[[str, float], None]
+"""Called with the name of a stage and the share of it done, 0..1."""
+_PIPE_WIDTH = 120
+
+
+def console(quiet: bool = False, stderr: bool = False) -> Console:
+    """Returns the console to print on.
+
+    Args:
+        quiet: print nothing (stdout carries JSON).
+        stderr: print on stderr instead of stdout.
+
+    Colours follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80 columns.
+    """
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_WIDTH
+    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, soft_wrap=False)
+
+
+def warn(messages: tuple[str, ...] | list[str]) -> None:
+    """Prints warnings on stderr, one line each."""
+    for message in messages:
+        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+@contextmanager
+def progress() -> Iterator[Advance]:
+    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it."""
+    if not sys.stderr.isatty():
+        yield lambda stage, share: None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def advance(stage: str, share: float) -> None:
+            bar.update(task, description=stage, completed=share)
+
+        yield advance
