@@ -6,9 +6,10 @@ flight.truth                         what really happened, for tests only
 """
 
 from quadid.flight.draw import draw_effect
-from quadid.flight.fly import Flight, FlightError, Truth, fly
+from quadid.flight.fly import FlightError, fly
 from quadid.flight.outside import OUTSIDE, draw_outside
 from quadid.flight.profiles import AXES, PROFILES, Segment
+from quadid.flight.record import Flight, Truth
 from quadid.flight.sensors import SensorNoise
 from quadid.flight.setup import check_effects, propeller_radius
 from quadid.flight.stabiliser import (

@@ -295,11 +295,14 @@ def orthonormalise(y: FloatArray, at: int) -> None:
 
     One Newton step of the polar projection; enough after every integration step.
     """
-    gram = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            gram[i, j] = y[at + i] * y[at + j] + y[at + 3 + i] * y[at + 3 + j] + y[at + 6 + i] * y[at + 6 + j]
+    xx = y[at] * y[at] + y[at + 3] * y[at + 3] + y[at + 6] * y[at + 6]
+    yy = y[at + 1] * y[at + 1] + y[at + 4] * y[at + 4] + y[at + 7] * y[at + 7]
+    zz = y[at + 2] * y[at + 2] + y[at + 5] * y[at + 5] + y[at + 8] * y[at + 8]
+    xy = y[at] * y[at + 1] + y[at + 3] * y[at + 4] + y[at + 6] * y[at + 7]
+    xz = y[at] * y[at + 2] + y[at + 3] * y[at + 5] + y[at + 6] * y[at + 8]
+    yz = y[at + 1] * y[at + 2] + y[at + 4] * y[at + 5] + y[at + 7] * y[at + 8]
     for row in range(at, at + 9, 3):
         a, b, c = y[row], y[row + 1], y[row + 2]
-        for j in range(3):
-            y[row + j] = 1.5 * y[row + j] - 0.5 * (a * gram[0, j] + b * gram[1, j] + c * gram[2, j])
+        y[row] = 1.5 * a - 0.5 * (a * xx + b * xy + c * xz)
+        y[row + 1] = 1.5 * b - 0.5 * (a * xy + b * yy + c * yz)
+        y[row + 2] = 1.5 * c - 0.5 * (a * xz + b * yz + c * zz)

@@ -46,7 +46,7 @@ class OnBoard(NamedTuple):
         gyro_matrix, gyro_bias: measured = matrix true + bias.
         accel_matrix, accel_bias: the same of the accelerometer.
         pull: gain k of the attitude filter towards the accelerometer's tilt [1/s].
-        gyro_shake, accel_shake: rms of vibration in hover [rad/s], [m/s^2]; shake_phase: shape (6, rotors) [rad].
+        gyro_shake, accel_shake: rms of vibration in hover [rad/s], [m/s^2]; shake_mode: see `shake`.
     """
 
     gyro_matrix: FloatArray
@@ -56,7 +56,7 @@ class OnBoard(NamedTuple):
     pull: float
     gyro_shake: float
     accel_shake: float
-    shake_phase: FloatArray
+    shake_mode: FloatArray
 
 
 class Events(NamedTuple):
@@ -140,13 +140,23 @@ def turned(m: FloatArray, angle: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
-def shake(phase: FloatArray, omega: FloatArray, offsets: FloatArray, row: int, hover: float) -> float:
-    """Vibration of one axis with unit rms in hover: every rotor's imbalance, growing with speed squared."""
-    total = 0.0
+def shake(phase: FloatArray, omega: FloatArray, mode: FloatArray, hover: float, out: FloatArray) -> None:
+    """Vibration of the six IMU axes with unit rms in hover: every rotor's imbalance, growing with speed squared.
+
+    Args:
+        phase: angle of each rotor [rad].
+        omega: rotor speeds [rad/s].
+        mode: sine and cosine share of each axis and rotor, shape (6, rotors, 2).
+        hover: rotor speed in hover [rad/s].
+        out: shape (6,), written.
+    """
+    out[:] = 0.0
+    gain = np.sqrt(2.0 / omega.shape[0]) / (hover * hover)
     for i in range(omega.shape[0]):
-        strength = omega[i] / hover
-        total += strength * strength * np.sin(phase[i] + offsets[row, i])
-    return float(total * np.sqrt(2.0 / omega.shape[0]))
+        strength = gain * omega[i] * omega[i]
+        sine, cosine = strength * np.sin(phase[i]), strength * np.cos(phase[i])
+        for axis in range(6):
+            out[axis] += mode[axis, i, 0] * sine + mode[axis, i, 1] * cosine
 
 
 @kernel

@@ -81,15 +81,16 @@ def march(
     rotors = omega.shape[0]
     dt = plan.dt
     level, slope = omega.copy(), np.zeros(rotors)
-    memory, phase, integral, trim = np.zeros(rotors), np.zeros(rotors), np.zeros(3), np.zeros(1)
+    memory, phase, integral, trim = np.zeros(rotors), np.zeros(rotors), np.zeros(3), np.zeros(3)
     reference, measured = np.zeros(4), np.zeros(3)
     present = efficiency.copy()
     error = np.zeros(9)
     error[0] = error[4] = error[8] = 1.0
     truth, ahrs, seen = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     force, shaken, powers = np.zeros(3), np.zeros(3), np.ones(3)
-    work = np.zeros((10, max(33, rotors)))
-    hover = air.hover_sum / rotors
+    work = np.zeros((5, max(33, rotors)))
+    hover, trembling = air.hover_sum / rotors, np.zeros(6)
+    shaking = on_board.gyro_shake > 0.0 or on_board.accel_shake > 0.0
     dropped, changed, head, issued, ramp_end, row = False, 0, 0, 0, NO_TIME, 0
     mass_factor = 1.0
 
@@ -100,10 +101,7 @@ def march(
             for j in range(3):
                 truth[i, j] = y[6 + 3 * i + j]
         for axis in range(3):
-            rate = y[15 + axis]
-            if on_board.gyro_shake > 0.0:
-                rate += on_board.gyro_shake * shake(phase, omega, on_board.shake_phase, axis, hover)
-            track.gyro[n, axis] = rate
+            track.gyro[n, axis] = y[15 + axis] + on_board.gyro_shake * trembling[axis]
             track.accel[n, axis] = y[18 + axis] + shaken[axis]
         if on_board.pull != 0.0:
             for i in range(3):
@@ -174,7 +172,8 @@ def march(
             for i in range(rotors):
                 phase[i] += 0.5 * h * omega[i]
             left += h
-        if on_board.accel_shake > 0.0:
+        if shaking:
+            shake(phase, omega, on_board.shake_mode, hover, trembling)
             for axis in range(3):
-                shaken[axis] += dt * on_board.accel_shake * shake(phase, omega, on_board.shake_phase, 3 + axis, hover)
+                shaken[axis] += dt * on_board.accel_shake * trembling[3 + axis]
     return FLEW, plan.start + plan.steps * dt

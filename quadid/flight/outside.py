@@ -57,11 +57,11 @@ def _effects() -> tuple[OutsideEffect, ...]:
     return (
         make(
             "suspended_load", "structure", "A load swings below the vehicle.",
-            {"share": s(0.08, 0.2, ""), "length": s(0.5, 1.5, "m", fixed), "damping": s(0.02, 0.05, "", fixed),
-             "depth": s(0.04, 0.1, "m", fixed)}, f.suspended_load),
+            {"share": s(0.05, 0.12, ""), "length": s(0.5, 1.5, "m", fixed), "damping": s(0.04, 0.08, "", fixed),
+             "depth": s(0.02, 0.05, "m", fixed)}, f.suspended_load),
         make(
             "flexible_arm", "structure", "Torque reaches the body through arms that resonate.",
-            {"share": s(0.3, 0.6, ""), "frequency": s(4.0, 9.0, "Hz", fixed), "damping": s(0.03, 0.08, "", fixed)},
+            {"share": s(0.25, 0.5, ""), "frequency": s(6.0, 11.0, "Hz", fixed), "damping": s(0.05, 0.12, "", fixed)},
             f.flexible_arm),
         make(
             "slosh", "structure", "Fluid moves in a tank.",
@@ -76,10 +76,10 @@ def _effects() -> tuple[OutsideEffect, ...]:
             {"fraction": s(0.02, 0.06, "")}, f.thrust_hysteresis),
         make(
             "esc_slew", "propulsion", "Rotor speed changes at a limited rate (smaller is stronger).",
-            {"rate": s(0.45, 0.8, "hover speeds per s", fixed)}, f.esc_slew),
+            {"rate": s(1.4, 2.2, "hover speeds per s", fixed)}, f.esc_slew),
         make(
             "esc_ceiling", "propulsion", "Rotors saturate below what is commanded.",
-            {"ceiling": s(1.03, 1.07, "hover speeds", fixed)}, f.esc_ceiling),
+            {"ceiling": s(1.14, 1.2, "hover speeds", fixed)}, f.esc_ceiling),
         make(
             "esc_grain", "propulsion", "Rotor speed comes in coarse steps.",
             {"grain": s(0.03, 0.06, "hover speeds")}, f.esc_grain),
@@ -89,7 +89,7 @@ def _effects() -> tuple[OutsideEffect, ...]:
             f.rotor_dropout),
         make(
             "gusts", "environment", "Turbulence pushes and turns (Dryden-like).",
-            {"push": s(0.4, 1.2, "m/s^2"), "turn": s(0.4, 1.2, "rad/s^2"), "time": s(0.4, 1.5, "s", fixed)}, f.gusts),
+            {"push": s(0.3, 0.9, "m/s^2"), "turn": s(0.4, 1.2, "rad/s^2"), "time": s(0.3, 1.0, "s", fixed)}, f.gusts),
         make(
             "translational_lift", "environment", "Thrust grows, and the vehicle rolls, with airspeed.",
             {"gain": s(0.02, 0.05, "s/m"), "roll": s(0.3, 0.8, "rad/m^2")}, f.translational_lift),

@@ -26,6 +26,8 @@ class Pilot(NamedTuple):
         hover_throttle: throttle that carries the weight in hover.
         hold: position gain [1/s^2]; brake: velocity gain [1/s], horizontally.
         climb_hold: height gain [1/s^2]; climb_brake: vertical velocity gain [1/s]; trim: integral gain [1/s^3].
+        horizon: how quickly the pilot corrects a tilt that stays away from what was asked for [1/s]; a human looks at
+            the horizon, and so survives an attitude filter that drifts.
         reach: largest horizontal acceleration asked for [m/s^2].
         tilt_limit: largest roll or pitch reference [rad].
         throttle_limits: lowest and highest throttle.
@@ -38,6 +40,7 @@ class Pilot(NamedTuple):
     climb_hold: float = 0.5
     climb_brake: float = 1.2
     trim: float = 0.1
+    horizon: float = 0.4
     reach: float = 2.0
     tilt_limit: float = 0.5
     throttle_limits: tuple[float, float] = (0.08, 0.85)
@@ -61,7 +64,7 @@ def fly_by_hand(
         velocity: world NED [m/s].
         attitude: rotation matrix, body to world.
         stick: roll, pitch to add [rad], yaw [rad], collective to add [fraction of hover thrust].
-        memory: trim of the collective [m/s^2], shape (1,); updated.
+        memory: trim of the collective [m/s^2], of roll and of pitch [rad], shape (3,); updated.
         reference: roll, pitch, yaw [rad], throttle 0..1; written.
     """
     ask_north = -pilot.hold * position[0] - pilot.brake * velocity[0]
@@ -73,8 +76,13 @@ def fly_by_hand(
     forward = np.cos(yaw) * ask_north + np.sin(yaw) * ask_east
     right = -np.sin(yaw) * ask_north + np.cos(yaw) * ask_east
     limit = pilot.tilt_limit
-    reference[0] = min(max(np.arctan(right / GRAVITY) + stick[0], -limit), limit)
-    reference[1] = min(max(np.arctan(-forward / GRAVITY) + stick[1], -limit), limit)
+    wanted_roll, wanted_pitch = np.arctan(right / GRAVITY) + stick[0], np.arctan(-forward / GRAVITY) + stick[1]
+    roll = np.arctan2(attitude[2, 1], attitude[2, 2])
+    pitch = -np.arcsin(min(max(attitude[2, 0], -1.0), 1.0))
+    memory[1] = min(max(memory[1] + pilot.horizon * (wanted_roll - roll) * PILOT_STEP, -0.3), 0.3)
+    memory[2] = min(max(memory[2] + pilot.horizon * (wanted_pitch - pitch) * PILOT_STEP, -0.3), 0.3)
+    reference[0] = min(max(wanted_roll + memory[1], -limit), limit)
+    reference[1] = min(max(wanted_pitch + memory[2], -limit), limit)
     reference[2] = stick[2]
 
     low = -pilot.altitude - position[2]

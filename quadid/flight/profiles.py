@@ -48,18 +48,18 @@ def doublets(rng: np.random.Generator, n: int, every: float, width: tuple[float,
 
 
 def _tilt(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    slow = band_noise(rng, n, 0.04, 0.3, 0.085)
-    quick = band_noise(rng, n, 0.3, 1.8, 0.085)
-    return scale * (slow + quick + doublets(rng, n, 9.0, (0.25, 0.6), 0.2))
+    slow = band_noise(rng, n, 0.06, 0.25, 0.125)
+    quick = band_noise(rng, n, 0.25, 1.5, 0.06)
+    return scale * (slow + quick + doublets(rng, n, 10.0, (0.25, 0.6), 0.2))
 
 
 def _yaw(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    rate = band_noise(rng, n, 0.02, 0.9, 0.42) + doublets(rng, n, 12.0, (0.5, 1.2), 0.6)
-    return np.asarray(scale * np.cumsum(np.clip(rate, -1.3, 1.3)) * PILOT_STEP)
+    rate = band_noise(rng, n, 0.01, 0.5, 0.5) + doublets(rng, n, 9.0, (0.6, 1.5), 0.9)
+    return np.asarray(scale * np.cumsum(np.clip(rate, -1.2, 1.2)) * PILOT_STEP)
 
 
 def _collective(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    return scale * (band_noise(rng, n, 0.15, 2.0, 0.075) + doublets(rng, n, 11.0, (0.3, 0.7), 0.12))
+    return scale * (band_noise(rng, n, 0.15, 1.8, 0.09) + doublets(rng, n, 11.0, (0.3, 0.7), 0.13))
 
 
 def excited(rng: np.random.Generator, n: int) -> FloatArray:

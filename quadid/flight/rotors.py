@@ -52,7 +52,10 @@ def rotor_speed(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: fl
         s: time since the start of the piece [s].
         out: speeds, written.
     """
-    if tau > 0.0:
+    if s == 0.0:
+        for i in range(omega.shape[0]):
+            out[i] = omega[i]
+    elif tau > 0.0:
         fade = np.exp(-s / tau)
         for i in range(omega.shape[0]):
             lag = slope[i] * tau
@@ -150,41 +153,38 @@ def advance(
         air: aerodynamics.
         odd: effects outside the catalogue.
         h: step [s].
-        work: scratch, shape (at least 10, max(33, n)).
+        work: scratch, shape (at least 5, max(33, n)).
     """
     rotors = omega.shape[0]
     states = STATES if odd.dynamic else RIGID_STATES
-    w0, w1, w2 = work[0], work[1], work[2]
-    mid, end = work[3, :rotors], work[4, :rotors]
-    k1, k2, k3, k4, probe = work[5], work[6], work[7], work[8], work[9]
+    total, k, probe, wrench = work[0], work[1], work[2], work[3]
+    speed = work[4, :rotors]
     tau = drive.tau
     if drive.slew > 0.0:
         limit_slew(drive, omega, level, slope, h)
         tau = 0.0
-    rotor_speed(omega, level, slope, tau, 0.5 * h, mid)
-    rotor_speed(omega, level, slope, tau, h, end)
-    rotor_wrench(omega, efficiency, body, w0)
-    rotor_wrench(mid, efficiency, body, w1)
-    rotor_wrench(end, efficiency, body, w2)
-    w0[6] = spin_up_torque(omega, level, slope, tau, 0.0, body)
-    w1[6] = spin_up_torque(mid, level, slope, tau, 0.5 * h, body)
-    w2[6] = spin_up_torque(end, level, slope, tau, h, body)
-
-    derivative(y, w0, powers[0], mass_factor, changed, push, body, air, odd, k1)
+    steady = tau == 0.0 and drive.ramp == 0.0 and drive.slew == 0.0
     for i in range(states):
-        probe[i] = y[i] + 0.5 * h * k1[i]
-    derivative(probe, w1, powers[1], mass_factor, changed, push, body, air, odd, k2)
+        total[i] = 0.0
+        probe[i] = y[i]
+    # One call site for each kernel below, so that the compiler can take them in.
+    for stage in range(4):
+        s = 0.5 * h * ((stage + 1) // 2)
+        if stage == 0 or (stage != 2 and not steady):
+            rotor_speed(omega, level, slope, tau, s, speed)
+            rotor_wrench(speed, efficiency, body, wrench)
+            wrench[6] = spin_up_torque(speed, level, slope, tau, s, body)
+        derivative(probe, wrench, powers[(stage + 1) // 2], mass_factor, changed, push, body, air, odd, k)
+        weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
+        reach = h if stage == 2 else 0.5 * h
+        for i in range(states):
+            total[i] += weight * k[i]
+            probe[i] = y[i] + reach * k[i]
     for i in range(states):
-        probe[i] = y[i] + 0.5 * h * k2[i]
-    derivative(probe, w1, powers[1], mass_factor, changed, push, body, air, odd, k3)
-    for i in range(states):
-        probe[i] = y[i] + h * k3[i]
-    derivative(probe, w2, powers[2], mass_factor, changed, push, body, air, odd, k4)
-    for i in range(states):
-        y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+        y[i] += total[i]
     orthonormalise(y, 6)
     for i in range(rotors):
-        omega[i] = end[i]
+        omega[i] = speed[i]
         level[i] += slope[i] * h
 
 

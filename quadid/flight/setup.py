@@ -193,7 +193,7 @@ def prepare(
     last: float,
     ramp: float,
     shakes: tuple[float, float],
-    shake_phase: FloatArray,
+    shake_mode: FloatArray,
 ) -> Setup:
     """Builds the constants of a flight.
 
@@ -204,7 +204,7 @@ def prepare(
         last: time of the last log row [s]; the battery sags until then.
         ramp: time the rotors take to reach a command [s]; 0 for held commands.
         shakes: rms vibration of gyro [rad/s] and accelerometer [m/s^2] in hover.
-        shake_phase: phase of every rotor's imbalance on the six IMU axes, shape (6, rotors).
+        shake_mode: how every rotor's imbalance shows on the six IMU axes, see `loop.shake`.
     """
     n = len(vehicle.rotors)
     complete = check_effects(effects, n)
@@ -222,7 +222,7 @@ def prepare(
         pull=value("ahrs_acceleration_error", "k"),
         gyro_shake=shakes[0],
         accel_shake=shakes[1],
-        shake_phase=shake_phase,
+        shake_mode=shake_mode,
     )
     return Setup(
         vehicle=vehicle,
