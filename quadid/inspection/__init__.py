@@ -1,0 +1,49 @@
+"""Looks at a log before anything is fitted: what is there, whether it can be true, and what it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from quadid.inspection.airborne import flying_spans
+from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
+from quadid.inspection.findings import ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
+from quadid.inspection.motor_checks import hover_check, motor_order_check
+from quadid.inspection.outlook import missing_signals, parameter_outlook
+from quadid.inspection.timing import channel_facts, timing_checks
+from quadid.vehicle import Vehicle
+from quadid.window import Recording
+
+__all__ = ["ChannelFacts", "Check", "Inspection", "Missing", "Outlook", "Verdict", "inspect"]
+
+
+def inspect(
+    recording: Recording, vehicle: Vehicle | None = None, excitation: Sequence[Mapping[str, Any]] | None = None
+) -> Inspection:
+    """Inspects a recording.
+
+    Args:
+        recording: a log in core units and frames, as the reader believes.
+        vehicle: with it, hover thrust, motor order and rotor columns are checked too.
+        excitation: rows per parameter computed elsewhere (`quadid.identify`); passed on as they are.
+    """
+    facts = channel_facts(recording)
+    spans = flying_spans(recording, vehicle)
+    checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
+    checks += [gravity_check(recording, spans), gyro_check(recording), velocity_check(recording)]
+    if vehicle is not None:
+        checks += [hover_check(recording, vehicle, spans), motor_order_check(recording, vehicle, spans)]
+    return Inspection(
+        name=recording.name,
+        format=recording.format,
+        sha256=recording.sha256,
+        seconds=max(f.last for f in facts) - min(f.first for f in facts) if facts else 0.0,
+        channels=facts,
+        breaks=recording.breaks,
+        flying=spans,
+        checks=tuple(checks),
+        missing=missing_signals(recording.format, facts),
+        parameters=parameter_outlook(facts),
+        excitation=tuple(excitation or ()),
+        warnings=recording.warnings,
+    )

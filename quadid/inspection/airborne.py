@@ -1,0 +1,92 @@
+"""When the vehicle flies, as far as its motors or its vibration tell."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from quadid.resample import sample_period
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+Spans = tuple[tuple[float, float], ...]
+
+_LEAST = 0.5
+"""Flying means at least this fraction of hover thrust."""
+_IDLE = 0.15
+"""Commands that never exceed this fraction of full are idling motors."""
+_SHORTEST, _BRIDGE = 1.0, 0.5
+"""Spans shorter than the first [s] are none; interruptions up to the second [s] do not end one."""
+
+
+def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
+    """Returns the spans [s] in which the vehicle flies; empty when nothing tells.
+
+    Thrust is taken to grow with the square of rotor speed (or command); hover is the vehicle's weight where rotor
+    speeds and a vehicle are known, else the median of the powered part of the log.  A flying vehicle also feels its
+    thrust: where the accelerometer does not point along its usual direction for half a second, it lies somewhere.
+    """
+    channels = recording.channels
+    for name in ("rotor_speed", "motor_command"):
+        if name in channels and len(channels[name].t) > 1:
+            thrust, hover = _thrust(channels[name], vehicle)
+            if hover <= 0.0:
+                return ()
+            t, on = channels[name].t, thrust > _LEAST * hover
+            if "accel" in channels and len(channels["accel"].t) > 10:
+                on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
+            return _spans(t, on)
+    if "accel" in channels and len(channels["accel"].t) > 10:
+        return _spans(channels["accel"].t, _vibrates(channels["accel"]))
+    return ()
+
+
+def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, float]:
+    """Returns relative thrust and the value that hovers."""
+    values = channel.values
+    if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
+        low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
+        values = np.clip((values - low) / (high - low), 0.0, None)
+    thrust = np.asarray(np.sum(values**2, axis=1))
+    if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
+        return thrust, 0.0
+    if channel.name == "rotor_speed" and vehicle is not None:
+        b = vehicle.parameters["b"].initial
+        low, high = vehicle.parameters["b"].limits
+        hover = float(vehicle.mass * GRAVITY / b)
+        typical = float(np.median(thrust[thrust > 0.25 * np.max(thrust)]))
+        if low / high < typical / hover < high / low:
+            return thrust, hover
+    powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
+    return thrust, float(np.median(powered)) if len(powered) else 0.0
+
+
+def _felt(accel: Channel) -> FloatArray:
+    """Returns 1 where the specific force, averaged over 0.5 s, points along its usual direction, else 0; any unit."""
+    usual = np.median(accel.values, axis=0)
+    share = accel.values @ usual / float(usual @ usual or 1.0)
+    width = max(1, round(0.5 / sample_period(accel.t)))
+    return np.asarray(uniform_filter1d(share, width, mode="nearest") > 0.3, dtype=np.float64)
+
+
+def _vibrates(accel: Channel) -> NDArray[np.bool_]:
+    """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
+    length = np.linalg.norm(accel.values, axis=1)
+    kernel = np.ones(25) / 25.0
+    mean = np.convolve(length, kernel, mode="same")
+    square = np.convolve(length**2, kernel, mode="same")
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
+
+
+def _spans(t: FloatArray, on: NDArray[np.bool_]) -> Spans:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    spans: list[tuple[float, float]] = []
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        a, b = float(t[first]), float(t[end - 1])
+        if spans and a - spans[-1][1] <= _BRIDGE:
+            spans[-1] = (spans[-1][0], b)
+        else:
+            spans.append((a, b))
+    return tuple(span for span in spans if span[1] - span[0] >= _SHORTEST)

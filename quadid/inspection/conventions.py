@@ -1,0 +1,242 @@
+"""Units and frames, told by physics: gravity, gyro against attitude, velocity against attitude and accelerometer."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.inspection.airborne import Spans
+from quadid.inspection.findings import Check, Verdict
+from quadid.resample import sample_period
+from quadid.tracks import GAP
+from quadid.vehicle import GRAVITY
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+DEGREES = 57.29577951308232
+"""Degrees in a radian."""
+_CLEAR = 0.5
+"""R^2 above which a relation between two channels is believed."""
+_MOTION = 0.03
+"""Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
+_STEP = 0.1
+"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_AXES = ("x", "y", "z")
+
+
+class AxisMap(NamedTuple):
+    """The signed permutation of axes, times a scale, that turns one vector signal into another best.
+
+    Attributes:
+        axes: for each output axis, the input axis it follows.
+        signs: its sign, +1 or -1.
+        scale: common factor.
+        r2: fraction of the output's variance explained.
+    """
+
+    axes: tuple[int, ...]
+    signs: tuple[int, ...]
+    scale: float
+    r2: float
+
+    @property
+    def straight(self) -> bool:
+        """Each axis follows itself with its own sign."""
+        return self.axes == tuple(range(len(self.axes))) and all(s > 0 for s in self.signs)
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{_AXES[i]} = {'-' if s < 0 else ''}{_AXES[a]}"
+            for i, (a, s) in enumerate(zip(self.axes, self.signs, strict=True))
+        )
+
+
+def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Finds the signed permutation and scale that explain `target` (n, k) by `source` (n, k) best, k = 2 or 3."""
+    x, y = source - source.mean(axis=0), target - target.mean(axis=0)
+    cross, power, total = y.T @ x, np.sum(x**2, axis=0), float(np.sum(y**2))
+    best = AxisMap(tuple(range(x.shape[1])), (1,) * x.shape[1], np.nan, -np.inf)
+    for axes in permutations(range(x.shape[1])):
+        for signs in product((1, -1), repeat=x.shape[1]):
+            gain = sum(s * cross[i, a] for i, (a, s) in enumerate(zip(axes, signs, strict=True)))
+            norm = float(sum(power[a] for a in axes))
+            if gain > 0.0 and norm > 0.0 and total > 0.0:
+                r2 = float(gain**2 / norm / total)
+                if r2 > best.r2 + 1e-9:
+                    best = AxisMap(axes, signs, float(gain / norm), r2)
+    return best
+
+
+def _fit_without_jumps(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Fits twice, the second time without rows far off (estimators reset their heading, and rows jump with it)."""
+    fit = fit_axes(source, target)
+    if not np.isfinite(fit.scale):
+        return fit
+    miss = np.linalg.norm(target - fit.scale * source[:, fit.axes] * np.array(fit.signs), axis=1)
+    return fit_axes(*(rows[miss <= 8.0 * np.median(miss)] for rows in (source, target)))
+
+
+def gravity_check(recording: Recording, spans: Spans) -> Check:
+    """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return Check("gravity", Verdict.UNKNOWN, "no accelerometer")
+    values = accel.values[_inside(accel.t, spans)] if spans else accel.values
+    length = float(np.median(np.linalg.norm(values, axis=1)))
+    z = float(np.median(values[:, 2]))
+    numbers = {"length": length, "z": z}
+    message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
+    for unit, factor in (("g", GRAVITY), ("milli-g", GRAVITY * 1e-3), ("cm/s^2", 0.01)):
+        if 0.7 < length * factor / GRAVITY < 1.6:
+            fix = f"multiply acceleration by {factor:.6g}"
+            return Check("gravity", Verdict.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
+    if not 0.5 < length / GRAVITY < 2.0:
+        return Check(
+            "gravity", Verdict.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration", numbers
+        )
+    if not spans and abs(z) < 0.8 * length:
+        return Check("gravity", Verdict.UNKNOWN, f"{message}; the vehicle does not fly in this log", numbers=numbers)
+    if z > 0.5 * length:
+        return Check(
+            "gravity", Verdict.ERROR, f"{message}: z points up (FLU, as ROS has it) or the sign is reversed",
+            "turn body vectors to FRD: negate y and z", numbers,
+        )  # fmt: skip
+    if z > -0.5 * length:
+        return Check(
+            "gravity", Verdict.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
+        )
+    return Check("gravity", Verdict.OK, message, numbers=numbers)
+
+
+def gyro_check(recording: Recording) -> Check:
+    """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
+    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
+    if gyro is None or attitude is None:
+        return Check("gyro_attitude", Verdict.UNKNOWN, "needs gyro and attitude")
+    best: tuple[str, AxisMap] | None = None
+    stride = max(1, round(_STEP / sample_period(attitude.t)))
+    for name, q in _attitude_readings(attitude.values):
+        measured, derived = _rates(gyro, attitude.t[::stride], q[::stride])
+        if len(measured) < 20 or np.max(np.std(derived, axis=0)) < _MOTION:
+            continue
+        fit = _fit_without_jumps(measured, derived)
+        better = best is None or fit.r2 > best[1].r2 + 0.15
+        if better:
+            best = (name, fit)
+    if best is None:
+        return Check("gyro_attitude", Verdict.UNKNOWN, "too little rotation to compare gyro and attitude")
+    return _judge_rates(*best)
+
+
+def _judge_rates(reading: str, fit: AxisMap) -> Check:
+    numbers = {"scale": fit.scale, "r2": fit.r2}
+    if fit.r2 < _CLEAR:
+        message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
+        fix = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
+        return Check("gyro_attitude", Verdict.ERROR, message, fix, numbers)
+    if reading != "as given":
+        message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
+        return Check(
+            "gyro_attitude", Verdict.ERROR, message, "give wxyz quaternions, body to world, FRD to NED", numbers
+        )
+    if not fit.straight:
+        message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        fix = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        return Check("gyro_attitude", Verdict.ERROR, message, fix, numbers)
+    for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
+        if 0.75 < fit.scale / scale < 1.33:
+            return Check(
+                "gyro_attitude", Verdict.ERROR, f"{what} (attitude moves {fit.scale:.3g} times as fast)",
+                "convert to radians", numbers,
+            )  # fmt: skip
+    message = f"attitude moves {fit.scale:.3g} times as fast as the gyro says (R^2 {fit.r2:.2f})"
+    verdict = Verdict.OK if 0.85 < fit.scale < 1.15 else Verdict.WARNING
+    return Check(
+        "gyro_attitude", verdict, message, "" if verdict is Verdict.OK else "check scales and filters", numbers
+    )
+
+
+def velocity_check(recording: Recording) -> Check:
+    """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity."""
+    channels = recording.channels
+    accel, attitude, velocity = (channels.get(n) for n in ("accel", "attitude", "velocity"))
+    if accel is None or attitude is None or velocity is None:
+        return Check("velocity_attitude", Verdict.UNKNOWN, "needs accelerometer, attitude and velocity")
+    gained, derived = _velocity_gains(accel, attitude, velocity)
+    if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
+        return Check("velocity_attitude", Verdict.UNKNOWN, "too little horizontal acceleration to compare")
+    fit = fit_axes(derived[:, :2], gained[:, :2])
+    numbers = {"scale": fit.scale, "r2": fit.r2}
+    if fit.r2 < _CLEAR:
+        message = f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})"
+        return Check("velocity_attitude", Verdict.UNKNOWN, message, numbers=numbers)
+    if not fit.straight:
+        message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        return Check("velocity_attitude", Verdict.ERROR, message, "use NED for both; ROS' ENU swaps x and y", numbers)
+    message = f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
+    return Check("velocity_attitude", Verdict.OK, message, numbers=numbers)
+
+
+def _inside(t: FloatArray, spans: Spans) -> NDArray[np.bool_]:
+    return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0))
+
+
+def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Ways in which four numbers may have been meant."""
+    return [
+        ("as given", q),
+        ("world to body", q * np.array([1.0, -1.0, -1.0, -1.0])),
+        ("x y z w (scalar last)", q[:, [3, 0, 1, 2]]),
+    ]
+
+
+def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
+    keep = _usable_steps(t, gyro.t)
+    mean = np.diff(_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
+    w, v = q[:, :1], q[:, 1:]
+    scalar = np.sum(q[1:] * q[:-1], axis=1)
+    vector = w[:-1] * v[1:] - w[1:] * v[:-1] - np.cross(v[:-1], v[1:])
+    vector *= np.where(scalar < 0.0, -1.0, 1.0)[:, None]
+    sine = np.linalg.norm(vector, axis=1)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    factor = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)
+    return mean, vector[keep] * factor[keep, None] / np.diff(t)[keep, None]
+
+
+def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
+    """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
+    q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    w, v = q[:, :1], q[:, 1:]
+    turned = np.cross(v, accel.values)
+    force = accel.values + 2.0 * (w * turned + np.cross(v, turned)) + np.array([0.0, 0.0, GRAVITY])
+    stride = max(1, round(0.2 / sample_period(velocity.t)))
+    t, speed = velocity.t[::stride], velocity.values[::stride]
+    keep = _usable_steps(t, accel.t) & _usable_steps(t, attitude.t)
+    world = Channel("accel", accel.t, force)
+    derived = np.diff(_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
+
+
+def _usable_steps(t: FloatArray, other: FloatArray) -> NDArray[np.bool_]:
+    """Tells which steps of `t` have no gap, neither in `t` nor in the other channel's times."""
+    steps = np.diff(t)
+    longest = GAP * sample_period(other)
+    holes = np.flatnonzero(np.diff(other) > longest)
+    spoiled = np.zeros(len(steps), dtype=np.bool_)
+    for hole in holes:
+        spoiled |= (t[:-1] < other[hole + 1]) & (t[1:] > other[hole])
+    inside = (t[:-1] >= other[0]) & (t[1:] <= other[-1])
+    return np.asarray(inside & ~spoiled & (steps < GAP * np.median(steps)))
+
+
+def _integral(channel: Channel, at: FloatArray) -> FloatArray:
+    """Running integral (trapezoidal) of a channel, read at times `at`, shape (m, columns)."""
+    area = 0.5 * (channel.values[1:] + channel.values[:-1]) * np.diff(channel.t)[:, None]
+    total = np.concatenate([np.zeros((1, area.shape[1])), np.cumsum(area, axis=0)])
+    return np.column_stack([np.interp(at, channel.t, c) for c in total.T])

@@ -1,0 +1,145 @@
+"""Rotor signals against weight and motion: unit of the speeds, order and spin of the motors."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from quadid.errors import QuadidError
+from quadid.grid import to_windows
+from quadid.inspection.airborne import Spans
+from quadid.inspection.findings import Check, Verdict
+from quadid.rotor_signal import rotor_signal
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Recording, Window
+
+FloatArray = NDArray[np.float64]
+
+_RPM = 2.0 * np.pi / 60.0
+_RATE = 50.0
+_SLOW_MOTION = 0.4
+"""Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
+_LEAST_RATE = 30.0
+_LAGS = 5
+"""Motors answer late: torque up to this many rows earlier is tried."""
+_CLEAR, _MARGIN = 0.25, 0.15
+"""Mean correlation that settles an order, and by how much another order must be better."""
+_MOST_ROTORS = 6
+"""Beyond this only turns and mirror images of the order are tried, not all permutations."""
+
+
+def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Thrust of the initial guess against weight in flight; tells rpm and rev/s from rad/s."""
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check("hover", Verdict.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
+    inside = np.any([(signal.t >= a) & (signal.t <= b) for a, b in spans], axis=0) if spans else None
+    if inside is None or not inside.any():
+        return Check("hover", Verdict.UNKNOWN, "the vehicle does not fly in this log, as far as the rotors tell")
+    square = float(np.mean(np.sum(signal.values[inside] ** 2, axis=1)))
+    needed = vehicle.mass * GRAVITY / square
+    low, high = vehicle.parameters["b"].limits
+    speed = float(np.sqrt(square / len(vehicle.rotors)))
+    numbers = {"b_from_hover": needed, "speed_rad_s": speed}
+    message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
+    if low <= needed <= high:
+        return Check("hover", Verdict.OK, f"{message}; bounds {low:.3g} to {high:.3g}", numbers=numbers)
+    for unit, factor in (("rpm", _RPM), ("rev/s", 2.0 * np.pi)):
+        if low <= needed / factor**2 <= high:
+            return Check(
+                "hover", Verdict.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
+                f"multiply rotor speeds by {factor:.6g}", numbers,
+            )  # fmt: skip
+    fix = "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
+    return Check("hover", Verdict.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
+
+
+def motor_order_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Correlates roll, pitch and yaw torque of every motor order with angular acceleration."""
+    name = "motor_order"
+    if "gyro" not in recording.channels or not spans:
+        return Check(name, Verdict.UNKNOWN, "needs gyro and rotor signal in flight")
+    try:
+        signal = rotor_signal(recording, vehicle)
+        windows = to_windows(recording, vehicle, _RATE, spans[0][0], spans[-1][1])
+    except QuadidError as error:
+        return Check(name, Verdict.UNKNOWN, error.found)
+    rate = 1.0 / float(np.median(np.diff(signal.t)))
+    if rate < _LEAST_RATE:
+        return Check(name, Verdict.UNKNOWN, f"rotor signal at {rate:.3g} Hz is too slow to tell the motor order")
+    lagged = [_quick_motion(windows, lag) for lag in range(_LAGS)]
+    if len(lagged[0][0]) < 100:
+        return Check(name, Verdict.UNKNOWN, "too little flight to tell the motor order")
+    return _judge_order(lagged, vehicle)
+
+
+def _quick_motion(windows: list[Window], lag: int) -> tuple[FloatArray, FloatArray]:
+    """Returns squared rotor speeds `lag` rows earlier (n, rotors) and angular acceleration (n, 3), no slow parts."""
+    width = max(3, round(_SLOW_MOTION * _RATE))
+    squares, gains = [], []
+    for w in windows:
+        if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
+            continue
+        # The change over two steps against what acted in between: the row itself and its neighbours' halves.
+        acted = w.rotor_speed**2
+        acted = (
+            0.5 * (acted[:-2] + acted[1:-1])
+            if w.sampling == "held"
+            else 0.25 * (acted[:-2] + 2 * acted[1:-1] + acted[2:])
+        )
+        gained = (w.gyro[2:] - w.gyro[:-2]) / (2.0 * w.dt)
+        acted, gained = acted[: len(acted) - lag], gained[lag:]
+        squares.append(acted - uniform_filter1d(acted, width, axis=0))
+        gains.append(gained - uniform_filter1d(gained, width, axis=0))
+    if not squares:
+        return np.empty((0, 0)), np.empty((0, 3))
+    return np.concatenate(squares), np.concatenate(gains)
+
+
+def _judge_order(lagged: list[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Check:
+    rotors = len(vehicle.rotors)
+    if float(np.max(np.std(lagged[0][1], axis=0))) < 0.05:
+        return Check("motor_order", Verdict.UNKNOWN, "too little rotation to tell the motor order")
+    scores = {
+        order: max((_correlations(squares[:, order], motion, vehicle) for squares, motion in lagged), key=np.mean)
+        for order in _orders(rotors)
+    }
+    own = scores[tuple(range(rotors))]
+    best = max(scores, key=lambda order: float(np.mean(scores[order])))
+    numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
+    text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
+    gain = float(np.mean(scores[best]) - np.mean(own))
+    if gain > _MARGIN and float(np.mean(scores[best])) > _CLEAR:
+        order = ", ".join(str(i + 1) for i in best)
+        return Check(
+            "motor_order", Verdict.ERROR,
+            f"{text}; much better ({np.mean(scores[best]):.2f} on average) with the log's columns in the order {order}",
+            f"order the rotors of the vehicle file so that they take columns {order}", numbers,
+        )  # fmt: skip
+    if own[2] < -_CLEAR:
+        return Check(
+            "motor_order", Verdict.ERROR, f"{text}: yaw is reversed", "negate the spins in the vehicle file", numbers
+        )
+    if min(own[0], own[1]) > _CLEAR:
+        return Check("motor_order", Verdict.OK, text, numbers=numbers)
+    return Check("motor_order", Verdict.UNKNOWN, f"{text}: too weak to judge", numbers=numbers)
+
+
+def _orders(rotors: int) -> list[tuple[int, ...]]:
+    own = tuple(range(rotors))
+    if rotors <= _MOST_ROTORS:
+        return list(permutations(own))
+    turns = [own[i:] + own[:i] for i in range(rotors)]
+    return turns + [turn[::-1] for turn in turns]
+
+
+def _correlations(squares: FloatArray, motion: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """Correlation per axis; thrust acts along -z, so torque is (-y, x) times thrust, and spin times drag about z."""
+    place = vehicle.rotor_positions
+    torque = np.column_stack([squares @ -place[:, 1], squares @ place[:, 0], squares @ vehicle.spins])
+    norm = np.linalg.norm(torque, axis=0) * np.linalg.norm(motion, axis=0)
+    return np.asarray(np.sum(torque * motion, axis=0) / np.maximum(norm, 1e-300))

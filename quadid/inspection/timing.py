@@ -1,0 +1,120 @@
+"""Timing of channels and values that do not move: rates, gaps, jitter, stuck and saturated signals, clock faults."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.inspection.findings import ChannelFacts, Check, Verdict
+from quadid.resample import sample_period
+from quadid.tracks import CSV_GAP, GAP
+from quadid.window import CHANNELS, Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+_STUCK = 0.5
+"""An IMU channel that does not change for this long [s] in flight is stuck."""
+_CLIPPED = 5
+"""A channel that reaches its extreme this often is clipped there."""
+_UNSTEADY = 0.25
+"""Jitter above which the log's timing is worth a warning."""
+
+
+def channel_facts(recording: Recording) -> tuple[ChannelFacts, ...]:
+    """Returns the facts of all channels of a recording."""
+    gap = CSV_GAP if recording.format == "csv" else GAP
+    return tuple(_facts(recording.channels[name], gap) for name in CHANNELS if name in recording.channels)
+
+
+def _facts(channel: Channel, gap: float) -> ChannelFacts:
+    steps = np.diff(channel.t)
+    median = float(np.median(steps)) if len(steps) else np.nan
+    long = steps > gap * median
+    usual = steps[~long]
+    same = np.all(np.diff(channel.values, axis=0) == 0.0, axis=1)
+    return ChannelFacts(
+        name=channel.name,
+        unit=CHANNELS[channel.name][1],
+        source=channel.source,
+        rate=1.0 / sample_period(channel.t) if len(channel.t) > 1 else np.nan,
+        count=len(channel.t),
+        first=float(channel.t[0]),
+        last=float(channel.t[-1]),
+        jitter=float(np.std(usual) / median) if len(usual) else np.nan,
+        gaps=int(np.count_nonzero(long)),
+        longest_gap=float(steps[long].max()) if long.any() else 0.0,
+        repeated=float(np.mean(same)) if len(same) else 0.0,
+        stuck=_longest_rest(channel.t, same),
+        saturated=_saturated(channel.values) if channel.name in ("gyro", "accel", "motor_command") else 0,
+        dropped=dict(channel.faults),
+    )
+
+
+def _longest_rest(t: FloatArray, same: NDArray[np.bool_]) -> float:
+    """Returns the longest time [s] during which no column changed."""
+    if not same.any():
+        return 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    return float(np.max(t[edges[1::2]] - t[edges[::2]]))
+
+
+def _saturated(values: FloatArray) -> int:
+    """Counts samples at a column's largest or smallest value, where that is hit `_CLIPPED` times after motion."""
+    count = 0
+    for column in values.T:
+        if np.ptp(column) == 0.0:
+            continue
+        for extreme in (column.min(), column.max()):
+            arrivals = np.count_nonzero((column[1:] == extreme) & (column[:-1] != extreme))
+            if arrivals >= _CLIPPED:
+                count += int(np.count_nonzero(column == extreme))
+    return count
+
+
+def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying: float) -> list[Check]:
+    """Checks clocks, gaps, jitter and stuck sensors.
+
+    Args:
+        recording: the log.
+        facts: of its channels.
+        flying: time in flight [s].
+    """
+    checks = [_clock_check(recording, facts)]
+    gaps = {f.name: f for f in facts if f.gaps}
+    if gaps:
+        worst = max(gaps.values(), key=lambda f: f.longest_gap)
+        text = ", ".join(f"{f.name} {f.gaps}" for f in gaps.values())
+        checks.append(
+            Check(
+                "timing", Verdict.WARNING, f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
+                "windows are cut there; log to a faster card or at a lower rate",
+                {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
+            )
+        )  # fmt: skip
+    unsteady = [
+        f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > _UNSTEADY
+    ]
+    for f in unsteady:
+        message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
+        checks.append(Check("timing", Verdict.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
+    for f in facts:
+        if f.name in ("gyro", "accel") and f.stuck > _STUCK and flying > 1.0:
+            message = f"{f.name}: does not change for {f.stuck:.2g} s ({f.source})"
+            checks.append(Check("stuck", Verdict.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck}))
+        if f.name in ("gyro", "accel") and f.saturated:
+            message = f"{f.name}: {f.saturated} samples at the limit of its range"
+            checks.append(Check("saturated", Verdict.WARNING, message, "choose a larger range or fly more gently"))
+    return checks
+
+
+def _clock_check(recording: Recording, facts: tuple[ChannelFacts, ...]) -> Check:
+    dropped: dict[str, int] = {}
+    for f in facts:
+        for reason, count in f.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+    numbers = {"breaks": float(len(recording.breaks)), **{k: float(v) for k, v in dropped.items()}}
+    if not recording.breaks and not dropped:
+        return Check("clock", Verdict.OK, "time rises steadily, no sample was dropped", numbers=numbers)
+    parts = [f"{len(recording.breaks)} breaks (reboots or clock steps)"] if recording.breaks else []
+    parts += [f"{count} samples dropped: {reason.replace('_', ' ')}" for reason, count in dropped.items()]
+    return Check("clock", Verdict.WARNING, "; ".join(parts), "nothing is joined across breaks", numbers)
