@@ -11,7 +11,7 @@ Logs = Annotated[
     list[str],
     typer.Argument(
         metavar="LOG...",
-        help="Flight logs: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
+        help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
     ),
 ]
 VehicleName = Annotated[

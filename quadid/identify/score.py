@@ -1,0 +1,263 @@
+"""How well a parameter vector explains a set: simulation over 1 s segments with estimated initial states.
+
+The mean squared residual of each channel is divided by what pure sensor noise would leave there after the initial
+states were fitted, so a perfect model scores 1.0 whatever the segment length, noise colour or channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import NotIdentifiableError
+from quadid.identify.noise import NoiseModel
+from quadid.identify.shooting import Linearised, Shooting
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+SCORE_SECONDS = 1.0
+"""Length of the simulated stretches that a set is scored on [s], whatever the fit used."""
+STATE_STEPS = 4
+"""Gauss-Newton steps of the initial states; the last ones change nothing but for a far-off parameter vector."""
+_ATTITUDE = slice(3, 6)
+
+
+@dataclass(frozen=True)
+class ChannelScore:
+    """One output.
+
+    Attributes:
+        name: p q r phi theta psi a_x a_y a_z v_n v_e v_d x y z.
+        unit: SI unit.
+        mse: squared residuals over those of a perfect model; NaN when never measured.
+        rmse: root mean squared error of the simulation, in `unit`.
+        fit_percent: 100 (1 - |y - y_sim| / |y - mean y|); 100 is perfect, 0 no better than the mean.
+        samples: measured samples.
+    """
+
+    name: str
+    unit: str
+    mse: float
+    rmse: float
+    fit_percent: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class Series:
+    """Measured and simulated outputs over time, for pictures.
+
+    Attributes:
+        t: times [s], shape (n,).
+        measured, simulated: shape (n, channels), attitude as roll, pitch, yaw [rad] (yaw unwrapped); NaN where not
+            measured.
+    """
+
+    t: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+
+
+@dataclass(frozen=True)
+class SetScore:
+    """Score of one parameter vector on one set.
+
+    Attributes:
+        mse: mean over channels and samples of the squared residuals over those of a perfect model; 1.0 is the noise
+            floor, infinite when the simulation ran away.
+        channels: every output.
+        series: what was measured and simulated.
+    """
+
+    mse: float
+    channels: tuple[ChannelScore, ...]
+    series: Series
+
+
+def mse_score(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel | None = None
+) -> SetScore:
+    """Scores `theta` on `windows`.
+
+    Args:
+        windows: data on one grid.
+        vehicle: geometry and mass.
+        theta: full parameter vector, shape (size,).
+        noise: sensor noise, from the fit; typical MEMS noise by default.  Channels it does not know get the typical.
+
+    Raises:
+        NotIdentifiableError: no stretch is long enough for one segment.
+    """
+    shooting = Shooting(windows, vehicle, SCORE_SECONDS)
+    if not shooting.rollouts:
+        raise NotIdentifiableError(
+            "no stretch is long enough to be scored", f"{SCORE_SECONDS + 0.4:g} s without gaps",
+            "record longer stretches at a steady rate",
+        )  # fmt: skip
+    shooting.noise = covering(noise, shooting.channels, vehicle)
+    lin = settle_states(shooting, theta)
+    expected = expected_squares(shooting, theta)
+    series = _series(shooting, lin)
+    return SetScore(*_compare(lin, expected, series), series)
+
+
+def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:
+    """The noise model for `channels` channels: `noise` as far as it goes, then the typical."""
+    out = NoiseModel.guess(channels, vehicle.noise)
+    if noise is None:
+        return out
+    known = min(channels, len(noise.white))
+    white, slow = out.white.copy(), out.slow.copy()
+    white[:known], slow[:known] = noise.white[:known], noise.slow[:known]
+    return NoiseModel(white, slow, noise.slow_time)
+
+
+def settle_states(shooting: Shooting, theta: FloatArray) -> Linearised:
+    """Fits the initial state of every segment at fixed `theta`; a step that makes a segment worse is not taken.
+
+    Returns:
+        The linearisation at the fitted states, which `shooting` holds afterwards.
+    """
+    none = shooting.free([])
+    lin = shooting.linearise(theta, none)
+    power = _power(shooting, lin)
+    for _ in range(STATE_STEPS):
+        kept = shooting.snapshot()
+        (before,) = kept.values()  # one vector, so one way to start segments
+        after = shooting.step_states(theta, none, lin, np.empty(0))
+        shooting.adopt(theta, none, after)
+        trial = shooting.linearise(theta, none)
+        better = _power(shooting, trial) < power
+        if not better.all():
+            shooting.adopt(theta, none, _choose(better, after, before))
+            trial = shooting.linearise(theta, none)
+        lin, last, power = trial, power, _power(shooting, trial)
+        if np.sum(last - power) <= 1e-6 * np.sum(power):
+            break
+    return lin
+
+
+def _power(shooting: Shooting, lin: Linearised) -> FloatArray:
+    """Whitened squares of every segment at its present initial state, shape (segments,); infinite where it ran away."""
+    white = shooting.whiten(lin.residuals[..., None], lin.weights)
+    return np.asarray(np.nan_to_num(np.sum(white**2, axis=(1, 2, 3)), nan=np.inf))
+
+
+def _choose(better: NDArray[np.bool_], after: list[FloatArray], before: list[FloatArray]) -> list[FloatArray]:
+    out, place = [], 0
+    for new, old in zip(after, before, strict=True):
+        out.append(np.where(better[place : place + len(new), None], new, old))
+        place += len(new)
+    return out
+
+
+def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
+    """Sum of squares that pure noise leaves in each segment and channel, shape (segments, channels), unit squared.
+
+    With C = L L' the noise covariance of a channel and Q the whitened initial-state directions, fitting the initial
+    state leaves E[r' r] = trace(L (I - Q Q') L').
+    """
+    factor = np.linalg.inv(shooting.noise.whitener(shooting.length, shooting.dt))
+    sigma, slow = np.sqrt(shooting.noise.variance), shooting.noise.slow > 0.0
+    parts = []
+    for i, (basis, _, complete) in enumerate(shooting.eliminated(theta, shooting.free([]))):
+        count, k = len(basis), basis.shape[2]
+        q = basis.reshape(count, shooting.length, shooting.channels, k)
+        whole = np.empty((count, shooting.channels))
+        rows = shooting.segments[i].starts[:, None] + np.arange(shooting.length)
+        measured = np.count_nonzero(shooting.rollouts[i].valid[rows][..., : shooting.channels], axis=1)
+        for c in range(shooting.channels):
+            directions = np.sum((sigma[c] * q[:, :, c]) ** 2, axis=(1, 2))
+            if slow[c]:
+                coloured = np.sum(np.matmul(factor[c], q[:, :, c]) ** 2, axis=(1, 2))
+                directions = np.where(complete[:, c], coloured, directions)
+            whole[:, c] = measured[:, c] * sigma[c] ** 2 - directions
+        parts.append(np.maximum(whole, 0.0))
+    return np.concatenate(parts)
+
+
+def _compare(lin: Linearised, expected: FloatArray, series: Series) -> tuple[float, tuple[ChannelScore, ...]]:
+    used = lin.weights > 0.0
+    squares = np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1))
+    samples = np.count_nonzero(used, axis=(0, 1))
+    total = expected.sum(axis=0)
+    # A channel whose samples are so few that the initial states take them all says nothing about the model.
+    told = total > 1e-9 * np.maximum(squares, 1e-300)
+    ratio = np.where(told, squares / np.where(told, total, 1.0), np.nan)
+    channels = []
+    for c, name in enumerate(CHANNEL_NAMES[: len(samples)]):
+        rmse, percent = _errors(series.measured[:, c], series.simulated[:, c])
+        channels.append(ChannelScore(name, CHANNEL_UNITS[c], float(ratio[c]), rmse, percent, int(samples[c])))
+    weight = np.where(told, samples, 0)
+    if not np.isfinite(lin.cost).all() or weight.sum() == 0:
+        return np.inf, tuple(channels)
+    return float(np.sum(weight * np.where(told, ratio, 0.0)) / weight.sum()), tuple(channels)
+
+
+def _errors(measured: FloatArray, simulated: FloatArray) -> tuple[float, float]:
+    """Root mean squared error, and normalised-root-mean-squared-error fit [%]; NaN when nothing was measured."""
+    good = np.isfinite(measured) & np.isfinite(simulated)
+    if not good.any():
+        return np.nan, np.nan
+    y, error = measured[good], measured[good] - simulated[good]
+    rmse, spread = float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean((y - y.mean()) ** 2)))
+    return rmse, 100.0 * (1.0 - rmse / spread) if spread > 0.0 else np.nan
+
+
+def _series(shooting: Shooting, lin: Linearised) -> Series:
+    t, measured, simulated = [], [], []
+    place = 0
+    for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
+        rows = (segments.starts[:, None] + np.arange(segments.length)).ravel()
+        part = slice(place, place + len(segments.starts))
+        residual = lin.residuals[part].reshape(len(rows), -1)
+        place += len(segments.starts)
+        y, q = _outputs(rollout.measured[rows], shooting.channels)
+        y_sim = y + residual
+        y[:, _ATTITUDE], y_sim[:, _ATTITUDE] = _angles(q, residual[:, _ATTITUDE])
+        absent = ~rollout.valid[rows][:, : shooting.channels]
+        y[absent] = y_sim[absent] = np.nan
+        t.append(rollout.window.t[rows])
+        measured.append(y)
+        simulated.append(y_sim)
+    return Series(np.concatenate(t), np.concatenate(measured), np.concatenate(simulated))
+
+
+def _outputs(rows: FloatArray, channels: int) -> tuple[FloatArray, FloatArray]:
+    """Measured rows (n, 16) as channels with a place left for the attitude, and the attitude quaternions (n, 4)."""
+    y = np.concatenate([rows[:, :3], np.zeros((len(rows), 3)), rows[:, 7:]], axis=1)[:, :channels]
+    return np.ascontiguousarray(y), rows[:, 3:7]
+
+
+def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Measured and simulated roll, pitch, yaw [rad] from attitudes (n, 4) and the simulation's error (n, 3).
+
+    The error is twice the vector part of the rotation from measured to simulated body.
+    """
+    v = np.clip(0.5 * error, -1.0, 1.0)
+    w = np.sqrt(np.maximum(1.0 - np.sum(v * v, axis=1), 0.0))
+    simulated = np.column_stack(
+        [
+            q[:, 0] * w - np.sum(q[:, 1:] * v, axis=1),
+            q[:, :1] * v + w[:, None] * q[:, 1:] + np.cross(q[:, 1:], v),
+        ]
+    )
+    angles, other = euler(q), euler(simulated)
+    angles[:, 2] = np.unwrap(angles[:, 2])
+    difference = np.remainder(other - angles + np.pi, 2.0 * np.pi) - np.pi
+    return angles, angles + difference
+
+
+def euler(q: FloatArray) -> FloatArray:
+    """Roll, pitch, yaw [rad] (z-y-x) of unit quaternions wxyz body to world, shapes (n, 4) -> (n, 3)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.column_stack([roll, pitch, yaw])
