@@ -96,7 +96,8 @@ def hold_mean(t: FloatArray, values: FloatArray, at: FloatArray, step: float) ->
 def _kernel_table() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Tabulates lag [grid steps], kernel, and its running integral (0 to 1)."""
     lag = np.linspace(-HALF_WIDTH, HALF_WIDTH, 16001)
-    window = np.i0(KAISER_BETA * np.sqrt(np.clip(1.0 - (lag / HALF_WIDTH) ** 2, 0.0, 1.0)))
+    # Less its value at the ends, so that a sample exactly there weighs nothing.
+    window = np.i0(KAISER_BETA * np.sqrt(np.clip(1.0 - (lag / HALF_WIDTH) ** 2, 0.0, 1.0))) - 1.0
     kernel = np.sinc(2.0 * CUTOFF * lag) * window
     area = np.concatenate([[0.0], np.cumsum(0.5 * (kernel[1:] + kernel[:-1]) * np.diff(lag))])
     return lag, kernel / area[-1], area / area[-1]

@@ -129,7 +129,8 @@ def _print(console: Console, inspection: Inspection) -> None:
 
     flying = ", ".join(f"{a:.1f}-{b:.1f}" for a, b in inspection.flying) or "none found"
     console.print(
-        f"[bold]{escape(inspection.name)}[/bold]: {inspection.format}, {inspection.seconds:.1f} s, flying from-to (s): {flying}"
+        f"[bold]{escape(inspection.name)}[/bold]: {inspection.format}, {inspection.seconds:.1f} s, "
+        f"flying from-to (s): {flying}"
     )
     for warning in inspection.warnings:
         console.print(f"[yellow]note[/yellow] {escape(warning)}")
