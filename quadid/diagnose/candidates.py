@@ -51,6 +51,7 @@ _FAMILY = {
     "mass_change": "step",
     "thrust_drop": "step",
     "battery_sag": "step",
+    "thrust_curve": "thrust_curve",
     "weak_rotor": "corner",
     "cg_offset": "corner",
 }

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, held_out_deviance
 from quadid.diagnose.candidates import Candidate
-from quadid.identify.polish import Polished, default_prior, polish
+from quadid.identify.polish import Polished, Prior, default_prior, polish
 from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.uncertainty import score_products
 from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +24,7 @@ class Model:
 
     Attributes:
         causes: candidates it contains.
-        free: its free parameters.
+        free: its free parameters; prior: weak prior on them.
         theta: full vector at the optimum.
         lin: linearisation there.
         cost: deviance with prior.
@@ -33,6 +34,7 @@ class Model:
 
     causes: tuple[Candidate, ...]
     free: Free
+    prior: Prior
     theta: FloatArray
     lin: Linearised
     cost: float
@@ -43,6 +45,32 @@ class Model:
     def deviance(self) -> float:
         """Marginal deviance on the fitted data, prior included."""
         return self.cost + float(self.lin.occam.sum())
+
+    @property
+    def rows(self) -> float:
+        """Independent residuals."""
+        return float(self.lin.rows.sum())
+
+    @property
+    def misfit(self) -> float:
+        """Deviance per independent residual; 1 at the noise floor."""
+        return float(self.lin.cost.sum()) / max(self.rows, 1.0)
+
+    def wald(self, cause: Candidate) -> float:
+        """Robust chi-square of the parameters of `cause` against neutral.
+
+        Their covariance is widened where segment scores are larger or more correlated than the noise model says.
+        """
+        precision = 1.0 / self.prior.sigma**2
+        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(precision))
+        meat, _ = score_products(self.lin)
+        ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
+        widen = np.sqrt(np.maximum(ratio, 1.0))
+        covariance = covariance * np.outer(widen, widen)
+        place = [self.free.names.index(n) for n in cause.names]
+        entries = [self.free.entries[i] for i in place]
+        z = np.array([(self.theta[e.index] - e.neutral) / e.typical for e in entries])
+        return float(z @ np.linalg.solve(covariance[np.ix_(place, place)], z))
 
     @property
     def effects(self) -> set[str]:
@@ -69,9 +97,9 @@ def fit_model(
 
 def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
     """Wraps a polish result with its held-out deviance."""
-    precision = 1.0 / default_prior(shooting, free).sigma ** 2
-    held_out = held_out_deviance(result.lin, precision, block_labels(result.lin))
-    return Model(causes, free, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
+    prior = default_prior(shooting, free)
+    held_out = held_out_deviance(result.lin, 1.0 / prior.sigma**2, block_labels(result.lin))
+    return Model(causes, free, prior, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
 
 
 def extend(shooting: Shooting, model: Model, candidate: Candidate, iterations: int = 6) -> Model:

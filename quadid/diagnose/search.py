@@ -18,16 +18,24 @@ from quadid.model.layout import NEVER
 
 FloatArray = NDArray[np.float64]
 
+LINEAR_MISFIT = 4.0
+"""Deviance per row above which the longer segments are too far from linear to search on."""
 SHORT_LIST = 5
 MOST_CAUSES = 12
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
 ERRORS = 2.0
 """A gain on unseen blocks must exceed this many of its standard errors."""
-LEAST_GAIN = 8.0
-"""… and this much deviance."""
-RELATIVE_GAIN = 0.004
+LEAST_GAIN = 15.0
+"""… and this much deviance …"""
+LEAST_SHARE = 0.0012
+"""… and this share of the noise that no model can remove: less is of no use to anybody, and within what the time step
+of a simulation or of an autopilot's own filter can imitate."""
+RELATIVE_GAIN = 1e-4
 """… and this share of all gains so far, so that the tail of a huge effect is not named as another."""
+FAMILY_SHARE = 0.01
+"""… and, where a look-alike is already in the model, this share of all gains so far: the rest of a fading thrust that
+is not quite linear is no second cause."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,11 @@ class Trial:
     gain: Gain
     drop: float
     tests: int
+
+    @property
+    def evidence(self) -> float:
+        """Chi-square of the new parameters: the smaller of the fall in deviance and the robust Wald statistic."""
+        return min(self.drop, self.model.wald(self.candidate))
 
 
 @dataclass(frozen=True)
@@ -67,21 +80,43 @@ class Search:
 
 
 def select(
-    shooting: Shooting, theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None]
-) -> Search:
-    """Selects the causes that the data support, most gain first."""
-    nominal = fit_model(shooting, theta, ())
-    model, rounds, tests = nominal, [], 1
+    short: Shooting, decisive: Shooting, theta: FloatArray, listed: Sequence[Candidate],
+    report: Callable[[str, float], None],
+) -> Search:  # fmt: skip
+    """Selects the causes that the data support, most gain first.
+
+    Args:
+        short: segments so short that even a large error stays nearly linear; used while the misfit is large.
+        decisive: longer segments, on which slow causes show; decides as soon as the model follows them.
+        theta: nominal optimum.
+        listed: causes to try.
+        report: progress.
+    """
+    nominal = fit_model(decisive, theta, ())
+    rounds: list[Round] = []
+    shooting, model, base = decisive, nominal, nominal
+    if nominal.misfit > LINEAR_MISFIT:
+        shooting, model = short, fit_model(short, theta, ())
+        base = model
+    tests = 1
     while len(model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
         scores = screen(shooting, model, list(listed))
         tests = len(scores)
         trials = [_try(shooting, model, s, tests) for s in _short_list(scores, tests)]
-        accepted = _choose(trials, model, nominal)
+        accepted = _choose(trials, model, base)
         rounds.append(Round(tuple(trials), accepted, tuple(scores)))
+        if accepted is not None:
+            model = _prune(shooting, accepted.model, accepted.candidate, base, tests)
+        if shooting is short:
+            longer = fit_model(decisive, model.theta, model.causes, iterations=10)
+            if longer.misfit < LINEAR_MISFIT or accepted is None:
+                shooting, model, base = decisive, longer, nominal
+                continue
         if accepted is None:
             break
-        model = _prune(shooting, accepted.model, accepted.candidate, nominal, tests)
+    if shooting is short:
+        model = fit_model(decisive, model.theta, model.causes, iterations=10)
     return Search(nominal, model, tuple(rounds), tests)
 
 
@@ -136,20 +171,34 @@ def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Mode
     return fit_model(shooting, best_theta, model.causes, model.states, iterations=4)
 
 
-def _significant(gain: Gain, drop: float, added: int, earned: float, tests: int) -> bool:
+@dataclass(frozen=True)
+class _Context:
+    """What a gain is measured against: all gains so far, independent rows, families already in the model."""
+
+    earned: float
+    rows: float
+    families: frozenset[str]
+
+
+def _significant(gain: Gain, evidence: float, cause: Candidate, tests: int, context: _Context) -> bool:
     """Whether a gain on unseen blocks is real, worth having, and beyond what so many trials bring by luck."""
+    share = FAMILY_SHARE if cause.family in context.families else RELATIVE_GAIN
     return (
         gain.total > ERRORS * gain.error
-        and gain.total > LEAST_GAIN
-        and gain.total > RELATIVE_GAIN * earned
-        and float(stats.chi2.sf(drop, added)) * tests < FALSE_ALARM
+        and gain.total > max(LEAST_GAIN, LEAST_SHARE * context.rows, share * context.earned)
+        and float(stats.chi2.sf(evidence, len(cause.names))) * tests < FALSE_ALARM
     )
+
+
+def _context(model: Model, nominal: Model) -> _Context:
+    earned = float(nominal.held_out.sum() - model.held_out.sum())
+    return _Context(earned, model.rows, frozenset(c.family for c in model.causes))
 
 
 def _choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
     """The best trial, or a simpler one within one standard error of it; None when none is significant."""
-    earned = float(nominal.held_out.sum() - model.held_out.sum())
-    good = [t for t in trials if _significant(t.gain, t.drop, len(t.candidate.names), earned, t.tests)]
+    context = _context(model, nominal)
+    good = [t for t in trials if _significant(t.gain, t.evidence, t.candidate, t.tests, context)]
     if not good:
         return None
     best = max(good, key=lambda t: t.gain.total)
@@ -181,7 +230,7 @@ def _prune(shooting: Shooting, model: Model, newest: Candidate, nominal: Model, 
             continue
         rest = without(shooting, model, cause)
         gain = paired_gain(rest.held_out, model.held_out)
-        earned = float(nominal.held_out.sum() - rest.held_out.sum())
-        if not _significant(gain, rest.deviance - model.deviance, len(cause.names), earned, tests):
+        evidence = min(rest.deviance - model.deviance, model.wald(cause))
+        if not _significant(gain, evidence, cause, tests, _context(rest, nominal)):
             model = rest
     return model

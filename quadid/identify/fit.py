@@ -13,6 +13,7 @@ from quadid.errors import NotIdentifiableError, WindowError
 from quadid.identify.noise import NoiseModel, estimate_noise
 from quadid.identify.polish import Convergence, Polished, Prior, default_prior, polish
 from quadid.identify.shooting import Free, Shooting
+from quadid.identify.spectrum import shaped_noise
 from quadid.identify.swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
 from quadid.model.layout import LOSS, Layout
@@ -27,6 +28,7 @@ Progress = Callable[[str, float], None]
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
+SPECTRUM_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def fit(
     first = polish(short, theta, free, iterations=8)
     short.noise = residual_noise(short, first)
     first = polish(short, first.theta, free, iterations=8)
-    noise, spent = noise_floor(short, first.theta, free)
+    noise, spent = noise_floor(windows, short, first.theta, free)
     report("polish", 0.4)
     final = Shooting(windows, vehicle, options.seconds, noise, layout)
     result = polish(final, first.theta, final.free(free_names), robust=options.robust)
@@ -227,22 +229,32 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
 
 
-def noise_floor(shooting: Shooting, theta: FloatArray, free: Free, iterations: int = 4) -> tuple[NoiseModel, int]:
-    """Sensor noise from a deliberately flexible fit on short segments, and the vectors simulated for it.
+def noise_floor(
+    windows: Sequence[Window], short: Shooting, theta: FloatArray, free: Free, iterations: int = 4
+) -> tuple[NoiseModel, int]:
+    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it.
+
+    The flexible model is fitted on short segments, where it is nearly linear, and again on longer ones that resolve
+    the spectrum of the vibration.
 
     Args:
-        shooting: short segments; its initial states are left as they were.
+        windows: data.
+        short: short segments; its initial states are left as they were.
         theta: nominal optimum.
         free: nominal free parameters (kept free).
-        iterations: linearisations to spend.
+        iterations: linearisations to spend on the short segments.
     """
-    names = list(dict.fromkeys([*free.names, *flexible_names(shooting.layout, shooting)]))
-    wide = shooting.free(names)
-    keep = shooting.snapshot()
-    result = polish(shooting, theta, wide, iterations=iterations)
-    noise = residual_noise(shooting, result)
-    shooting.restore(keep)
-    return noise, result.iterations * (len(names) + 10)
+    names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
+    wide = short.free(names)
+    keep = short.snapshot()
+    first = polish(short, theta, wide, iterations=iterations)
+    noise = residual_noise(short, first)
+    short.restore(keep)
+    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, noise, short.layout)
+    second = polish(longer, first.theta, wide, iterations=3)
+    longer.noise = residual_noise(longer, second)
+    noise = shaped_noise(longer, second.theta, wide)
+    return noise, (first.iterations + second.iterations) * (len(names) + 10)
 
 
 def channel_names(channels: int) -> tuple[str, ...]:

@@ -20,6 +20,8 @@ FloatArray = NDArray[np.float64]
 
 SLOW_TIME = 0.66
 """Correlation time of the slow AHRS error [s]: a pole of 0.97 at 50 Hz, safe also when the noise is white."""
+SHAPE_POINTS = 51
+"""Frequencies on which a noise spectrum is kept."""
 _DEFAULT = np.array([0.02] * 3 + [0.005] * 3 + [0.2] * 3 + [0.1] * 3 + [0.05] * 3)
 _POLYNOMIAL = (1, 2, 0, 2, 3)
 """Order of the trend that fitting a segment's initial state takes out of rate, attitude, specific force, velocity,
@@ -34,11 +36,14 @@ class NoiseModel:
         white: standard deviation of the white part, shape (channels,), channel's unit.
         slow: standard deviation of the slow part, shape (channels,).
         slow_time: correlation time of the slow part [s].
+        shape: relative spectrum of the white part on `SHAPE_POINTS` frequencies from 0 to Nyquist, mean 1, shape
+            (channels, SHAPE_POINTS); None when all is white.
     """
 
     white: FloatArray
     slow: FloatArray
     slow_time: float = SLOW_TIME
+    shape: FloatArray | None = None
 
     @classmethod
     def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
@@ -56,20 +61,37 @@ class NoiseModel:
         return np.asarray(self.white**2 + self.slow**2)
 
     def whitener(self, length: int, dt: float) -> FloatArray:
-        """Returns W, shape (channels, length, length): W[c] @ r has unit variance and is white for pure noise r."""
+        """Returns W, shape (channels, length, length): W[c] @ r has unit variance and is white for pure noise r.
+
+        A slow part is whitened by the Cholesky factor of its covariance, a spectrum in the cosine modes, which are
+        nearly independent for stationary noise.
+        """
         out = np.zeros((len(self.white), length, length))
         for c, (white, slow) in enumerate(zip(self.white, self.slow, strict=True)):
-            if slow == 0.0:
-                out[c] = np.eye(length) / white
-            else:
+            if slow > 0.0:
                 cov = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / self.slow_time)
                 out[c] = np.linalg.inv(np.linalg.cholesky(cov))
+            elif self.shape is not None:
+                modes = np.linspace(0.0, 1.0, length, endpoint=False)
+                level = np.interp(modes, np.linspace(0.0, 1.0, SHAPE_POINTS), self.shape[c])
+                out[c] = _cosines(length) / (white * np.sqrt(level))[:, None]
+            else:
+                out[c] = np.eye(length) / white
         return out
 
     @property
-    def is_white(self) -> bool:
-        """True when no channel has a slow part."""
-        return not np.any(self.slow)
+    def coloured(self) -> NDArray[np.bool_]:
+        """True for channels that are not white, shape (channels,)."""
+        mask = self.slow > 0.0
+        return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
+
+
+@lru_cache(maxsize=32)
+def _cosines(length: int) -> FloatArray:
+    """Orthonormal cosine transform, rows are modes."""
+    from scipy.fft import dct
+
+    return np.asarray(dct(np.eye(length), axis=0, norm="ortho"))
 
 
 @lru_cache(maxsize=32)

@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 PRIOR_SIGMA_LINEAR = 10.0
 """Weak prior of an effect parameter: this many typical sizes."""
 HUBER = 4.0
-"""Whitened residuals beyond this many sigma are down-weighted (Huber); Gaussian data lose nothing measurable."""
+"""Residuals beyond this many sigma are down-weighted (Huber); Gaussian data lose nothing measurable."""
 
 
 class Convergence(str, Enum):
@@ -84,9 +84,8 @@ def prior_terms(free: Free, prior: Prior, theta: FloatArray) -> tuple[FloatArray
 
 
 def robust_weights(shooting: Shooting, lin: Linearised) -> list[FloatArray]:
-    """Huber weights of every sample from whitened residuals (square roots of the row weights), per window."""
-    plain = (lin.weights > 0.0).astype(np.float64)
-    white = np.abs(shooting.whiten(lin.residuals[..., None], plain)[..., 0])
+    """Huber weights of every sample (square roots of the row weights), per window."""
+    white = np.abs(lin.residuals) / np.sqrt(shooting.noise.variance)
     weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(white, HUBER)))
     out, place = [], 0
     for segments in shooting.segments:

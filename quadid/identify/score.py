@@ -7,7 +7,7 @@ states were fitted, so a perfect model scores 1.0 whatever the segment length, n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,13 +109,17 @@ def mse_score(
 
 def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:
     """The noise model for `channels` channels: `noise` as far as it goes, then the typical."""
-    out = NoiseModel.guess(channels, vehicle.noise)
+    typical = NoiseModel.guess(channels, vehicle.noise)
     if noise is None:
-        return out
+        return typical
     known = min(channels, len(noise.white))
-    white, slow = out.white.copy(), out.slow.copy()
+    white, slow = typical.white.copy(), typical.slow.copy()
     white[:known], slow[:known] = noise.white[:known], noise.slow[:known]
-    return NoiseModel(white, slow, noise.slow_time)
+    shape = None
+    if noise.shape is not None:
+        shape = np.ones((channels, noise.shape.shape[1]))
+        shape[:known] = noise.shape[:known]
+    return replace(noise, white=white, slow=slow, shape=shape)
 
 
 def settle_states(shooting: Shooting, theta: FloatArray) -> Linearised:
@@ -163,22 +167,20 @@ def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
     With C = L L' the noise covariance of a channel and Q the whitened initial-state directions, fitting the initial
     state leaves E[r' r] = trace(L (I - Q Q') L').
     """
-    factor = np.linalg.inv(shooting.noise.whitener(shooting.length, shooting.dt))
-    sigma, slow = np.sqrt(shooting.noise.variance), shooting.noise.slow > 0.0
+    whitener = shooting.noise.whitener(shooting.length, shooting.dt)
+    factor = np.linalg.inv(whitener)
+    white = [np.count_nonzero(w - np.diag(np.diag(w))) == 0 for w in whitener]
+    variance = shooting.noise.variance
     parts = []
     for i, (basis, _, complete) in enumerate(shooting.eliminated(theta, shooting.free([]))):
-        count, k = len(basis), basis.shape[2]
-        q = basis.reshape(count, shooting.length, shooting.channels, k)
-        whole = np.empty((count, shooting.channels))
+        q = basis.reshape(len(basis), shooting.length, shooting.channels, -1)
         rows = shooting.segments[i].starts[:, None] + np.arange(shooting.length)
         measured = np.count_nonzero(shooting.rollouts[i].valid[rows][..., : shooting.channels], axis=1)
-        for c in range(shooting.channels):
-            directions = np.sum((sigma[c] * q[:, :, c]) ** 2, axis=(1, 2))
-            if slow[c]:
-                coloured = np.sum(np.matmul(factor[c], q[:, :, c]) ** 2, axis=(1, 2))
-                directions = np.where(complete[:, c], coloured, directions)
-            whole[:, c] = measured[:, c] * sigma[c] ** 2 - directions
-        parts.append(np.maximum(whole, 0.0))
+        left = variance * (measured - np.sum(q**2, axis=(1, 3)))
+        for c in np.flatnonzero(~np.array(white)):
+            coloured = np.sum(factor[c] ** 2) - np.sum(np.matmul(factor[c], q[:, :, c]) ** 2, axis=(1, 2))
+            left[:, c] = np.where(complete[:, c], coloured, left[:, c])
+        parts.append(np.maximum(left, 0.0))
     return np.concatenate(parts)
 
 

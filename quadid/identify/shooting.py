@@ -8,17 +8,19 @@ the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.gram_kernel import segment_grams
 from quadid.identify.noise import NoiseModel
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES
 from quadid.model.layout import Entry, Layout
 from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import _threads as worker_threads
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -195,9 +197,10 @@ class Shooting:
         for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
             cut = Segments(segments.length, segments.lead, np.ascontiguousarray(segments.starts[::every]))
             x0 = np.ascontiguousarray(self.states(n_pre)[i][::every])
-            _, columns = self._columns(rollout, cut, theta, self.free([]), x0, n_pre, k)
+            rolled, steps = self._roll_directions(rollout, cut, theta, self.free([]), x0, n_pre, k)
             weights = _weights(rollout, cut, self.channels) / np.sqrt(self.noise.variance)
-            flat = (columns[..., :k] * weights[..., None]).reshape(len(x0), -1, k)
+            columns = rolled[0, ..., : self.channels, 1 : k + 1] - rolled[0, ..., : self.channels, :1]
+            flat = (columns / steps * weights[..., None]).reshape(len(x0), -1, k)
             flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / _RIDGE[:k])[None], len(flat), axis=0)], axis=1)
             basis = np.linalg.qr(flat)[0][:, : -k]
             jobs.append((rollout, cut, x0, weights, np.ascontiguousarray(basis.transpose(0, 2, 1))))
@@ -220,18 +223,20 @@ class Shooting:
         states = self.states(n_pre)
         parts = []
         for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
-            base, columns = self._columns(rollout, segments, theta, free, states[i], n_pre, k)
             weights = _weights(rollout, segments, self.channels)
             robust = self.robust[i]
             if robust is not None and robust.shape == weights.shape:
                 weights = weights * robust
-            parts.append(self._eliminate(i, base, columns, weights, states[i], segments, k))
+            out, steps = self._roll_directions(rollout, segments, theta, free, states[i], n_pre, k)
+            grams = self._grams(out, steps, weights)
+            base = np.ascontiguousarray(out[0, ..., : self.channels, 0])
+            parts.append(self._eliminate(i, grams, base, weights, states[i], segments, k))
         return _join(parts)
 
-    def _columns(
+    def _roll_directions(
         self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, n_pre: int, k: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Residual (segments, length, channels) and its derivatives (…, k + P) by forward differences."""
+        """Rolls the base and one lane a direction; returns the residuals (blocks, …, LANES) and the steps (k + P,)."""
         m = 1 + k + len(free.entries)
         thetas = np.repeat(theta[None], m, axis=0)
         dx = np.zeros((m, 12))
@@ -244,32 +249,30 @@ class Shooting:
             h = _STEP_FRACTION if theta[e.index] + scale[j] * _STEP_FRACTION <= e.upper else -_STEP_FRACTION
             thetas[1 + k + j, e.index] += h * scale[j]
             steps[k + j] = h
-        out, _ = rollout.roll(segments, thetas, x0, dx, n_pre)
-        out = out[..., : self.channels, :]
-        base = np.ascontiguousarray(out[0, ..., 0])
-        columns = np.empty((*base.shape, m - 1))
-        for block in range(len(out)):
-            low, high = max(block * LANES, 1), min((block + 1) * LANES, m)
-            if high > low:
-                part = out[block][..., low - block * LANES : high - block * LANES] - base[..., None]
-                columns[..., low - 1 : high - 1] = part / steps[low - 1 : high - 1]
-        return base, columns
+        return rollout.roll(segments, thetas, x0, dx, n_pre)[0], steps
+
+    def _grams(self, out: FloatArray, steps: FloatArray, weights: FloatArray) -> FloatArray:
+        """Products of all weighted, whitened columns of each segment, the residual last: (segments, k+P+1, k+P+1)."""
+        count, width = out.shape[1], len(steps)
+        grams = np.empty((count, width + 1, width + 1))
+        whitener = self.noise.whitener(self.length, self.dt)
+        sigma, coloured = np.sqrt(self.noise.variance), self.noise.coloured
+
+        def run(first: int, last: int) -> None:
+            segment_grams(out, 1.0 / steps, weights, sigma, coloured, whitener, self.channels, first, last, grams)
+
+        halves = [(0, count // 2), (count // 2, count)] if count > 20 else [(0, count)]
+        list(worker_threads().map(lambda half: run(*half), halves))
+        return grams
 
     def _eliminate(
-        self, i: int, base: FloatArray, columns: FloatArray, weights: FloatArray, x0: FloatArray,
-        segments: Segments, k: int,
+        self, i: int, grams: FloatArray, base: FloatArray, weights: FloatArray, x0: FloatArray, segments: Segments,
+        k: int,
     ) -> Linearised:  # fmt: skip
-        count, length, channels, width = columns.shape
-        if not (np.isfinite(base).all() and np.isfinite(columns).all()):
-            # The simulation ran away at this point: an infinite cost, which every search steps back from.
-            base, columns = np.zeros_like(base), np.zeros_like(columns)
-            away = np.inf
-        else:
-            away = 0.0
-        stacked = np.concatenate([columns, base[..., None]], axis=3)
-        white = self.whiten(stacked, weights)
-        flat = white.reshape(count, length * channels, width + 1)
-        h = np.matmul(flat.transpose(0, 2, 1), flat)
+        count, width = len(grams), grams.shape[1] - 1
+        # A simulation that ran away has an infinite cost, which every search steps back from.
+        away = 0.0 if np.isfinite(grams).all() else np.inf
+        h = grams if away == 0.0 else np.zeros_like(grams)
         haa, hab, hbb = h[:, :k, :k].copy(), h[:, :k, k:width], h[:, k:width, k:width]
         ga, gb, cost = h[:, :k, width].copy(), h[:, k:width, width], h[:, width, width].copy()
         informed = np.einsum("sii->si", haa).copy()
@@ -298,6 +301,28 @@ class Shooting:
             time=self.rollouts[i].window.t[segments.starts],
         )
 
+    def eliminated(
+        self, theta: FloatArray, free: Free
+    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_]]]:
+        """For each window, what the elimination of initial states does to the residual at `theta`.
+
+        Yields:
+            Orthonormal basis of the initial-state directions, whitened (segments, length * channels, k); the whitened
+            residual (segments, length, channels); which channels of a segment were measured throughout.
+        """
+        n_pre, k = self._shape(theta, free)
+        states = self.states(n_pre)
+        for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
+            out, steps = self._roll_directions(rollout, segments, theta, self.free([]), states[i], n_pre, k)
+            weights = _weights(rollout, segments, self.channels)
+            base = out[0, ..., : self.channels, :1]
+            columns = (out[0, ..., : self.channels, 1 : k + 1] - base) / steps
+            white = self.whiten(np.concatenate([columns, base], axis=3), weights)
+            flat = white.reshape(len(white), -1, k + 1)
+            ridge = np.repeat(np.diag(1.0 / _RIDGE[:k])[None], len(flat), axis=0)
+            basis = np.linalg.qr(np.concatenate([flat[..., :k], ridge], axis=1))[0][:, :-k]
+            yield basis, white[..., k], np.all(weights > 0.0, axis=1)
+
     def _has_velocity(self, i: int) -> bool:
         return self.rollouts[i].channels > 9
 
@@ -305,7 +330,7 @@ class Shooting:
         """Weights and whitens rows of shape (segments, length, channels, columns); masked channels stay unwhitened."""
         whitener = self.noise.whitener(self.length, self.dt)
         out = rows * (weights / np.sqrt(self.noise.variance))[..., None]
-        for c in np.flatnonzero(self.noise.slow > 0.0):
+        for c in np.flatnonzero(self.noise.coloured):
             full = np.all(weights[:, :, c] > 0.0, axis=1)
             scaled = rows[full, :, c] * weights[full, :, c, None]
             out[full, :, c] = np.matmul(whitener[c], scaled)

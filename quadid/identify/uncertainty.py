@@ -57,15 +57,15 @@ def uncertainty(lin: Linearised, free: Free, prior: Prior, theta: FloatArray) ->
     covariance = np.linalg.inv(lin.gram.sum(axis=0) + np.diag(precision))
     inflation = np.ones(len(free.entries))
     if len(lin.grad) >= 10:
-        meat, lags = _meat(lin)
+        meat, lags = score_products(lin)
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
         inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
     return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
 
 
-def _meat(lin: Linearised) -> tuple[FloatArray, int]:
-    """Bartlett-weighted sum of score products over segments of the same window, and the number of lags used."""
+def score_products(lin: Linearised) -> tuple[FloatArray, int]:
+    """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used."""
     step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
     lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
     scores = lin.grad - lin.grad.mean(axis=0)

@@ -1,0 +1,88 @@
+"""From the selected model to findings: numbers with intervals, losers, a sentence."""
+
+from __future__ import annotations
+
+import math
+
+from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.models import Model
+from quadid.diagnose.result import Alternative, Finding, FoundParameter
+from quadid.diagnose.search import Search, Trial
+from quadid.diagnose.validation import Worth
+from quadid.diagnose.words import evidence
+from quadid.effects import EFFECTS
+from quadid.identify.shooting import Shooting
+from quadid.identify.uncertainty import Z95, uncertainty
+
+TIME_SIGMA = 0.1
+"""Standard deviation [s] given to a change time, the resolution of its scan."""
+
+
+def describe(shooting: Shooting, search: Search, worth: tuple[Worth, ...], confident: bool) -> tuple[Finding, ...]:
+    """Findings in the order of their worth."""
+    sigma = _sigmas(search.model)
+    return tuple(_finding(shooting, search, w, sigma, confident) for w in worth)
+
+
+def _sigmas(model: Model) -> dict[str, float]:
+    unc = uncertainty(model.lin, model.free, model.prior, model.theta)
+    scale = model.free.jacobian(model.theta)
+    return {e.name: float(s * k) for e, s, k in zip(model.free.entries, unc.sigma, scale, strict=True)}
+
+
+def _finding(
+    shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool
+) -> Finding:
+    cause = worth.cause
+    numbers = _numbers(shooting, search.model, cause, sigma)
+    values = {p.name: p.value for p in numbers}
+    benefit = worth.benefit
+    return Finding(
+        effect=cause.effect,
+        confident=confident,
+        parameters=numbers,
+        gain=benefit,
+        p_value=min(1.0, worth.p_value * search.tests),
+        alternatives=_alternatives(search, cause),
+        evidence=evidence(cause.effect, values, benefit.mse_before, benefit.mse_after),
+        per_log=EFFECTS[cause.effect].per_log,
+    )
+
+
+def _numbers(
+    shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]
+) -> tuple[FoundParameter, ...]:
+    spec = EFFECTS[cause.effect]
+    if cause.effect == "weak_rotor":
+        entry = shooting.layout.entry(cause.names[0])
+        value, half = float(model.theta[entry.index]), Z95 * sigma[entry.name]
+        rotor = float(entry.name.rsplit("_", 1)[1])
+        return (
+            FoundParameter("rotor", "", rotor, (rotor, rotor)),
+            FoundParameter("loss", "", value, (value - half, value + half)),
+        )
+    if cause.effect == "imu_lag":
+        entry = shooting.layout.entry(cause.names[0])
+        value, half = float(model.theta[entry.index]), Z95 * sigma[entry.name]
+        low = 1.0 / (value + half)
+        high = 1.0 / (value - half) if value > half else math.inf
+        return (FoundParameter("cutoff", "Hz", 1.0 / max(value, 1e-9), (low, high)),)
+    out = []
+    for p in spec.parameters:
+        entry = shooting.layout.entry(f"{cause.effect}.{p.name}")
+        value = float(model.theta[entry.index])
+        half = Z95 * (TIME_SIGMA if p.name == "time" else sigma[entry.name])
+        out.append(FoundParameter(p.name, p.unit, value, (value - half, value + half)))
+    return tuple(out)
+
+
+def _alternatives(search: Search, cause: Candidate) -> tuple[Alternative, ...]:
+    """Other causes refitted in the round that accepted `cause`, on the same blocks."""
+    for step in search.rounds:
+        if step.accepted is not None and step.accepted.candidate.label == cause.label:
+            losers: list[Trial] = [t for t in step.trials if t.candidate.effect != cause.effect and t.gain.total > 0.0]
+            losers.sort(key=lambda t: -t.gain.total)
+            return tuple(
+                Alternative(t.candidate.effect, float(t.model.held_out.sum()) / t.model.rows) for t in losers[:4]
+            )
+    return ()

@@ -1,0 +1,127 @@
+"""The diagnosis from windows to verdict: fit, noise floor, selection, remainder, validation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.candidates import candidates
+from quadid.diagnose.findings import describe
+from quadid.diagnose.models import Model, fit_model, free_names
+from quadid.diagnose.remainder import Remainder, remainder
+from quadid.diagnose.result import Diagnosis, Verdict
+from quadid.diagnose.search import Search, select
+from quadid.diagnose.validation import validate
+from quadid.diagnose.vehicle_file import extended_vehicle
+from quadid.identify.fit import (
+    SWARM_SECONDS,
+    FitOptions,
+    check_windows,
+    noise_floor,
+    residual_noise,
+    swarm_search,
+)
+from quadid.identify.polish import polish
+from quadid.identify.shooting import Shooting
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+DECIDE_SECONDS = 1.0
+SHARE_TO_NAME = 0.8
+"""Named causes must account for this share of all structure, else the answer is `unknown`."""
+LEAST_STRUCTURE = 0.03
+"""Structure below this share of the noise is not worth a word."""
+
+
+@dataclass(frozen=True)
+class Workings:
+    """Everything a report or a test may want to look into.
+
+    Attributes:
+        search: the selection; short, decisive: the problems it ran on.
+        remainder: what is left.
+    """
+
+    search: Search
+    short: Shooting
+    decisive: Shooting
+    remainder: Remainder
+
+
+def diagnose(
+    windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
+    progress: Progress | None = None, swarm: bool = False,
+) -> tuple[Diagnosis, Workings]:  # fmt: skip
+    """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
+
+    Args:
+        windows: data to diagnose.
+        vehicle: nominal vehicle; effects already in its file are kept as they are.
+        validation: flights to measure the gain on; without them blocks of `windows` are left out.
+        seed: for the swarm, where asked for, and drawn noise.
+        progress: called with a stage and a fraction.
+        swarm: search globally first, for poor initial guesses.
+
+    Raises:
+        WindowError, NotIdentifiableError: as `quadid.identify.fit.fit`.
+    """
+    report = progress or (lambda stage, share: None)
+    check_windows(windows)
+    short = Shooting(windows, vehicle, SWARM_SECONDS)
+    free = short.free(NOMINAL_NAMES)
+    theta = short.layout.initial(vehicle)
+    if swarm:
+        theta, _ = swarm_search(short, theta, free, FitOptions(seed=seed), report)
+    report("fit", 0.0)
+    first = polish(short, theta, free, iterations=8)
+    short.noise = residual_noise(short, first)
+    first = polish(short, first.theta, free, iterations=8)
+    report("noise floor", 0.0)
+    short.noise, _ = noise_floor(windows, short, first.theta, free)
+    decisive = Shooting(windows, vehicle, DECIDE_SECONDS, short.noise, short.layout)
+    listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
+    listed = [c for c in listed if c.effect not in vehicle.effects]
+    search = select(short, decisive, first.theta, listed, report)
+    if search.model.causes:
+        report("noise floor", 0.5)
+        search = _with_better_noise(windows, short, decisive, search)
+    left = remainder(decisive, search.model, seed)
+    verdict = judge(search.nominal, search.model, left)
+    report("validation", 0.0)
+    outcome, per_finding = validate(decisive, search, validation)
+    findings = describe(decisive, search, per_finding, verdict is not Verdict.UNKNOWN)
+    text = extended_vehicle(vehicle, decisive, search.model)
+    name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
+    report("done", 1.0)
+    result = Diagnosis(verdict, findings, outcome, left, text, name)
+    return result, Workings(search, short, decisive, left)
+
+
+def _with_better_noise(
+    windows: Sequence[Window], short: Shooting, decisive: Shooting, search: Search
+) -> Search:
+    """Re-estimates the noise around the selected model, where the flexible fit is closest to linear, and refits both."""
+    short.restore({})
+    wide = short.free(free_names(search.model.causes))
+    decisive.noise, _ = noise_floor(windows, short, search.model.theta, wide)
+    model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
+    nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
+    return replace(search, model=model, nominal=nominal)
+
+
+def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:
+    """Verdict from what the causes explain and what is left."""
+    structure = left.deviance if left.deviance > LEAST_STRUCTURE * model.rows else 0.0
+    if not model.causes:
+        return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
+    explained = max(float(nominal.held_out.sum() - model.held_out.sum()), 0.0)
+    if not structure:
+        return Verdict.EXPLAINED
+    return Verdict.PARTLY_EXPLAINED if explained >= SHARE_TO_NAME * (explained + structure) else Verdict.UNKNOWN

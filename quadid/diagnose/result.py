@@ -1,0 +1,158 @@
+"""What a diagnosis says: findings, verdict, validation; and the same as plain data for JSON."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from quadid.diagnose.remainder import Remainder
+
+
+class Verdict(str, Enum):
+    """Overall answer."""
+
+    NOTHING_FOUND = "nothing_found"
+    EXPLAINED = "explained"
+    PARTLY_EXPLAINED = "partly_explained"
+    UNKNOWN = "unknown"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in plain words."""
+        return {
+            Verdict.NOTHING_FOUND: "The simulation agrees with the flight: nothing was found that it gets wrong.",
+            Verdict.EXPLAINED: "What the simulation gets wrong is explained by the causes below.",
+            Verdict.PARTLY_EXPLAINED: "The causes below explain most of what the simulation gets wrong; some remains.",
+            Verdict.UNKNOWN: "The simulation gets something wrong that no known cause explains.",
+        }[self]
+
+
+@dataclass(frozen=True)
+class FoundParameter:
+    """One number of a finding: contract name, SI unit, value and 95 % interval."""
+
+    name: str
+    unit: str
+    value: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Benefit:
+    """Mean squared error (noise floor 1) on unseen data before and after, and the 95 % interval of the difference."""
+
+    mse_before: float
+    mse_after: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A look-alike that lost: its error on unseen data in place of the finding."""
+
+    effect: str
+    mse_after: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One named cause.
+
+    Attributes:
+        effect: contract name.
+        confident: False when the verdict is `unknown`.
+        parameters: numbers of the effect.
+        gain: what it is worth on unseen data, given all other findings.
+        p_value: chance of such a gain without the effect, corrected for how many causes were tried.
+        alternatives: look-alikes refitted in its place, best first.
+        evidence: one sentence a pilot understands.
+        per_log: its values belong to the flight, not the vehicle.
+    """
+
+    effect: str
+    confident: bool
+    parameters: tuple[FoundParameter, ...]
+    gain: Benefit
+    p_value: float
+    alternatives: tuple[Alternative, ...]
+    evidence: str
+    per_log: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of contract form."""
+        return {
+            "effect": self.effect,
+            "confident": self.confident,
+            "parameters": [
+                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": [_plain(x) for x in p.ci95]}
+                for p in self.parameters
+            ],
+            "gain": {
+                "mse_before": self.gain.mse_before,
+                "mse_after": self.gain.mse_after,
+                "ci95": list(self.gain.ci95),
+            },
+            "p_value": self.p_value,
+            "alternatives": [{"effect": a.effect, "mse_after": a.mse_after} for a in self.alternatives],
+            "evidence": self.evidence,
+            "per_log": self.per_log,
+        }
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Error on unseen data: flights given for validation, else blocks left out; noise floor 1.
+
+    Attributes:
+        nominal, extended: mean squared error without and with the findings.
+        on: ``validation logs`` or ``held-out blocks``.
+        refitted: extended, with per-log values refitted on the first half and scored on the second; None without logs.
+    """
+
+    nominal: float
+    extended: float
+    on: str
+    refitted: float | None = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name."""
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    validation: Validation
+    remainder: Remainder
+    vehicle_yaml: str
+    vehicle_name: str
+    warnings: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def unexplained(self) -> dict[str, float]:
+        """Share of each channel's residual power that is structure, where there is any."""
+        return {s.channel: round(s.share, 4) for s in self.remainder.significant}
+
+    def to_dict(self, vehicle_file: str | None = None) -> dict[str, Any]:
+        """Plain data of contract form."""
+        return {
+            "schema": "quadid.diagnose/1",
+            "verdict": self.verdict.value,
+            "statement": self.verdict.sentence,
+            "findings": [f.to_dict() for f in self.findings],
+            "validation": {
+                "mse_nominal": self.validation.nominal,
+                "mse_extended": self.validation.extended,
+                "noise_floor": 1.0,
+                "on": self.validation.on,
+                "mse_extended_refitted": self.validation.refitted,
+            },
+            "unexplained": self.unexplained,
+            "vehicle_file": vehicle_file,
+            "warnings": list(self.warnings),
+        }
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,131 @@
+"""What the findings are worth on data that neither the fit nor the selection saw.
+
+With validation logs the parameters stay as fitted; values that belong to a flight (`per_log`) are carried over, and, as
+a second figure, refitted on the first half of each validation log and scored on its second half.  Without such logs,
+ten-second blocks of the training log are left out in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.blocks import block_labels, paired_gain
+from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.models import Model
+from quadid.diagnose.result import Benefit, Validation
+from quadid.diagnose.search import Search, without
+from quadid.effects import EFFECTS
+from quadid.identify.polish import polish
+from quadid.identify.shooting import Shooting
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Worth:
+    """Benefit of one cause given all others, and its uncorrected p-value."""
+
+    cause: Candidate
+    benefit: Benefit
+    p_value: float
+    deviance: float
+
+
+def validate(
+    decisive: Shooting, search: Search, logs: Sequence[Window]
+) -> tuple[Validation, tuple[Worth, ...]]:
+    """Scores nominal and extended model on unseen data, and each cause by leaving it out.
+
+    Returns:
+        The overall figures, and the worth of each cause, most valuable first.
+    """
+    rest = {c.label: without(decisive, search.model, c) for c in search.model.causes}
+    if not logs:
+        return _on_blocks(search, rest)
+    return _on_logs(decisive, search, rest, logs)
+
+
+def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, tuple[Worth, ...]]:
+    rows = search.model.rows
+    figures = Validation(
+        float(search.nominal.held_out.sum()) / rows, float(search.model.held_out.sum()) / rows, "held-out blocks"
+    )
+    worth = [_worth(c, rest[c.label].held_out, search.model.held_out, rows) for c in search.model.causes]
+    return figures, tuple(sorted(worth, key=lambda w: -w.deviance))
+
+
+def _worth(cause: Candidate, before: FloatArray, after: FloatArray, rows: float) -> Worth:
+    gain = paired_gain(before, after)
+    low, high = gain.interval
+    benefit = Benefit(float(before.sum()) / rows, float(after.sum()) / rows, (low / rows, high / rows))
+    return Worth(cause, benefit, gain.p_value, gain.total)
+
+
+def _on_logs(
+    decisive: Shooting, search: Search, rest: dict[str, Model], logs: Sequence[Window]
+) -> tuple[Validation, tuple[Worth, ...]]:
+    scorer = Shooting(logs, decisive.vehicle, decisive.length * decisive.dt, decisive.noise, decisive.layout)
+    nominal, rows = block_deviance(scorer, search.nominal)
+    extended, _ = block_deviance(scorer, search.model)
+    worth = []
+    for cause in search.model.causes:
+        if EFFECTS[cause.effect].per_log:
+            # The value belongs to the training flight; its worth is measured there, on blocks left out.
+            worth.append(_worth(cause, rest[cause.label].held_out, search.model.held_out, search.model.rows))
+        else:
+            before, _ = block_deviance(scorer, rest[cause.label])
+            worth.append(_worth(cause, before, extended, rows))
+    refitted = _second_halves(scorer, search.model, logs)
+    figures = Validation(float(nominal.sum()) / rows, float(extended.sum()) / rows, "validation logs", refitted)
+    return figures, tuple(sorted(worth, key=lambda w: -w.deviance))
+
+
+def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = None) -> tuple[FloatArray, float]:
+    """Deviance of each block of unseen data with parameters as fitted, and the independent rows."""
+    point = model.theta if theta is None else theta
+    names = [n for c in model.causes for n in c.names]
+    scorer.restore({})
+    lin = settle(scorer, point, names)
+    labels = block_labels(lin)
+    total = np.zeros(int(labels.max()) + 1)
+    np.add.at(total, labels, lin.cost + lin.occam)
+    return total, float(lin.rows.sum())
+
+
+def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: int = 3):  # type: ignore[no-untyped-def]
+    """Fits the initial states of all segments at fixed parameters and returns the last linearisation.
+
+    Args:
+        scorer: the data; theta: full vector.
+        names: entries in use (they decide whether velocity matters and filters must settle).
+        rounds: Gauss-Newton steps on the initial states.
+    """
+    free = scorer.free(list(names))
+    still = np.zeros(len(free.entries))
+    for _ in range(rounds):
+        lin = scorer.linearise(theta, free)
+        scorer.adopt(theta, free, scorer.step_states(theta, free, lin, still))
+    return scorer.linearise(theta, free)
+
+
+def _second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> float | None:
+    per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
+    if not per_log:
+        return None
+    deviance, rows = 0.0, 0.0
+    seconds = scorer.length * scorer.dt
+    for window in logs:
+        middle = len(window) // 2
+        if middle < 4 * scorer.length:
+            continue
+        first = Shooting([window.slice(0, middle)], scorer.vehicle, seconds, scorer.noise, scorer.layout)
+        theta = polish(first, model.theta, first.free(per_log), iterations=6).theta
+        second = Shooting([window.slice(middle, len(window))], scorer.vehicle, seconds, scorer.noise, scorer.layout)
+        total, count = block_deviance(second, model, theta)
+        deviance, rows = deviance + float(total.sum()), rows + count
+    return deviance / rows if rows else None

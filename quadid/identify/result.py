@@ -1,0 +1,172 @@
+"""Results as plain dictionaries, ready for JSON: the forms of ``quadid.identify/1`` and ``quadid.score/1``.
+
+Numbers stay Python floats; NaN and infinities mean "no answer" and become null when written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from quadid.identify.fit import Fit
+from quadid.identify.horizon import QUANTITIES, HorizonScore
+from quadid.identify.score import SetScore
+from quadid.model.layout import Layout
+from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.vehicle import ParameterPrior, Vehicle
+
+JsonDict = dict[str, Any]
+
+_DIGITS = 7
+"""Significant digits of a fitted vehicle file; far below any interval."""
+
+
+@dataclass(frozen=True)
+class ScoredSet:
+    """One log with its scores.
+
+    Attributes:
+        log: its name.
+        role: ``train`` or ``validate``.
+        initial: score of the initial guess.
+        fitted: score of the fit.
+        paper: mean squared error of the paper's closed-loop simulation before and after; None without a stabiliser.
+    """
+
+    log: str
+    role: str
+    initial: SetScore
+    fitted: SetScore
+    paper: tuple[float, float] | None = None
+
+
+def identify_result(
+    fit: Fit, optimizer: str, seed: int, seconds: float, sets: Sequence[ScoredSet], vehicle_file: str,
+    warnings: Sequence[str] = (),
+) -> JsonDict:  # fmt: skip
+    """The result of an identification.
+
+    Args:
+        fit: the fit.
+        optimizer: name of the search that was used.
+        seed: of all random numbers.
+        seconds: wall time of the fit, on the caller's clock.
+        sets: training and validation sets with their scores.
+        vehicle_file: absolute path of the written vehicle file.
+        warnings: beyond those of the fit, from reading the logs.
+    """
+    return {
+        "schema": "quadid.identify/1",
+        "vehicle": fit.vehicle.name,
+        "optimizer": optimizer,
+        "seed": seed,
+        "seconds": seconds,
+        "parameters": [parameter_entry(p) for p in fit.parameters],
+        "sets": [_set_entry(s) for s in sets],
+        "vehicle_file": vehicle_file,
+        "warnings": [*fit.warnings, *inertia_warnings(fit.parameters), *warnings],
+    }
+
+
+def parameter_entry(p: Parameter) -> JsonDict:
+    """One parameter: name, unit, value, 95 % interval, initial value, status; the partner of a known ratio."""
+    entry: JsonDict = {
+        "name": p.name,
+        "unit": p.unit,
+        "value": p.value,
+        "ci95": list(p.ci95),
+        "initial": p.initial,
+        "status": p.status.value,
+    }
+    if p.relative_to is not None:
+        entry["relative_to"] = p.relative_to
+    return entry
+
+
+def _set_entry(s: ScoredSet) -> JsonDict:
+    seen = [c for c in s.fitted.channels if c.samples > 0]
+    paper = None if s.paper is None else {"initial": s.paper[0], "fitted": s.paper[1]}
+    return {
+        "log": s.log,
+        "role": s.role,
+        "mse": {"initial": s.initial.mse, "fitted": s.fitted.mse, "noise_floor": 1.0},
+        "mse_paper": paper,
+        "fit_percent": {c.name: c.fit_percent for c in seen},
+        "rmse": {c.name: {"value": c.rmse, "unit": c.unit} for c in seen},
+    }
+
+
+def inertia_warnings(parameters: ParameterSet) -> list[str]:
+    """Says when identified moments of inertia cannot belong to a rigid body."""
+    values = {p.name: p for p in parameters if p.name in ("J_xx", "J_yy", "J_zz")}
+    if len(values) < 3 or any(p.status is Status.PRIOR_DOMINATED for p in values.values()):
+        return []
+    why = impossible_inertia([values[n].value for n in ("J_xx", "J_yy", "J_zz")], slack=1.05)
+    if why is None:
+        return []
+    return [
+        f"no rigid body has these moments of inertia: {why}; check mass, rotor positions and units in the vehicle file"
+    ]
+
+
+def answered(parameters: ParameterSet) -> bool:
+    """True when the data say anything beyond the vehicle file about at least one parameter."""
+    return any(p.status is not Status.PRIOR_DOMINATED for p in parameters)
+
+
+def fitted_vehicle(fit: Fit) -> Vehicle:
+    """The vehicle with fitted values as initial guess, their standard deviations, fitted effects; bounds are kept."""
+    priors = dict(fit.vehicle.parameters)
+    effects = {name: dict(values) for name, values in fit.vehicle.effects.items()}
+    layout = Layout(fit.vehicle)
+    for p in fit.parameters:
+        if p.name in NOMINAL_NAMES:
+            priors[p.name] = _prior(priors[p.name], p)
+        else:
+            effect = p.name.split(".")[0]
+            effects[effect] = {k: _rounded(v) for k, v in layout.read_effect(fit.theta, effect).items()}
+    return fit.vehicle.model_copy(update={"parameters": priors, "effects": effects})
+
+
+def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
+    value = _rounded(p.value)
+    if given.bounds is not None:
+        value = min(max(value, given.bounds[0]), given.bounds[1])
+    sigma = _rounded(p.sigma) if math.isfinite(p.sigma) and p.sigma > 0.0 else None
+    return ParameterPrior(initial=value, bounds=given.bounds, sigma=sigma)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def score_result(vehicle: str, pooled: HorizonScore, files: Sequence[tuple[str, int, HorizonScore]]) -> JsonDict:
+    """The result of ``quadid score``.
+
+    Args:
+        vehicle: its name.
+        pooled: over all starts of all files.
+        files: name, number of gaps, and score of each file.
+    """
+    return {
+        "schema": "quadid.score/1",
+        "vehicle": vehicle,
+        **_horizon_entry(pooled, sum(gaps for _, gaps, _ in files)),
+        "files": [{"log": name, **_horizon_entry(score, gaps)} for name, gaps, score in files],
+    }
+
+
+def _horizon_entry(score: HorizonScore, gaps: int) -> JsonDict:
+    return {
+        "samples": score.samples,
+        "gaps": gaps,
+        "horizons": {str(h): score.at(h) for h in score.horizons},
+        "sum": {"to": score.sum_to, **score.sum},
+    }
+
+
+def units() -> dict[str, str]:
+    """Units of what ``quadid score`` reports."""
+    return dict(QUANTITIES)

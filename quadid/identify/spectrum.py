@@ -1,0 +1,99 @@
+"""Spectrum of what a fit leaves: cosine modes of the whitened residual beside those of pure noise.
+
+Rotor vibration folds to a hump somewhere between 0 Hz and the Nyquist frequency, so inertial noise is not white.  The
+spectrum is taken from the residual of the flexible fit above `LOWEST`; below it the level found just above is carried
+on, because what stands there is more likely dynamics than noise, and must stay visible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+
+from quadid.identify.noise import SHAPE_POINTS, NoiseModel
+from quadid.identify.shooting import Free, Shooting
+
+FloatArray = NDArray[np.float64]
+
+LOWEST = 3.0
+"""Frequency [Hz] below which residual power is not counted as noise."""
+BAND = 1.5
+"""Width [Hz] above `LOWEST` whose level is carried on below it."""
+DRAWS = 4
+SMOOTH = 3
+LEAST_SEGMENTS = 20
+
+
+def mode_power(
+    shooting: Shooting, theta: FloatArray, free: Free, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Mean power of each mode (channels, length) of the residual, and of noise through the same elimination.
+
+    Args:
+        shooting: problem, with initial states at their optimum.
+        theta: full parameter vector; free: free parameters of the model (decide what is eliminated).
+        rng: for the drawn noise.
+
+    Returns:
+        Power found, power of unit white noise, and the number of segments, per channel; NaN where none is complete.
+    """
+    parts: list[tuple[FloatArray, FloatArray, NDArray[np.bool_]]] = []
+    for basis, residual, complete in shooting.eliminated(theta, free):
+        powers = [_powers(residual, basis)]
+        powers += [_powers(rng.standard_normal(residual.shape), basis) for _ in range(DRAWS)]
+        parts.append((powers[0], np.mean(powers[1:], axis=0), complete))
+    found, null = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+    complete = np.concatenate([p[2] for p in parts])
+    counts = complete.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_found = np.einsum("scm,sc->cm", found, complete) / counts[:, None]
+        mean_null = np.einsum("scm,sc->cm", null, complete) / counts[:, None]
+    return mean_found, mean_null, counts.astype(np.intp)
+
+
+def _powers(residual: FloatArray, basis: FloatArray) -> FloatArray:
+    """Squared cosine modes of the residual less its part in `basis`: (segments, channels, length)."""
+    count, length, channels = residual.shape
+    flat = residual.reshape(count, -1)
+    inside = np.matmul(basis.transpose(0, 2, 1), flat[..., None])
+    flat = flat - np.matmul(basis, inside)[..., 0]
+    modes = dct(flat.reshape(count, length, channels), axis=1, norm="ortho")
+    return np.asarray((modes**2).transpose(0, 2, 1))
+
+
+def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, seed: int = 0) -> NoiseModel:
+    """Noise model of `shooting` with the spectrum of its inertial channels, from the residual at `theta`.
+
+    `shooting.noise` must be white in those channels.  Attitude keeps its slow part; channels with few segments stay
+    white.
+    """
+    noise = shooting.noise
+    found, null, counts = mode_power(shooting, theta, free, np.random.default_rng(seed))
+    channels, length = found.shape
+    frequency = 0.5 * np.arange(length) / (length * shooting.dt)
+    grid = np.linspace(0.0, 0.5 / shooting.dt, SHAPE_POINTS)
+    shape, white = np.ones((channels, SHAPE_POINTS)), noise.white.copy()
+    for c in range(channels):
+        if 3 <= c < 6 or counts[c] < LEAST_SEGMENTS or not np.isfinite(found[c]).all():
+            continue
+        level = _smooth_ratio(found[c], null[c])
+        band = (frequency >= LOWEST) & (frequency < LOWEST + BAND)
+        level = np.where(frequency < LOWEST, np.mean(level[band]), level)
+        level = np.maximum(level, 1e-3 * np.max(level))
+        mean = float(np.mean(level))
+        white[c] *= np.sqrt(mean)
+        shape[c] = np.interp(grid, frequency, level / mean)
+    return replace(noise, white=white, shape=shape)
+
+
+def _smooth_ratio(found: FloatArray, null: FloatArray) -> FloatArray:
+    kernel = np.ones(SMOOTH)
+    weight = np.where(null > 0.3, null, 0.0)
+    power = np.where(null > 0.3, found, 0.0)
+    total = np.convolve(weight, kernel, mode="same")
+    ratio = np.convolve(power, kernel, mode="same") / np.maximum(total, 1e-9)
+    known = total > 0.0
+    return np.asarray(np.interp(np.arange(len(found)), np.flatnonzero(known), ratio[known]))
