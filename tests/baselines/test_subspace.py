@@ -180,12 +180,13 @@ def test_the_order_that_simulates_unseen_segments_best_is_the_true_one_or_close(
 
 def test_agrees_with_nfoursid_far_within_the_statistical_error() -> None:
     """nfoursid 1.0.2 finds the subspace by PO-MOESP too; its regression and weights differ in detail."""
-    pandas = pytest.importorskip("pandas")
-    nfoursid = pytest.importorskip("nfoursid.nfoursid")
+    import pandas
+    from nfoursid.nfoursid import NFourSID
+
     own_errors, differences = [], []
     for seed in range(3):
         u, y = data(seed, 3000, 0.3)
-        peer = nfoursid.NFourSID(
+        peer = NFourSID(
             pandas.DataFrame(np.hstack([u, y]), columns=["u0", "u1", "y0", "y1"]), ["y0", "y1"], ["u0", "u1"], 12
         )
         peer.subspace_identification()
