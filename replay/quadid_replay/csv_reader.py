@@ -56,10 +56,20 @@ def read_csv(path: Path, sha256: str = "") -> Recording:
     for name, columns in layout.items():
         values = rows[:, [names.index(c) for c in columns]]
         blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
-        values = from_euler(values) if columns == EULER else values
+        if columns == EULER:
+            notes += _suspect_degrees(values)
+            values = from_euler(values)
         raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(columns), refused))
     recording = assemble(path.name, "csv", raw, clock, notes, sha256)
     return replace(recording, grid=_uniform_step(recording.channels))
+
+
+def _suspect_degrees(angles: FloatArray) -> list[str]:
+    """Pitch in radians never leaves +-pi/2, and roll seldom two turns."""
+    roll, pitch = np.nanmax(np.abs(angles[:, :2]), axis=0, initial=0.0)
+    if pitch <= 0.5 * np.pi + 0.01 and roll <= 4.0 * np.pi:
+        return []
+    return [f"phi and theta reach {roll:.3g} and {pitch:.3g}: degrees? they are read as radians"]
 
 
 def _header(path: Path) -> tuple[list[str], str]:

@@ -1,0 +1,164 @@
+"""ArduPilot DataFlash: values as pymavlink reads them, motors, ESC telemetry, reboots, damage."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink import DFReader
+from quadid_replay import open_log
+from quadid_replay.dataflash_index import index_dataflash
+from quadid_replay.frames import from_euler
+from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
+
+CODES = {"Q": "Q", "f": "f", "B": "B", "H": "H", "c": "h", "N": "16s", "Z": "64s", "I": "I"}
+
+
+class Dataflash:
+    """Writes a log byte by byte."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.layouts: dict[str, tuple[int, str]] = {}
+        self.describe(0x80, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89)
+
+    def describe(self, kind: int, name: str, form: str, columns: str, length: int | None = None) -> None:
+        size = length or 3 + struct.calcsize("<" + "".join(CODES[c] for c in form))
+        self.layouts[name] = (kind, form)
+        body = struct.pack("<BB4s16s64s", kind, size, name.encode(), form.encode(), columns.encode())
+        self.data += b"\xa3\x95\x80" + body
+
+    def add(self, name: str, *values: float | bytes) -> None:
+        kind, form = self.layouts[name]
+        self.data += b"\xa3\x95" + bytes([kind]) + struct.pack("<" + "".join(CODES[c] for c in form), *values)
+
+
+def flight(seconds: float = 4.0, start: float = 10.0, motors: tuple[int, ...] = (3, 0, 1, 2)) -> Dataflash:
+    log = Dataflash()
+    log.describe(1, "PARM", "QNf", "TimeUS,Name,Value")
+    log.describe(2, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    log.describe(3, "RCOU", "QHHHHHH", "TimeUS,C1,C2,C3,C4,C5,C6")
+    log.describe(4, "ATT", "Qcccccc", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw")
+    log.describe(5, "CTUN", "Qf", "TimeUS,ThO")
+    log.describe(6, "ESC", "QBf", "TimeUS,Instance,RPM")
+    for number, output in enumerate(motors):
+        log.add("PARM", 0, f"SERVO{output + 1}_FUNCTION".encode(), 33.0 + number)
+    add_flight(log, seconds, start)
+    return log
+
+
+def add_flight(log: Dataflash, seconds: float, start: float) -> None:
+    for k in range(round(seconds * 100)):
+        us = round((start + k * 0.01) * 1e6)
+        log.add("IMU", us, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8)
+        log.add("IMU", us, 1, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0)
+        log.add("RCOU", us + 100, 1100 + k, 1200 + k, 1300 + k, 1400 + k, 900, 1500)
+        if k % 10 == 0:
+            log.add("CTUN", us + 150, 0.5)
+            log.add("ATT", us + 200, 100, 1000, -100, -500, 9000, 27000)
+        log.add("ESC", us + 300, k % 4, 6000.0 + 100.0 * (k % 4))
+
+
+def opened(tmp_path: Path, data: bytes) -> Path:
+    path = tmp_path / "flight.log"
+    path.write_bytes(data)
+    return path
+
+
+def test_channels_units_motor_map_and_instance(tmp_path: Path) -> None:
+    recording = open_log(opened(tmp_path, bytes(flight().data)))
+    channels = recording.channels
+    np.testing.assert_allclose(channels["gyro"].values[0], [0.1, 0.2, 0.3], rtol=1e-6)
+    assert channels["gyro"].source == "IMU instance 0"
+    assert channels["motor_command"].source == "RCOU C4 C1 C2 C3"
+    np.testing.assert_array_equal(channels["motor_command"].values[5], [1405, 1105, 1205, 1305])
+    expected = from_euler(np.radians([[10.0, -5.0, 270.0]]))[0]
+    assert abs(float(channels["attitude"].values[0] @ expected)) == pytest.approx(1.0)
+    np.testing.assert_allclose(
+        channels["attitude_reference"].values[0], [np.radians(1), -np.radians(1), np.pi / 2, 0.5], rtol=1e-6
+    )
+    assert channels["gyro"].t[0] == pytest.approx(10.0)
+    assert recording.warnings == ()
+
+
+def test_esc_telemetry_of_one_motor_at_a_time_becomes_rows(tmp_path: Path) -> None:
+    speed = open_log(opened(tmp_path, bytes(flight().data))).channels["rotor_speed"]
+    assert speed.values.shape[1] == 4
+    np.testing.assert_allclose(speed.values[3], RPM * np.array([6300.0, 6000.0, 6100.0, 6200.0]))
+    assert 1.0 / np.median(np.diff(speed.t)) == pytest.approx(25.0, rel=0.01)
+
+
+def test_values_are_those_of_pymavlink(data_dir: Path) -> None:
+    path = data_dir / "ardupilot" / "log171.bin"
+    reader = DFReader.DFReader_binary(str(path))
+    recording = open_log(path)
+    gyro, motors, attitude = (recording.channels[n] for n in ("gyro", "motor_command", "attitude"))
+    for k in range(0, 300):
+        imu = reader.recv_match(type="IMU")
+        assert gyro.t[k] == imu.TimeMS * 1e-3
+        np.testing.assert_array_equal(gyro.values[k], [imu.GyrX, imu.GyrY, imu.GyrZ])
+    reader.rewind()
+    for k in range(0, 100):
+        out = reader.recv_match(type="RCOU")
+        np.testing.assert_array_equal(motors.values[k], [out.Ch1, out.Ch2, out.Ch3, out.Ch4])
+    reader.rewind()
+    for k in range(0, 50):
+        att = reader.recv_match(type="ATT")
+        expected = from_euler(np.radians([[att.Roll, att.Pitch, att.Yaw]]))[0]
+        assert abs(float(attitude.values[k] @ expected)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_two_boots_in_one_log_are_kept_apart(tmp_path: Path) -> None:
+    log = flight()
+    add_flight(log, 4.0, 1.0)
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    assert len(recording.breaks) == 1
+    for channel in recording.channels.values():
+        assert np.all(np.diff(channel.t) > 0.0)
+    assert recording.channels["gyro"].t[-1] - recording.channels["gyro"].t[0] > 8.0
+
+
+def test_a_damaged_stretch_costs_only_itself(tmp_path: Path) -> None:
+    data = bytearray(flight().data)
+    data[9000:9300] = bytes(300)
+    recording = open_log(opened(tmp_path, bytes(data)))
+    assert len(recording.channels["gyro"].t) > 380
+    assert any("damaged" in w for w in recording.warnings)
+
+
+def test_a_damaged_description_loses_only_that_message(tmp_path: Path) -> None:
+    log = flight()
+    at = log.data.find(b"IMU\x00")
+    log.data[at + 4 : at + 7] = b"Q\x01~"  # a format that does not exist
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    assert "gyro" not in recording.channels
+    assert len(recording.channels["motor_command"].t) == 400
+    assert any("descriptions" in w for w in recording.warnings)
+
+
+def test_padding_at_the_end_is_no_damage_but_a_cut_record_is_told(tmp_path: Path) -> None:
+    data = bytes(flight().data)
+    assert open_log(opened(tmp_path, data + bytes(200))).warnings == ()
+    assert any("cut" in w for w in open_log(opened(tmp_path, data[:-4])).warnings)
+    index = index_dataflash(opened(tmp_path, b"\x00" * 700 + data))
+    assert index.skipped == 700
+
+
+def test_which_outputs_are_motors() -> None:
+    assert ardupilot_motor_outputs({"SERVO5_FUNCTION": 33, "SERVO2_FUNCTION": 34, "SERVO1_FUNCTION": 35}) == [4, 1, 0]
+    assert ardupilot_motor_outputs({}, "HEXA/X") == list(range(6))
+    assert ardupilot_motor_outputs({"SERVO1_FUNCTION": 34}) == []  # motor 1 is nowhere
+    k = np.arange(100.0)[:, None]
+    pulses = np.hstack([1100 + k, 1200 + k, 1300 + k, 1400 + k, 1500 + 0 * k, 1600 + k])
+    assert active_outputs(pulses) == [0, 1, 2, 3]
+
+
+def test_merging_never_reaches_beyond_an_instance() -> None:
+    t = np.arange(0.0, 1.0, 0.1)
+    at, values = merge_instances([(t, t), (t + 0.05, 2 * t)])
+    assert at[0] >= 0.05
+    assert at[-1] <= 0.95
+    np.testing.assert_allclose(values[:, 1], 2 * (at - 0.05))
+    assert merge_instances([(t, t), (t[:1], t[:1])])[1].shape == (0, 2)

@@ -1,0 +1,159 @@
+"""Frames against textbook cases, clocks against wraps, reboots and wild stamps, columns against what cannot be used."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from quadid_replay.clocks import LogClock, WrapCounter
+from quadid_replay.columns import Columns, RawChannel, clean_channel, fastest_first
+from quadid_replay.frames import (
+    continuous_sign,
+    flip_attitude,
+    flip_body,
+    flip_world,
+    from_euler,
+    to_euler,
+    unit_quaternions,
+)
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+angles = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+
+
+def matrix(q: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_quat(q[0], scalar_first=True).as_matrix())
+
+
+@given(angles)
+def test_euler_angles_are_z_y_x_and_come_back(rpy: tuple[float, float, float]) -> None:
+    q = from_euler(np.array([rpy]))
+    np.testing.assert_allclose(matrix(q), Rotation.from_euler("ZYX", rpy[::-1]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(to_euler(q)[0], rpy, atol=1e-6)
+
+
+@given(angles)
+def test_attitudes_change_frames_as_matrices_do(rpy: tuple[float, float, float]) -> None:
+    """R_ned_frd = T_world R_enu_flu T_body with T_world = [[0 1 0] [1 0 0] [0 0 -1]] and T_body = diag(1 -1 -1)."""
+    q = from_euler(np.array([rpy]))
+    world, body = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(matrix(flip_attitude(q)), world @ matrix(q) @ body, atol=1e-12)
+    np.testing.assert_allclose(flip_attitude(flip_attitude(q)), q, atol=1e-12)
+    vector = np.array([[1.0, 2.0, 3.0]])
+    turned = (matrix(q) @ vector[0])[None]
+    np.testing.assert_allclose(matrix(flip_attitude(q)) @ flip_body(vector)[0], flip_world(turned)[0], atol=1e-12)
+
+
+def test_level_and_north_in_both_worlds() -> None:
+    facing_east_enu = np.array([[1.0, 0.0, 0.0, 0.0]])  # ROS: yaw 0 faces east
+    np.testing.assert_allclose(to_euler(flip_attitude(facing_east_enu))[0], [0.0, 0.0, np.pi / 2], atol=1e-12)
+    np.testing.assert_array_equal(flip_world(np.array([[1.0, 2.0, 3.0]])), [[2.0, 1.0, -3.0]])
+    np.testing.assert_array_equal(flip_body(np.array([[1.0, 2.0, 3.0]])), [[1.0, -2.0, -3.0]])
+
+
+def test_signs_become_continuous() -> None:
+    q = from_euler(np.column_stack([np.linspace(0, 7, 50), np.zeros(50), np.zeros(50)]))
+    flipped = q * np.where(np.random.default_rng(1).random(50) < 0.5, -1.0, 1.0)[:, None]
+    out = continuous_sign(flipped)
+    assert np.all(np.sum(out[1:] * out[:-1], axis=1) > 0.0)
+    np.testing.assert_array_equal(out[0], flipped[0])
+
+
+def test_quaternions_off_unit_length_are_normalised_and_zeros_refused() -> None:
+    q, good = unit_quaternions(np.array([[1.0, 0, 0, 0], [1.1, 0, 0, 0], [0.0, 0, 0, 0]]))
+    np.testing.assert_array_equal(q[1], [1.0, 0, 0, 0])
+    assert list(good) == [True, True, False]
+
+
+def test_32_bit_microseconds_unwrap_forwards_and_through_disorder() -> None:
+    counter = WrapCounter()
+    true = np.arange(0.0, 3 * 2.0**32, 1e8)
+    assert [counter.unwrap(float(t % 2**32)) for t in true] == list(true)
+    counter = WrapCounter()
+    assert counter.unwrap(2.0**32 - 10) == 2.0**32 - 10
+    assert counter.unwrap(5.0) == 2.0**32 + 5
+    assert counter.unwrap(2.0**32 - 2) == 2.0**32 - 2  # late message from before the wrap
+    assert counter.unwrap(7.0) == 2.0**32 + 7
+
+
+@given(st.floats(0, 1e12), st.floats(-1e9, 1e9))
+def test_unwrapping_near_a_reference(true: float, offset: float) -> None:
+    assert WrapCounter().unwrap_near(true % 2**32, true + offset) == pytest.approx(true, abs=1e-3)
+
+
+def test_steady_time_passes_untouched() -> None:
+    clock = LogClock()
+    t = np.arange(0.0, 10.0, 0.01)
+    out, accepted = clock.times(t)
+    np.testing.assert_array_equal(out, t)
+    assert accepted.all()
+    assert clock.breaks == []
+
+
+def test_reboot_goes_on_after_a_break() -> None:
+    clock = LogClock()
+    out, accepted = clock.times(np.concatenate([np.arange(100.0, 110.0, 0.1), np.arange(2.0, 12.0, 0.1)]))
+    assert clock.reboots == 1
+    assert len(clock.breaks) == 1
+    kept = out[accepted]
+    assert np.all(np.diff(kept) > 0.0)
+    assert np.count_nonzero(~accepted) == 3  # the stamps that waited for confirmation
+    assert kept[99] < clock.breaks[0] < kept[100]
+    np.testing.assert_allclose(np.diff(kept[100:]), 0.1, atol=1e-9)
+
+
+def test_a_jump_ahead_is_a_break_and_a_single_wild_stamp_is_dropped() -> None:
+    clock = LogClock()
+    t = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(500.0, 510.0, 0.1)])
+    out, accepted = clock.times(t)
+    assert clock.jumps == 1
+    assert out[accepted][100] == pytest.approx(500.3)
+    clock = LogClock()
+    wild = np.insert(np.arange(0.0, 10.0, 0.1), [40, 60], [1e9, -1e6])
+    out, accepted = clock.times(wild)
+    assert list(np.flatnonzero(~accepted)) == [40, 61]
+    assert (clock.breaks, clock.wild) == ([], 2)
+    assert any("confirm" in w for w in clock.warnings())
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
+def test_any_stamps_are_survived(raw: list[float]) -> None:
+    clock = LogClock()
+    for stamp in raw:
+        t = clock.time(stamp)
+        assert t is None or np.isfinite(t)
+
+
+def test_samples_that_cannot_be_used_are_dropped_and_counted() -> None:
+    t = np.array([0.0, 0.1, 0.1, 0.05, 0.2, np.nan, 0.3, 0.4])
+    values = np.arange(24.0).reshape(8, 3)
+    values[6, 1] = np.inf
+    channel = clean_channel(RawChannel("gyro", t, values, "x", 2))
+    assert channel is not None
+    np.testing.assert_array_equal(channel.t, [0.0, 0.1, 0.2, 0.4])
+    assert dict(channel.faults) == {"bad_stamp": 2, "not_finite": 2, "duplicate": 1, "backwards": 1}
+    assert clean_channel(RawChannel("gyro", t, values * np.nan, "x")) is None
+
+
+def test_columns_keep_doubles_and_refuse_other_widths() -> None:
+    columns = Columns(2)
+    columns.add(1.0, (2.0, 3.0))
+    columns.add(None, (0.0, 0.0))
+    t, values = columns.arrays()
+    assert (list(t), values.tolist(), columns.refused) == ([1.0], [[2.0, 3.0]], 1)
+    with pytest.raises(ValueError, match="3 values for 2 columns"):
+        columns.add(2.0, (1.0, 2.0, 3.0))
+    empty_t, empty_values = Columns(3).arrays()
+    assert (empty_t.shape, empty_values.shape) == ((0,), (0, 3))
+
+
+def test_a_source_must_be_clearly_faster_to_be_preferred() -> None:
+    def raw(rate: float, name: str) -> RawChannel:
+        t = np.arange(0.0, 2.0, 1.0 / rate)
+        return RawChannel("gyro", t, np.zeros((len(t), 3)), name)
+
+    assert [e.source for e in fastest_first([raw(100, "a"), raw(110, "b")])] == ["a", "b"]
+    assert fastest_first([raw(100, "a"), raw(400, "b")])[0].source == "b"
