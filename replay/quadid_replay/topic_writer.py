@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
@@ -56,7 +56,7 @@ class TopicWriter:
             LogError: no definition of this type, or a message that does not fit it.
         """
         try:
-            data = self.encoder(kind)(message)
+            data = self.encoder(kind)(_namespace(message))
         except (ValueError, TypeError, AttributeError, LookupError) as error:
             raise LogError(
                 f"message for {topic} does not fit {kind}: {error}", "the fields of its definition"
@@ -103,6 +103,15 @@ class TopicWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _namespace(message: Any) -> Any:
+    """Turns dicts into objects, throughout: the library takes an absent key ``values`` for the dict's own method."""
+    if isinstance(message, Mapping):
+        return SimpleNamespace(**{str(name): _namespace(value) for name, value in message.items()})
+    if isinstance(message, list | tuple):
+        return [_namespace(value) for value in message]
+    return message
 
 
 def _definition(kind: str) -> str:
