@@ -29,7 +29,7 @@ def console(quiet: bool = False, stderr: bool = False) -> Console:
 
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_WIDTH
-    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, soft_wrap=False)
+    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=False)
 
 
 def warn(messages: tuple[str, ...] | list[str]) -> None:

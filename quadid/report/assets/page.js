@@ -1,0 +1,93 @@
+"use strict";
+(() => {
+  const figures = JSON.parse(document.getElementById("figures").textContent);
+  const root = document.documentElement;
+  const chosen = new Map();
+  const colour = (name) => getComputedStyle(root).getPropertyValue("--" + name).trim();
+
+  function line(role) {
+    if (role === "measured") return { color: colour(role), width: 2.4 };
+    if (role === "before") return { color: colour(role), width: 1.2, dash: "dot" };
+    if (role === "floor") return { color: colour(role), width: 1, dash: "dash" };
+    return { color: colour(role), width: 1.3 };
+  }
+
+  function marker(role) {
+    const symbols = { before: "line-ns-open", after: "circle", truth: "x-thin-open" };
+    return { color: colour(role), size: role === "after" ? 9 : 14, symbol: symbols[role] || "circle", line: { width: 2, color: colour(role) } };
+  }
+
+  function painted(trace, view) {
+    const out = Object.assign(view.x && !trace.x ? { x: view.x } : {}, trace);
+    if ((trace.mode || "").includes("lines")) out.line = line(trace.role);
+    if ((trace.mode || "").includes("markers")) out.marker = marker(trace.role);
+    if (trace.error_x) out.error_x = Object.assign({ color: colour(trace.role), thickness: 2, width: 5 }, trace.error_x);
+    if (trace.type === "bar") out.marker = { color: colour(trace.role) };
+    return out;
+  }
+
+  function layoutOf(view) {
+    const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), automargin: true };
+    const layout = {
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { color: colour("ink"), size: 12, family: getComputedStyle(document.body).fontFamily },
+      margin: { l: 60, r: 8, t: 8, b: 40 }, hovermode: "x unified", dragmode: "zoom",
+      hoverlabel: { bgcolor: colour("card"), font: { color: colour("ink") } },
+      legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" },
+    };
+    for (const [key, value] of Object.entries(view.layout)) {
+      layout[key] = /^[xy]axis/.test(key) ? Object.assign({}, axis, value) : value;
+    }
+    return layout;
+  }
+
+  function draw(box) {
+    const figure = figures[box.dataset.figure];
+    const view = figure.views[chosen.get(figure.id) || 0];
+    box.dataset.drawn = "yes";
+    return Plotly.react(box, view.data.map((trace) => painted(trace, view)), layoutOf(view), { responsive: true, displaylogo: false, displayModeBar: false });
+  }
+
+  const boxes = () => document.querySelectorAll(".plot");
+  const redraw = () => boxes().forEach((box) => { if (box.dataset.drawn) draw(box); });
+
+  const seen = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      if (entry.isIntersecting && !entry.target.dataset.drawn) draw(entry.target);
+    }
+  }, { rootMargin: "600px" });
+  boxes().forEach((box) => seen.observe(box));
+
+  document.querySelectorAll("button[data-figure]").forEach((button) => {
+    button.addEventListener("click", () => {
+      const id = button.dataset.figure;
+      chosen.set(id, Number(button.dataset.view));
+      document.querySelectorAll("button[data-figure]").forEach((other) => {
+        if (other.dataset.figure === id) other.classList.toggle("on", other === button);
+      });
+      draw(document.getElementById("plot-" + id));
+    });
+  });
+
+  const system = window.matchMedia("(prefers-color-scheme: dark)");
+  let own = null;
+  function dress() {
+    const dark = own === null ? system.matches : own;
+    root.classList.toggle("dark", dark);
+    root.style.colorScheme = dark ? "dark" : "light";
+    redraw();
+  }
+  document.getElementById("theme").addEventListener("click", () => { own = !root.classList.contains("dark"); dress(); });
+  system.addEventListener("change", dress);
+  dress();
+
+  // Paper: light colours, every part open and every figure drawn.
+  let was = [];
+  window.addEventListener("beforeprint", () => {
+    was = Array.from(document.querySelectorAll("details")).filter((d) => !d.open);
+    was.forEach((d) => { d.open = true; });
+    root.classList.remove("dark");
+    boxes().forEach(draw);
+  });
+  window.addEventListener("afterprint", () => { was.forEach((d) => { d.open = false; }); dress(); });
+})();

@@ -1,0 +1,226 @@
+"""Figures as plain Plotly descriptions, without colours: the page gives every trace the colour of its role.
+
+Roles: ``measured``, ``before`` (current parameters), ``after`` (proposed ones), ``truth``, ``floor``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.result import ScoredSet
+from quadid.identify.score import SetScore
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+
+FloatArray = NDArray[np.float64]
+JsonDict = dict[str, Any]
+
+GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "rates": ("Body rates", (0, 1, 2)),
+    "attitude": ("Attitude", (3, 4, 5)),
+    "accel": ("Specific force", (6, 7, 8)),
+    "velocity": ("Velocity", (9, 10, 11)),
+    "position": ("Position", (12, 13, 14)),
+}
+LABELS = {"phi": "φ", "theta": "θ", "psi": "ψ"}
+WHOLE_POINTS = 800
+"""Points a trace over a whole log keeps at most."""
+DETAIL_POINTS = 600
+DETAIL_SECONDS = 12.0
+MOST_LOGS = 4
+"""Logs that get pictures; the others are in the tables."""
+BUDGET = 110_000
+"""Numbers that all pictures of channels may take together, so that a page stays below 6 MB."""
+
+
+def trace(role: str, name: str, x: FloatArray | None, y: FloatArray, **more: Any) -> JsonDict:
+    """One line of a figure; without `x` it takes that of its view.  Numbers keep what a picture can show."""
+    across = {} if x is None else {"x": short(x)}
+    return {"role": role, "name": name, **across, "y": short(y), "type": "scatter", "mode": "lines", **more}
+
+
+def short(values: FloatArray, resolution: float | None = None) -> list[float | None]:
+    """Numbers rounded to a two-thousandth of their range, so that a page stays small; None where not finite.
+
+    Args:
+        values: shape (n,).
+        resolution: smallest difference to keep, instead.
+    """
+    good = values[np.isfinite(values)]
+    if len(good) == 0:
+        return [None] * len(values)
+    finest = resolution or max(float(np.ptp(good)), 1e-3 * float(np.abs(good).max()), 1e-12) / 2000.0
+    decimals = max(0, math.ceil(-math.log10(finest)))
+    return [round(v, decimals) if math.isfinite(v) else None for v in values.tolist()]
+
+
+def channel_figures(scored: ScoredSet, prefix: str, logs: int = 1) -> list[JsonDict]:
+    """Measured and simulated outputs of one log, one figure a group of channels: the whole log and its liveliest part.
+
+    Args:
+        scored: the log with both scores.
+        prefix: makes the figures' identifiers unique.
+        logs: number of logs that share the page.
+    """
+    series = scored.fitted.series
+    zero = float(series.t[0])
+    share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + DETAIL_POINTS)))
+    whole = _thinned(series.measured, int(share * WHOLE_POINTS))
+    detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
+    out = []
+    for key, (title, channels) in GROUPS.items():
+        here = [c for c in channels if c < series.measured.shape[1] and np.isfinite(series.measured[:, c]).any()]
+        if here:
+            views = [
+                {"label": "Liveliest part, every sample", **_stack(scored, detail, here, zero)},
+                {"label": "Whole log", **_stack(scored, whole, here, zero)},
+            ]
+            shown = views if len(whole) > len(detail) else views[1:]
+            out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
+    return out
+
+
+def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], zero: float) -> JsonDict:
+    """Channels above each other with one time axis."""
+    after, before = scored.fitted.series, scored.initial.series
+    t = after.t[rows] - zero
+    data, layout = [], dict[str, Any]()
+    for i, c in enumerate(channels):
+        axis = "" if i == 0 else str(i + 1)
+        where = {"xaxis": "x", "yaxis": f"y{axis}", "showlegend": i == 0}
+        name, measured = CHANNEL_NAMES[c], after.measured[rows, c]
+        low, high = _focus(measured)
+        for role, label, y in (
+            ("measured", "measured", measured),
+            ("before", "current parameters", before.simulated[rows, c]),
+            ("after", "proposed parameters", after.simulated[rows, c]),
+        ):
+            # A poor first guess may run far away; what leaves the picture need not be kept.
+            inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
+            line = trace(role, label, None, inside, legendgroup=role, **where)
+            data.append({**line, "y": short(inside, (high - low) / 2000.0)})
+        share = 1.0 / len(channels)
+        layout[f"yaxis{axis}"] = {
+            "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
+            "title": {"text": f"{LABELS.get(name, name)} [{CHANNEL_UNITS[c]}]"},
+            "range": [low, high],
+        }
+    last = "y" if len(channels) == 1 else f"y{len(channels)}"
+    layout["xaxis"] = {"title": {"text": "time [s]"}, "anchor": last}
+    return {"x": short(t), "data": data, "layout": layout}
+
+
+def _focus(measured: FloatArray) -> tuple[float, float]:
+    """Axis limits that show the measurement."""
+    good = measured[np.isfinite(measured)]
+    if len(good) == 0:
+        return -1.0, 1.0
+    low, high = float(good.min()), float(good.max())
+    margin = 0.15 * max(high - low, 1e-3)
+    return low - margin, high + margin
+
+
+def _thinned(values: FloatArray, points: int) -> NDArray[np.intp]:
+    """Rows that keep the peaks: of each bin the rows where the liveliest channel is smallest and largest."""
+    n = len(values)
+    if n <= points:
+        return np.arange(n)
+    loud = values[:, _loudest(values)]
+    edges = np.linspace(0, n, points // 2 + 1).astype(np.intp)
+    filled = np.nan_to_num(loud)
+    keep = [
+        i + np.array([filled[i:j].argmin(), filled[i:j].argmax()]) for i, j in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    return np.unique(np.concatenate(keep))
+
+
+def _loudest(values: FloatArray) -> int:
+    return int(np.argmax(np.nan_to_num(values[:, :3]).std(axis=0)))
+
+
+def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) -> NDArray[np.intp]:
+    """Rows of the `DETAIL_SECONDS`, or as many as `points` last, with the most rotation."""
+    n = len(t)
+    step = float(np.median(np.diff(t))) if n > 1 else 1.0
+    width = min(n, points, max(int(DETAIL_SECONDS / step), 2))
+    energy = np.concatenate([[0.0], np.cumsum(np.nan_to_num(np.sum(values[:, :3] ** 2, axis=1)))])
+    first = int(np.argmax(energy[width:] - energy[:-width])) if n > width else 0
+    return np.arange(first, first + width)
+
+
+def error_figure(scored: ScoredSet, identifier: str) -> JsonDict:
+    """Error over time: mean squared residual of each second over that of a perfect model, before and after."""
+    zero = float(scored.fitted.series.t[0])
+    data = []
+    for role, name, score in (
+        ("before", "current parameters", scored.initial),
+        ("after", "proposed parameters", scored.fitted),
+    ):
+        t, ratio = error_over_time(score, scored.fitted)
+        data.append(trace(role, name, t - zero, ratio))
+    ends = series_ends(scored) - zero
+    data.append(trace("floor", "sensor noise alone", ends, np.ones(2)))
+    layout = {
+        "xaxis": {"title": {"text": "time [s]"}},
+        "yaxis": {"title": {"text": "squared error / noise"}, "type": "log", "dtick": 1},
+    }
+    views = [{"label": "", "data": data, "layout": layout}]
+    return {"id": identifier, "title": "Error over the flight", "views": views, "height": 240}
+
+
+def series_ends(scored: ScoredSet) -> FloatArray:
+    """First and last scored time [s], shape (2,)."""
+    return scored.fitted.series.t[[0, -1]]
+
+
+def error_over_time(score: SetScore, fitted: SetScore) -> tuple[FloatArray, FloatArray]:
+    """Time [s] and squared error over that of a perfect model, one value for about a second.
+
+    Args:
+        score: whose residuals.
+        fitted: says how large those of a perfect model are.
+    """
+    perfect = np.array([c.rmse / np.sqrt(c.mse) if c.samples and c.mse > 0.0 else np.nan for c in fitted.channels])
+    series = score.series
+    squares = ((series.simulated - series.measured) / perfect) ** 2
+    step = float(np.median(np.diff(series.t)))
+    width = max(round(1.0 / step), len(series.t) // WHOLE_POINTS, 1)
+    bins = np.arange(0, len(series.t) - width + 1, width)
+    mean = [np.nanmean(part) if np.isfinite(part).any() else np.nan for part in (squares[i : i + width] for i in bins)]
+    return series.t[bins] + 0.5 * width * step, np.array(mean)
+
+
+def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str, float] | None = None) -> JsonDict:
+    """Proposed over current value with its interval, one row a parameter; the truth where a simulation knows it."""
+    shown = [p for p in parameters if p["initial"] and np.isfinite(p["initial"])][::-1]
+    names = [p["name"] for p in shown]
+    scale = np.array([p["initial"] for p in shown])
+    value = np.array([p["value"] for p in shown]) / scale
+    interval = (
+        np.array([[np.nan if v is None else v for v in p["ci95"]] for p in shown]).reshape(-1, 2) / scale[:, None]
+    )
+    upper, lower = short(interval[:, 1] - value, 1e-5), short(value - interval[:, 0], 1e-5)
+    bars = {"type": "data", "symmetric": False, "array": upper, "arrayminus": lower}
+    common = {"y": names, "mode": "markers", "type": "scatter"}
+    data = [
+        {"role": "before", "name": "current", "x": [1.0] * len(names), **common},
+        {"role": "after", "name": "proposed, 95 % interval", "x": short(value), "error_x": bars, **common},
+    ]
+    if truth:
+        known = np.array([truth.get(n, np.nan) for n in names]) / scale
+        data.append({"role": "truth", "name": "truth", "x": short(known), **common})
+    layout = {
+        "xaxis": {"title": {"text": "value / current value"}},
+        "yaxis": {"type": "category"},
+    }
+    views = [{"label": "", "data": data, "layout": layout}]
+    return {
+        "id": "parameters",
+        "title": "Proposed against current",
+        "views": views,
+        "height": 60 + 38 * len(names) + 60,
+    }

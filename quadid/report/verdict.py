@@ -1,0 +1,158 @@
+"""What a result means, in plain words: a headline, one sentence a parameter, and what to do next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+JsonDict = Mapping[str, Any]
+Level = Literal["good", "fair", "poor"]
+
+NOISE_LEVEL = 1.3
+"""Below this ratio to the noise floor nothing that a flight could show is missing."""
+ROUGH = 5.0
+"""Above this ratio the simulation misses more than it explains."""
+MOTION = {
+    "b": "climbs and descents",
+    "d": "yaw turns",
+    "J_xx": "quick roll doublets",
+    "J_yy": "quick pitch doublets",
+    "J_zz": "quick yaw doublets, together with roll and pitch",
+    "J_r": "roll and pitch doublets while yawing",
+}
+"""What the vehicle must do for each parameter to show."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A judgement.
+
+    Attributes:
+        level: good, fair or poor.
+        headline: one sentence.
+        details: further sentences.
+        next_steps: what to do, most useful first.
+    """
+
+    level: Level
+    headline: str
+    details: tuple[str, ...]
+    next_steps: tuple[str, ...]
+
+
+def identify_verdict(result: JsonDict) -> Verdict:
+    """Judges the result of ``quadid identify``.
+
+    Args:
+        result: a dictionary of the form ``quadid.identify/1``.
+    """
+    parameters, sets = result["parameters"], result["sets"]
+    known = [p for p in parameters if p["status"] == "identified"]
+    open_ones = [p for p in parameters if p["status"] != "identified"]
+    judged = [s for s in sets if s["role"] == "validate"] or sets
+    ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
+    where = "a flight it has not seen" if judged and judged[0]["role"] == "validate" else "the fitted flight"
+    level, match = _match(ratio, where)
+    if not known:
+        level = "poor"
+    elif open_ones and level == "good":
+        level = "fair"
+    headline = f"{_count(len(known), len(parameters))} identified; {match}."
+    return Verdict(level, headline, _details(known, judged), _next_steps(result, open_ones, ratio))
+
+
+def _match(ratio: float, where: str) -> tuple[Level, str]:
+    if ratio <= NOISE_LEVEL:
+        return "good", f"the simulation matches {where} down to the sensor noise"
+    if ratio <= ROUGH:
+        return (
+            "fair",
+            f"the simulation follows {where}, with errors above the sensor noise ({ratio:.2g} times its variance)",
+        )
+    if math.isfinite(ratio):
+        return "poor", f"the simulation misses much of {where} (error {ratio:.3g} times the noise variance)"
+    return "poor", f"the simulation does not hold together on {where}"
+
+
+def _count(known: int, total: int) -> str:
+    if known == total:
+        return f"All {total} parameters"
+    return f"{known} of {total} parameters" if known else f"None of {total} parameters"
+
+
+def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str, ...]:
+    out = []
+    if known:
+        widest = max(known, key=relative_halfwidth)
+        out.append(
+            f"The least certain of them is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval)."
+        )
+    fits = [v for s in judged for n, v in s["fit_percent"].items() if n in ("p", "q", "r") and v is not None]
+    if fits:
+        out.append(
+            f"Over one second without correction the simulated rates fit the measured ones by {min(fits):.0f} to "
+            f"{max(fits):.0f} % (100 % is perfect, 0 % is no better than the mean)."
+        )
+    return tuple(out)
+
+
+def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], ratio: float) -> tuple[str, ...]:
+    out = []
+    for p in open_ones:
+        if p["status"] == "prior_dominated":
+            out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} does not show in these data.")
+    if open_ones:
+        out.append("`quadid excite` proposes a manoeuvre and says what it would gain.")
+    if ratio > NOISE_LEVEL:
+        out.append("`quadid diagnose` names what the simulation gets wrong and measures what the better model gains.")
+    if all(s["role"] != "validate" for s in result["sets"]):
+        out.append("Give another flight with --validate: only data that were not fitted prove a model.")
+    if not out:
+        out.append(
+            "Nothing is applied by itself: `quadid export` writes the values for PX4, ArduPilot, Gazebo or RotorPy."
+        )
+    return tuple(dict.fromkeys(out))
+
+
+def reason(parameter: JsonDict) -> str:
+    """Says in one sentence what the data say about a parameter."""
+    name, status = parameter["name"], parameter["status"]
+    if status == "prior_dominated":
+        needs = MOTION.get(name)
+        return "The data say nothing about it; the value is the guess." + (f" It needs {needs}." if needs else "")
+    if status == "ratio_only":
+        return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
+    change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan
+    if not math.isfinite(change):
+        return f"Known to {percent(relative_halfwidth(parameter))}."
+    if _within(parameter):
+        return f"Known to {percent(relative_halfwidth(parameter))}; the old value lies inside the interval."
+    moved = "raised" if change > 0 else "lowered"
+    return f"Known to {percent(relative_halfwidth(parameter))}; {moved} by {percent(abs(change))}."
+
+
+def relative_halfwidth(parameter: JsonDict) -> float:
+    """Half of the 95 % interval relative to the value; infinite without an interval."""
+    low, high = (_number(v) for v in parameter["ci95"])
+    value = _number(parameter["value"])
+    width = 0.5 * (high - low) / abs(value) if value else math.inf
+    return width if math.isfinite(width) else math.inf
+
+
+def percent(share: float) -> str:
+    """A share as per cent with two digits that matter: 0.0123 -> 1.2 %."""
+    if not math.isfinite(share):
+        return "an unknown margin"
+    value = 100.0 * share
+    return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
+
+
+def _within(parameter: JsonDict) -> bool:
+    low, high = (_number(v) for v in parameter["ci95"])
+    return low <= _number(parameter["initial"]) <= high
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
