@@ -27,6 +27,8 @@ CSV_GAP = 1.5
 """In a log that is a grid itself, a step longer than this many median steps is a gap."""
 GAP = 3.5
 """In logs whose channels come each at its own pace, a step longer than this many periods is a gap."""
+_BRIDGED = 0.5
+"""There a step no longer than this fraction of the grid's is never a gap: hardly anything shows of it on the grid."""
 _FAST = 0.77
 """A channel whose period is below this many grid steps must be low-passed before it is read on the grid."""
 REQUIRED = ("rotor_speed", "gyro", "accel")
@@ -64,10 +66,10 @@ def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling:
     own = sample_period(raw.get("gyro", raw["rotor_speed"])[0])
     step = round(own, 9) if rate is None else 1.0 / rate
     filtered = min(sample_period(raw[n][0]) for n in REQUIRED if n in raw) < _FAST * step
-    gap = CSV_GAP if recording.format == "csv" else GAP
+    gap, bridged = (CSV_GAP, 0.0) if recording.format == "csv" else (GAP, _BRIDGED * step)
     tracks = {}
     for name, (times, values) in raw.items():
-        longest = gap * float(np.median(np.diff(times)))
+        longest = max(gap * float(np.median(np.diff(times))), bridged)
         if filtered and name in ("attitude", "velocity", "position", "gyro"):
             rows = fresh_rows(values)
             if len(rows) < len(times):

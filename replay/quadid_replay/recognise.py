@@ -99,16 +99,12 @@ def _is_csv(head: bytes) -> bool:
 
 
 def header_line(head: bytes) -> str | None:
-    """Returns the first line that is neither empty nor a comment (#), or None when the bytes are not text."""
-    if b"\x00" in head:
-        return None
-    try:
-        text = head.decode("utf-8-sig", errors="strict")
-    except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:  # more than a character cut at the end of the head
-            return None
-        text = head[: error.start].decode("utf-8-sig")
-    for line in text.splitlines():
-        if line.strip() and not line.lstrip().startswith("#"):
-            return line
+    """Returns the first line that is neither empty nor a comment (#), or None when it is not text."""
+    for line in head.removeprefix(b"\xef\xbb\xbf").splitlines():
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            try:
+                text = line.decode("utf-8")
+            except UnicodeDecodeError:
+                return None
+            return text if text.replace("\t", " ").isprintable() else None
     return None

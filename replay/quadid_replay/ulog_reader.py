@@ -77,7 +77,7 @@ def _load(path: Path) -> _Log:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints
             ulog = ULog(str(path), message_name_filter_list=_TOPICS)
-    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
+    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, OSError) as error:
         raise LogError(
             f"{path.name}: its definitions are damaged ({type(error).__name__}: {str(error)[:80]})",
             "a PX4 ULog", "copy the file again from the vehicle",
