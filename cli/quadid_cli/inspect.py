@@ -124,29 +124,33 @@ def _text(result: dict[str, Any]) -> str:
     return json.dumps(plain(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _print(console: Console, inspection: Inspection) -> None:
+def _plain(text: str) -> str:
+    """Text of a log for the terminal: no control characters, no markup."""
     from rich.markup import escape
 
+    return escape("".join(c if c.isprintable() else "?" for c in text))
+
+
+def _print(console: Console, inspection: Inspection) -> None:
     flying = ", ".join(f"{a:.1f}-{b:.1f}" for a, b in inspection.flying) or "none found"
     console.print(
-        f"[bold]{escape(inspection.name)}[/bold]: {inspection.format}, {inspection.seconds:.1f} s, "
+        f"[bold]{_plain(inspection.name)}[/bold]: {inspection.format}, {inspection.seconds:.1f} s, "
         f"flying from-to (s): {flying}"
     )
     for warning in inspection.warnings:
-        console.print(f"[yellow]note[/yellow] {escape(warning)}")
+        console.print(f"[yellow]note[/yellow] {_plain(warning)}")
     console.print(_channel_table(inspection))
     console.print(_check_table(inspection))
     console.print(_parameter_table(inspection))
     for missing in inspection.missing:
         console.print(
-            f"[yellow]missing[/yellow] {missing.channel}: {escape(missing.why)}. To get it: {escape(missing.how)}"
+            f"[yellow]missing[/yellow] {missing.channel}: {_plain(missing.why)}. To get it: {_plain(missing.how)}"
         )
     verdict = "usable for identification" if inspection.usable else "not usable for identification as it is"
     console.print(f"[bold]{verdict}[/bold]")
 
 
 def _channel_table(inspection: Inspection) -> Any:
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="channels", title_justify="left")
@@ -156,14 +160,13 @@ def _channel_table(inspection: Inspection) -> Any:
         table.add_column(name, justify="right")
     for f in inspection.channels:
         table.add_row(
-            f.name, escape(f.source), f"{f.rate:.4g}", str(f.count), f"{f.first:.3f}", f"{f.last:.3f}", str(f.gaps),
+            f.name, _plain(f.source), f"{f.rate:.4g}", str(f.count), f"{f.first:.3f}", f"{f.last:.3f}", str(f.gaps),
             f"{f.longest_gap:.3g}" if f.gaps else "", str(sum(f.dropped.values()) or ""),
         )  # fmt: skip
     return table
 
 
 def _check_table(inspection: Inspection) -> Any:
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="checks", title_justify="left")
@@ -173,12 +176,11 @@ def _check_table(inspection: Inspection) -> Any:
     for check in inspection.checks:
         verdict = check.verdict.value
         coloured = f"[{_COLOURS[verdict]}]{verdict}[/{_COLOURS[verdict]}]"
-        table.add_row(coloured, check.name.replace("_", " "), escape(check.message), escape(check.fix))
+        table.add_row(coloured, check.name.replace("_", " "), _plain(check.message), _plain(check.fix))
     return table
 
 
 def _parameter_table(inspection: Inspection) -> Any:
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="what can be identified", title_justify="left")
@@ -188,7 +190,7 @@ def _parameter_table(inspection: Inspection) -> Any:
     if expected:
         table.add_column("expected 1-sigma (%)", justify="right")
     for outlook in inspection.parameters:
-        cells = [outlook.parameter, "yes" if outlook.possible else "no", escape(outlook.reason)]
+        cells = [outlook.parameter, "yes" if outlook.possible else "no", _plain(outlook.reason)]
         if expected:
             sigma = expected.get(outlook.parameter, float("nan"))
             cells.append(f"{100.0 * sigma:.2g}" if sigma < 10.0 else "unknown from this flight")

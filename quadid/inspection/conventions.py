@@ -90,7 +90,7 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     z = float(np.median(values[:, 2]))
     numbers = {"length": length, "z": z}
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
-    for unit, factor in (("g", GRAVITY), ("milli-g", GRAVITY * 1e-3), ("cm/s^2", 0.01)):
+    for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
         if 0.7 < length * factor / GRAVITY < 1.6:
             fix = f"multiply acceleration by {factor:.6g}"
             return Check("gravity", Verdict.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
@@ -124,12 +124,16 @@ def gyro_check(recording: Recording) -> Check:
         if len(measured) < 20 or np.max(np.std(derived, axis=0)) < _MOTION:
             continue
         fit = _fit_without_jumps(measured, derived)
-        better = best is None or fit.r2 > best[1].r2 + 0.15
-        if better:
+        if best is None or _likely(name, fit) > _likely(*best):
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", Verdict.UNKNOWN, "too little rotation to compare gyro and attitude")
     return _judge_rates(*best)
+
+
+def _likely(reading: str, fit: AxisMap) -> float:
+    """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
+    return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
 
 
 def _judge_rates(reading: str, fit: AxisMap) -> Check:

@@ -71,7 +71,6 @@ def read_mcap(path: Path, sha256: str = "", preset: str = AUTO) -> Recording:
     Raises:
         LogError: no topic of a known type, unknown preset, or a file made to exhaust memory.
     """
-    preset_rank(preset, "gyro", "")  # an unknown preset is an error even where no topic would match
     file = McapFile(path)
     notes: list[str] = []
     sources = _sources(file, preset, notes)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from quadid.errors import LogError
 from quadid.window import Recording
+from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
 
-def open_log(path: str | Path, preset: str = "auto") -> Recording:
+def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
 
     Args:
@@ -22,6 +23,7 @@ def open_log(path: str | Path, preset: str = "auto") -> Recording:
         LogError: no such file, a directory, an empty file, an unknown format, or nothing readable in it.
     """
     file = Path(path)
+    preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
     head, sha256 = _head_and_hash(file)
     kind = recognise(head, file.name)
     if kind == "mcap":

@@ -1,0 +1,85 @@
+"""`quadid inspect` as people and programs call it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from quadid_cli.main import app_main
+from quadid_replay import write_csv
+
+from quadid.window import Recording
+from tests.replay.synthetic import Flight
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "flight.csv"
+    write_csv(path, Flight().recording(seconds=10.0))
+    return path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr("sys.argv", ["quadid", "inspect", *arguments])
+    return app_main()
+
+
+def test_tables_for_people(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, str(log)) == 0
+    out = capsys.readouterr().out
+    for text in ("gyro", "rate (Hz)", "gravity", "J_xx", "usable for identification"):
+        assert text in out
+
+
+def test_json_alone_on_stdout(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, str(log), "--vehicle", "pelican", "--json", "-") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["schema"] == "quadid.inspect/1"
+    assert result["log"] == str(log)
+    assert {row["name"] for row in result["excitation"]} == {"b", "d", "J_xx", "J_yy", "J_zz", "J_r"}
+    assert all(row["relative_sigma"] > 0 for row in result["excitation"])
+
+
+def test_files_are_named_by_absolute_path(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(log.parent)
+    assert run(monkeypatch, "flight.csv", "--json", "result.json", "--out", "written") == 0
+    result = json.loads((log.parent / "result.json").read_text())
+    (written,) = result["files"]
+    assert Path(written).is_absolute()
+    assert json.loads(Path(written).read_text())["schema"] == "quadid.inspect/1"
+
+
+def test_a_span_of_the_log(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, f"{log}@2:5", "--json", "-") == 0
+    assert json.loads(capsys.readouterr().out)["seconds"] == pytest.approx(3.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["absent.csv"], "no file"),
+        (["{log}", "--vehicle", "pelikan"], "pelican"),
+        (["{log}", "--preset", "mavro", "--json", "-"], "did you mean 'mavros'"),
+        (["{log}@100:200"], "nothing between"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(
+    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str
+) -> None:
+    code = run(monkeypatch, *(a.format(log=log) for a in arguments))
+    captured = capsys.readouterr()
+    assert code == 2
+    assert text in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_control_characters_of_a_log_do_not_reach_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = Flight().recording(seconds=5.0)
+    path = tmp_path / "evil\x1b[31m[bold]name.csv"
+    write_csv(path, Recording(recording.name, "csv", recording.channels))
+    assert run(monkeypatch, str(path)) == 0
+    assert "\x1b" not in capsys.readouterr().out

@@ -1,0 +1,258 @@
+"""What an inspection must notice: wrong units, wrong frames, swapped motors, absent and slow channels, clock faults."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from quadid_replay import open_log
+from quadid_replay.frames import flip_attitude, flip_body, flip_world
+
+from quadid.inspection import Check, Inspection, Verdict, inspect
+from quadid.inspection.conventions import fit_axes
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+from tests.replay.synthetic import PELICAN, Flight, with_command
+
+FloatArray = NDArray[np.float64]
+FLIGHT = Flight()
+
+
+@pytest.fixture(scope="module")
+def clean() -> Recording:
+    """Twenty seconds without a fault."""
+    rng = np.random.default_rng(4)
+    recording = FLIGHT.recording(seconds=20.0, rate=50.0)
+    noisy = {}
+    for name, sigma in (("gyro", 0.01), ("accel", 0.1)):
+        channel = recording.channels[name]
+        noisy[name] = replace(channel, values=channel.values + sigma * rng.normal(size=channel.values.shape))
+    return replace(recording, channels={**recording.channels, **noisy})
+
+
+def changed(recording: Recording, name: str, change: Callable[[FloatArray], FloatArray]) -> Recording:
+    channel = recording.channels[name]
+    return replace(recording, channels={**recording.channels, name: replace(channel, values=change(channel.values))})
+
+
+def check(inspection: Inspection, name: str) -> Check:
+    return next(c for c in inspection.checks if c.name == name)
+
+
+def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
+    found = inspect(clean, PELICAN)
+    assert {c.name: c.verdict for c in found.checks} == dict.fromkeys(
+        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order"), Verdict.OK
+    )
+    assert found.usable
+    np.testing.assert_allclose(found.flying, [(0.0, 19.98)])
+    assert found.missing == ()
+    assert all(p.possible for p in found.parameters)
+    gyro = next(c for c in found.channels if c.name == "gyro")
+    assert gyro.rate == pytest.approx(50.0)
+    assert (gyro.count, gyro.gaps, gyro.saturated) == (1000, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [(1 / 9.80665, "in g"), (1000 / 9.80665, "milli-g"), (100.0, "cm/s"), (30.0, "no specific force")],
+)
+def test_wrong_units_of_the_accelerometer(clean: Recording, factor: float, unit: str) -> None:
+    gravity = check(inspect(changed(clean, "accel", lambda v: v * factor)), "gravity")
+    assert gravity.verdict is Verdict.ERROR
+    assert unit in gravity.message
+    assert gravity.fix
+
+
+def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording) -> None:
+    gravity = check(inspect(changed(clean, "accel", flip_body)), "gravity")
+    assert gravity.verdict is Verdict.ERROR
+    assert "FLU" in gravity.message
+    gyro = check(inspect(changed(clean, "gyro", flip_body)), "gyro_attitude")
+    assert gyro.verdict is Verdict.ERROR
+    assert "x = x, y = -y, z = -z" in gyro.message
+    ros = clean
+    for name, flip in (
+        ("gyro", flip_body),
+        ("accel", flip_body),
+        ("attitude", flip_attitude),
+        ("velocity", flip_world),
+    ):
+        ros = changed(ros, name, flip)
+    verdicts = {c.name: c.verdict for c in inspect(ros).checks}
+    assert verdicts["gravity"] is Verdict.ERROR
+
+
+def test_degrees_for_radians(clean: Recording) -> None:
+    gyro = check(inspect(changed(clean, "gyro", np.degrees)), "gyro_attitude")
+    assert gyro.verdict is Verdict.ERROR
+    assert "deg/s" in gyro.message
+    assert gyro.fix == "convert to radians"
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [(lambda q: q * [1, -1, -1, -1], "world to body"), (lambda q: q[:, [1, 2, 3, 0]], "scalar last")],
+)
+def test_quaternions_read_the_wrong_way(
+    clean: Recording, change: Callable[[FloatArray], FloatArray], name: str
+) -> None:
+    found = check(inspect(changed(clean, "attitude", change)), "gyro_attitude")
+    assert found.verdict is Verdict.ERROR
+    assert name in found.message
+
+
+def test_swapped_gyro_axes_are_named(clean: Recording) -> None:
+    found = check(inspect(changed(clean, "gyro", lambda v: v[:, [1, 0, 2]])), "gyro_attitude")
+    assert found.verdict is Verdict.ERROR
+    assert "x = y, y = x, z = z" in found.message
+
+
+def test_velocity_in_enu_beside_an_attitude_in_ned(clean: Recording) -> None:
+    found = check(inspect(changed(clean, "velocity", flip_world)), "velocity_attitude")
+    assert found.verdict is Verdict.ERROR
+    assert "x = y, y = x" in found.message
+
+
+@pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1), (1, 2, 3, 0)])
+def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...]) -> None:
+    swapped = changed(clean, "rotor_speed", lambda v: v[:, order])
+    found = check(inspect(swapped, PELICAN), "motor_order")
+    assert found.verdict is Verdict.ERROR
+    back = ", ".join(str(int(i) + 1) for i in np.argsort(order))
+    assert back in found.message
+    assert back in found.fix
+
+
+def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
+    data = PELICAN.model_dump()
+    for rotor in data["rotors"]:
+        rotor["spin"] = -rotor["spin"]
+    found = check(inspect(clean, Vehicle.model_validate(data)), "motor_order")
+    assert found.verdict is Verdict.ERROR
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(60 / (2 * np.pi), "rpm"), (1 / (2 * np.pi), "rev/s")])
+def test_rotor_speeds_in_other_units(clean: Recording, factor: float, unit: str) -> None:
+    found = check(inspect(changed(clean, "rotor_speed", lambda v: v * factor), PELICAN), "hover")
+    assert found.verdict is Verdict.ERROR
+    assert unit in found.message
+
+
+def test_the_wrong_vehicle_is_an_error_of_hover(clean: Recording) -> None:
+    found = check(inspect(clean, Vehicle.shipped("hexacopter")), "hover")
+    assert found.verdict is Verdict.ERROR
+    assert "4 rotor columns" in found.message
+
+
+@pytest.mark.parametrize("kind", ["csv", "mcap", "ulog", "dataflash", "tlog"])
+def test_what_is_missing_is_named_with_the_way_to_log_it(kind: str) -> None:
+    t = np.arange(0.0, 10.0, 0.02)
+    nothing = replace(FLIGHT.at({"attitude": t}), format=kind)
+    found = inspect(nothing)
+    assert [m.channel for m in found.missing] == ["rotor", "gyro", "accel"]
+    assert all(m.how and m.why for m in found.missing)
+    assert not any(p.possible for p in found.parameters)
+    assert not found.usable
+    slow = replace(FLIGHT.at({"gyro": t, "accel": t, "attitude": t, "rotor_speed": t[::5]}), format=kind)
+    found = inspect(slow)
+    assert "10 Hz is too slow" in found.missing[0].why
+    assert [p.parameter for p in found.parameters if p.possible] == ["b"]
+
+
+def test_flying_spans_leave_out_the_ground(clean: Recording) -> None:
+    t = clean.channels["rotor_speed"].t
+    idle = (t < 4.0) | (t > 15.0)
+
+    def landed(speed: FloatArray) -> FloatArray:
+        return np.where(idle[:, None], 60.0, speed)
+
+    (span,) = inspect(changed(clean, "rotor_speed", landed), PELICAN).flying
+    np.testing.assert_allclose(span, (4.0, 15.0), atol=0.03)
+    command = Channel(
+        "motor_command", t, np.where(idle[:, None], 1050.0, 1500.0 + 20 * np.sin(t)[:, None] + np.zeros(4))
+    )
+    pulses = replace(clean, channels={"gyro": clean.channels["gyro"], "motor_command": command})
+    (span,) = inspect(pulses).flying
+    np.testing.assert_allclose(span, (4.0, 15.0), atol=0.03)
+    armed = replace(command, values=np.full((len(t), 4), 1100.0))
+    assert inspect(replace(pulses, channels={"motor_command": armed})).flying == ()
+
+
+def test_lying_on_the_back_with_turning_motors_is_no_flight(clean: Recording) -> None:
+    late = clean.channels["accel"].t > 12.0
+    crashed = changed(clean, "accel", lambda v: np.where(late[:, None], [0.0, 3.0, 9.0], v))
+    (span,) = inspect(crashed, PELICAN).flying
+    assert span[1] == pytest.approx(12.0, abs=0.6)
+
+
+def test_stuck_clipped_and_jumping_sensors(clean: Recording) -> None:
+    def stuck(v: FloatArray) -> FloatArray:
+        out = v.copy()
+        out[300:400] = out[300]
+        return out
+
+    found = inspect(changed(clean, "gyro", stuck))
+    assert check(found, "stuck").message.startswith("gyro: does not change for 2 s")
+    clipped = inspect(changed(clean, "gyro", lambda v: np.clip(v, -0.8, 0.8)))
+    assert "at the limit" in check(clipped, "saturated").message
+    broken = inspect(replace(clean, breaks=(5.0,)))
+    assert "1 breaks" in check(broken, "clock").message
+
+
+def test_faults_of_the_reader_are_counted(clean: Recording) -> None:
+    gyro = replace(clean.channels["gyro"], faults={"duplicate": 3, "not_finite": 2})
+    found = inspect(replace(clean, channels={**clean.channels, "gyro": gyro}))
+    assert check(found, "clock").numbers["duplicate"] == 3.0
+    assert next(c for c in found.channels if c.name == "gyro").dropped == {"duplicate": 3, "not_finite": 2}
+
+
+def test_json_holds_only_what_json_knows(clean: Recording) -> None:
+    rows = ({"name": "b", "relative_sigma": 0.01},)
+    data = inspect(clean, PELICAN, rows).to_dict()
+    text = json.dumps(data, allow_nan=False)
+    assert json.loads(text)["schema"] == "quadid.inspect/1"
+    assert data["excitation"] == [{"name": "b", "relative_sigma": 0.01}]
+    assert data["checks"][0]["verdict"] == "ok"
+    single = Recording("one", "csv", {"battery": Channel("battery", np.array([1.0]), np.array([[12.0]]))})
+    assert inspect(single).to_dict()["channels"][0]["rate"] is None
+
+
+def test_axis_fits_find_any_signed_permutation() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(400, 3)) * [1.0, 2.0, 0.5]
+    y = 2.5 * x[:, [2, 0, 1]] * [1.0, -1.0, -1.0] + 0.01 * rng.normal(size=(400, 3))
+    fit = fit_axes(x, y)
+    assert (fit.axes, fit.signs) == ((2, 0, 1), (1, -1, -1))
+    assert fit.scale == pytest.approx(2.5, rel=1e-2)
+    assert fit.r2 > 0.99
+
+
+@pytest.mark.parametrize(
+    ("log", "vehicle"),
+    [
+        ("nanodrone/chirp_run1.csv", "nanodrone/vehicle.yaml"),
+        ("crazyflie_rpm/figure8_30.csv", "crazyflie_rpm/vehicle.yaml"),
+        ("crazyflie_rpm/figure8_27_pwm.csv", "crazyflie_rpm/vehicle_pwm.yaml"),
+        ("cases/case_014/train.csv", "cases/case_014/vehicle.yaml"),
+        ("mcap/crazyflie_rollpitch.mcap", "crazyflie_rpm/vehicle_pwm.yaml"),
+    ],
+)
+def test_real_flights_are_believed_and_their_motors_in_order(data_dir: Path, log: str, vehicle: str) -> None:
+    found = inspect(open_log(data_dir / log), Vehicle.from_yaml((data_dir / vehicle).read_text()))
+    assert not [c for c in found.checks if c.verdict is Verdict.ERROR]
+    assert check(found, "motor_order").verdict is Verdict.OK
+    assert found.usable
+
+
+def test_a_crash_ends_the_flight_of_a_real_log(data_dir: Path) -> None:
+    recording = open_log(data_dir / "ardupilot" / "log171.bin")
+    spans = inspect(recording, with_command(PELICAN, kind="pwm", max_speed=800.0)).flying
+    zero = float(recording.channels["gyro"].t[0])
+    assert spans[-1][0] - zero < 83.0
+    assert 216.0 < spans[-1][1] - zero < 230.0
