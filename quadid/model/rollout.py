@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
+from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
-from quadid.model.kernel import LANES, N_STATE
-from quadid.model.rollout_kernel import N_TANGENT, roll_segments
+from quadid.model.rollout_kernel import N_TANGENT, Flight, Needs, needs_of, roll_segments
+from quadid.model.rotor_kernel import rotor_table
+from quadid.model.rows import ALL_MOMENTS, N_STATE
+from quadid.model.simd import LANES, aligned
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -22,16 +28,12 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 """Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
-_VELOCITY_PARAMETERS = [ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.HX, ix.HY, ix.GROUND]
-_BODY_PARAMETERS = [ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ, ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ]
-_FACTOR_PARAMETERS = [ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION]
-_IMU_PARAMETERS = list(range(ix.GBX, ix.MAZ + 1))
-_ROTOR_PARAMETERS = [ix.TAU, ix.DELAY, ix.DEAD_SPEED]
+_TABLES_KEPT = 4
 
 
 @lru_cache(maxsize=1)
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=2, thread_name_prefix="rollout")
+    return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="rollout")
 
 
 @dataclass(frozen=True)
@@ -61,35 +63,16 @@ class Segments:
         return cls(length, lead, starts)
 
 
-@dataclass(frozen=True)
-class _Needs:
-    """Which parts of the model any lane uses."""
-
-    full: bool
-    rotor_lanes: bool
-    factors: bool
-    imu_lag: bool
-    att_delay: bool
-    imu_static: bool
-    ahrs: bool
+_NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 
 
-def _needs(theta: FloatArray, channels: int) -> _Needs:
-    used = np.any(theta != 0.0, axis=0)
-    losses = slice(ix.LOSS, theta.shape[1])
-    vary = np.ptp(theta, axis=0) > 0.0
-    factors = bool(used[_FACTOR_PARAMETERS].any())
-    return _Needs(
-        full=bool(
-            channels > 9 or factors or used[_VELOCITY_PARAMETERS].any() or used[_BODY_PARAMETERS].any()
-        ),
-        rotor_lanes=bool(vary[_ROTOR_PARAMETERS].any() or vary[losses].any()),
-        factors=factors,
-        imu_lag=bool(used[ix.IMU_PERIOD]),
-        att_delay=bool(used[ix.ATT_DELAY]),
-        imu_static=bool(used[_IMU_PARAMETERS].any()),
-        ahrs=bool(used[ix.AHRS_K]),
-    )
+class _Lanes(NamedTuple):
+    """One block: parameter vectors (LANES, size), tangent offsets (12, LANES), needs, and shared rotor moments."""
+
+    theta: FloatArray
+    dx: FloatArray
+    need: Needs
+    table: FloatArray
 
 
 class Rollout:
@@ -120,13 +103,17 @@ class Rollout:
         if window.velocity is not None or window.position is not None:
             self.channels = 15 if window.position is not None else 12
         self.measured, self.valid = _measured(window, self.channels)
+        self._mask = self.valid.astype(np.float64)
+        self._flight = Flight(self.mass, self.reach, window.t0, window.dt, *window.log_span)
+        self._tables: OrderedDict[tuple[float, float, float, bytes], FloatArray] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.window)
 
     def roll(
-        self, segments: Segments, theta: FloatArray, x0: FloatArray, dx: FloatArray | None = None, n_pre: int = 1
-    ) -> tuple[FloatArray, FloatArray]:
+        self, segments: Segments, theta: FloatArray, x0: FloatArray, dx: FloatArray | None = None, n_pre: int = 1,
+        out: tuple[FloatArray, FloatArray] | None = None,
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         """Simulates every segment for every parameter vector.
 
         Args:
@@ -136,43 +123,117 @@ class Rollout:
                 position [m] (NED); shape (segments, 13).
             dx: tangent offset of the initial state of each vector, shape (m, 12); none by default.
             n_pre: rows rolled before the first scored one.
+            out: what an earlier call of the same shapes returned, to be overwritten; spares fresh memory.
 
         Returns:
             Residuals predicted - measured, shape (blocks, segments, length, channels, LANES), vector i at
             [i // LANES, ..., i % LANES] (surplus lanes repeat the last vector; unmeasured samples hold 0), and the
             states one step after each segment, shape (blocks, segments, 13, LANES).
         """
+        m, count = len(theta), len(segments.starts)
+        blocks = -(-m // LANES)
+        shapes = (blocks, count, segments.length, self.channels, LANES), (blocks, count, N_STATE, LANES)
+        residuals, ends = (aligned(shapes[0]), aligned(shapes[1])) if out is None else out
+        if residuals.shape != shapes[0] or ends.shape != shapes[1]:
+            raise ValueError(
+                f"out of shapes {residuals.shape}, {ends.shape}; these arguments need {shapes[0]}, {shapes[1]}"
+            )
+        nothing = np.empty((0, 0)), np.empty((0, 0, 0)), np.empty(0)
+
+        def one(block: int, lanes: _Lanes) -> None:
+            rows = residuals[block].reshape(count, segments.length, -1)
+            self._run(segments, n_pre, x0, lanes, self.channels, *nothing[:2], rows, ends[block], nothing[2])
+
+        self._each_block(segments, n_pre, theta, dx, self.channels, one)
+        return residuals, ends
+
+    def costs(
+        self, segments: Segments, theta: FloatArray, x0: FloatArray, weights: FloatArray, basis: FloatArray,
+        n_pre: int = 1,
+    ) -> FloatArray:  # fmt: skip
+        """Weighted sum of squares of many parameter vectors, initial states eliminated by variable projection.
+
+        For residuals r of a segment, weights W and orthonormal columns Q that span the directions which the initial
+        state opens in W r, the cost is ``|W r|^2 - |Q' W r|^2``, summed over segments.  Golub & Pereyra 1973,
+        doi:10.1137/0710036.  Residuals stay in the processor's cache.
+
+        Args:
+            segments: the cut.
+            theta: parameter vectors, shape (m, size).
+            x0: initial states `n_pre` rows before each segment, shape (segments, 13), as for `roll`.
+            weights: of every row of the window, shape (n, channels): 1 / sigma, 0 where nothing was measured; the
+                first 9, 12 or all channels.
+            basis: shape (segments, length * channels, directions); channel c of sample i at row i * channels + c.
+            n_pre: rows rolled before the first scored one.
+
+        Returns:
+            Costs, shape (m,).
+        """
+        n, channels = weights.shape
+        if n != len(self) or channels not in (9, 12, 15) or channels > self.channels:
+            raise ValueError(f"weights of shape {weights.shape}; allowed: ({len(self)}, 9 to {self.channels})")
+        rows = (len(segments.starts), segments.length * channels)
+        if basis.shape[:2] != rows:
+            raise ValueError(f"basis of shape {basis.shape}; allowed: {rows} and any number of directions")
+        cost = np.zeros((-(-len(theta) // LANES), LANES))
+        weights, basis = np.ascontiguousarray(weights), np.ascontiguousarray(basis)
+        no_residuals, no_ends = np.empty((0, 0, 0)), np.empty((0, 0, 0))
+
+        def one(block: int, lanes: _Lanes) -> None:
+            self._run(segments, n_pre, x0, lanes, channels, weights, basis, no_residuals, no_ends, cost[block])
+
+        self._each_block(segments, n_pre, theta, None, channels, one)
+        return cost.reshape(-1)[: len(theta)]
+
+    def _each_block(
+        self, segments: Segments, n_pre: int, theta: FloatArray, dx: FloatArray | None, channels: int,
+        run: Callable[[int, _Lanes], None],
+    ) -> None:  # fmt: skip
+        """Cuts parameter vectors into blocks of lanes and runs the blocks, several at a time."""
         if not 1 <= n_pre <= segments.lead:
             raise ValueError(f"n_pre = {n_pre}; allowed: 1 to the segments' lead, {segments.lead}")
+        if not np.isfinite(theta).all():
+            vector, entry = np.argwhere(~np.isfinite(theta))[0]
+            raise ValueError(f"theta[{vector}, {entry}] = {theta[vector, entry]}; allowed: finite numbers (see Layout)")
         m = len(theta)
         blocks = -(-m // LANES)
-        take = np.minimum(np.arange(blocks * LANES), m - 1)
-        th = np.ascontiguousarray(theta[take]).reshape(blocks, LANES, -1)
-        offsets = np.zeros((m, N_TANGENT)) if dx is None else dx
-        off = np.ascontiguousarray(offsets[take]).reshape(blocks, LANES, N_TANGENT)
-        count = len(segments.starts)
-        out = np.empty((blocks, count, segments.length, self.channels, LANES))
-        ends = np.empty((blocks, count, N_STATE, LANES))
-
-        def run(block: int) -> None:
-            self._run(segments, n_pre, x0, th[block], off[block], out[block], ends[block])
-
+        th = np.empty((blocks * LANES, theta.shape[1]))
+        th[:m], th[m:] = theta, theta[-1]
+        offsets = np.zeros((blocks * LANES, N_TANGENT))
+        if dx is not None:
+            offsets[:m] = dx
+        lanes = [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]
         if blocks == 1:
-            run(0)
+            run(0, lanes[0])
         else:
-            list(_threads().map(run, range(blocks)))
-        return out, ends
+            list(_threads().map(run, range(blocks), lanes))
+
+    def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
+        need = needs_of(theta, channels)
+        return _Lanes(theta, np.ascontiguousarray(dx.T), need, self._table(theta, need) if need.shared else _NO_TABLE)
+
+    def _table(self, theta: FloatArray, need: Needs) -> FloatArray:
+        """Rotor moments of every step for lanes with the same rotors; kept for the next calls."""
+        key = (theta[0, ix.TAU], theta[0, ix.DELAY], theta[0, ix.DEAD_SPEED], theta[0, ix.LOSS :].tobytes())
+        table = self._tables.get(key)
+        if table is None:
+            w = self.window
+            table = np.empty((len(w), 2 * ALL_MOMENTS))
+            rotor_table(w.rotor_speed, w.sampling == "held", need.delayed, self.geometry, w.dt, theta, table)
+            self._tables[key] = table
+            while len(self._tables) > _TABLES_KEPT:
+                self._tables.popitem(last=False)
+        return table
 
     def _run(
-        self, segments: Segments, n_pre: int, x0: FloatArray, theta: FloatArray, dx: FloatArray, out: FloatArray,
-        ends: FloatArray,
+        self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, channels: int, weights: FloatArray,
+        basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
-        w, need = self.window, _needs(theta, self.channels)
+        w = self.window
         roll_segments(
-            w.rotor_speed, w.sampling == "held", self.geometry, self.mass, self.reach, w.t0, w.dt, w.log_span[0],
-            w.log_span[1], self.measured, segments.starts, n_pre, segments.length, x0, theta.T.ravel(), dx, need.full,
-            need.rotor_lanes, need.factors, need.imu_lag, need.att_delay, need.imu_static, need.ahrs, self.channels,
-            out.reshape(out.shape[0], out.shape[1], -1), ends.reshape(len(ends), -1),
+            w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, self._mask,
+            segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, channels, segments.length, weights, basis,
+            out, ends, cost,
         )  # fmt: skip
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:

@@ -1,275 +1,383 @@
-"""Segment loop of the rollout: simulates every segment for a block of lanes and writes residuals.
+"""Segment loop of the rollout: simulates every segment for one block of lanes; writes residuals or adds up their cost.
 
-Follows the state through rotors, body, AHRS and IMU, and compares it with what was measured.  One whole file, because
-the loop is one pass over time.
+Follows the motion through rotors, body, AHRS and IMU, and compares it with what was measured, one pass over time.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
-from quadid.model.kernel import (
-    C_AHRS,
-    C_EC,
-    C_ECH,
-    C_ES,
-    C_ESH,
-    C_KAP,
-    C_SIG,
-    LANES,
-    N_AGG,
-    N_CONST,
-    N_STATE,
-    RING,
-    _jit,
-    flight_factors,
-    lane_constants,
-    rotors_step,
-    step_core,
-    step_full,
-)
+from quadid.model.kernel import body_constants, flight_factors, step_core, step_full
+from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step, spread_moments
+
+# isort: off
+from quadid.model.rows import (
+    A_G, E_X, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, RES, ROTOR, S_FX, X_P,
+    X_QW, X_QX, X_QY, X_QZ,
+)  # fmt: skip
+from quadid.model.sensor_kernel import (
+    add_tilt_error, compare, compare_motion, delay_attitude, distort_imu, remember_attitude, sensor_constants,
+    start_filter, step_filter, step_tilt_error, use_filter,
+)  # fmt: skip
+
+# isort: on
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit, lane_kernel
 
 FloatArray = NDArray[np.float64]
 
-N_TANGENT = 12
-"""Directions of an initial state: attitude (body rotation vector), rate, velocity, position."""
+N_TANGENT = MAX_TANGENTS
 
 
-@nb.njit(**_jit)
-def _start(x0: FloatArray, dx: FloatArray, x: FloatArray) -> None:
-    """Sets lane states from one segment's initial state (13,) and each lane's tangent offset (LANES, 12)."""
+class Needs(NamedTuple):
+    """Which parts of the model any lane of a block uses.
+
+    Attributes:
+        full: velocity and all effects on the body; else attitude and rate alone.
+        shared: lag, delay, dead speed and losses are the same in all lanes, and their moments are tabled.
+        delayed: commands are delayed.
+        factors: thrust or mass change in flight.
+        imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
+    """
+
+    full: bool
+    shared: bool
+    delayed: bool
+    factors: bool
+    imu_lag: bool
+    att_delay: bool
+    imu_static: bool
+    ahrs: bool
+
+
+_BODY_ENTRIES = (
+    ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.HX, ix.HY, ix.GROUND, ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ,
+    ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ,
+)  # fmt: skip
+_FACTOR_ENTRIES = (ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION)
+_ROTOR_ENTRIES = (ix.TAU, ix.DELAY, ix.DEAD_SPEED)
+
+
+@nb.njit(**jit)
+def _needs_of(theta: FloatArray, channels: int) -> Needs:
+    """Returns what a block of parameter vectors (LANES, size) needs of the model."""
+    full, factors, varied, imu_static = channels > 9, False, False, False
+    delayed, imu_lag, att_delay, ahrs = False, False, False, False
+    for lane in range(len(theta)):
+        for i in _BODY_ENTRIES:
+            full |= theta[lane, i] != 0.0
+        for i in _FACTOR_ENTRIES:
+            factors |= theta[lane, i] != 0.0
+        for i in _ROTOR_ENTRIES:
+            varied |= theta[lane, i] != theta[0, i]
+        for i in range(ix.LOSS, theta.shape[1]):
+            varied |= theta[lane, i] != theta[0, i]
+        for i in range(ix.GBX, ix.LAX):
+            imu_static |= theta[lane, i] != 0.0
+        delayed |= theta[lane, ix.DELAY] > 0.0
+        imu_lag |= theta[lane, ix.IMU_PERIOD] > 0.0
+        att_delay |= theta[lane, ix.ATT_DELAY] > 0.0
+        ahrs |= theta[lane, ix.AHRS_K] != 0.0
+    return Needs(full or factors, not varied, delayed, factors, imu_lag, att_delay, imu_static, ahrs)
+
+
+class Flight(NamedTuple):
+    """Numbers of one window: vehicle's mass [kg], half the smallest rotor distance [m], grid and log span [s]."""
+
+    mass: float
+    reach: float
+    t0: float
+    dt: float
+    span0: float
+    span1: float
+
+
+@nb.njit(**jit)
+def _start(seg: int, x0: FloatArray, dx: FloatArray, s: FloatArray) -> None:
+    """Sets lane states from the initial state x0[seg] (13,) and each lane's tangent offset dx (12, LANES)."""
+    lane_kernel()
+    q0, q1, q2, q3 = x0[seg, 0], x0[seg, 1], x0[seg, 2], x0[seg, 3]
     for lane in range(LANES):
-        a, b, c = 0.5 * dx[lane, 0], 0.5 * dx[lane, 1], 0.5 * dx[lane, 2]
+        a, b, c = 0.5 * dx[0, lane], 0.5 * dx[1, lane], 0.5 * dx[2, lane]
         w = 1.0 / math.sqrt(1.0 + a * a + b * b + c * c)
         a, b, c = a * w, b * w, c * w
-        q0, q1, q2, q3 = x0[0], x0[1], x0[2], x0[3]
-        x[0 * LANES + lane] = q0 * w - q1 * a - q2 * b - q3 * c
-        x[1 * LANES + lane] = q0 * a + q1 * w + q2 * c - q3 * b
-        x[2 * LANES + lane] = q0 * b - q1 * c + q2 * w + q3 * a
-        x[3 * LANES + lane] = q0 * c + q1 * b - q2 * a + q3 * w
-        for i in range(9):
-            x[(4 + i) * LANES + lane] = x0[4 + i] + dx[lane, 3 + i]
-
-
-@nb.njit(**_jit)
-def _filter(con: FloatArray, ec: int, es: int, h: float, u0: FloatArray, u1: FloatArray, y: FloatArray, yd: FloatArray) -> None:
-    """Advances three second-order Butterworth filters by h for input linear from u0 to u1, each (3 * LANES,)."""
-    for i in range(3):
+        s[X_QW + lane] = q0 * w - q1 * a - q2 * b - q3 * c
+        s[X_QX + lane] = q0 * a + q1 * w + q2 * c - q3 * b
+        s[X_QY + lane] = q0 * b - q1 * c + q2 * w + q3 * a
+        s[X_QZ + lane] = q0 * c + q1 * b - q2 * a + q3 * w
+    for i in range(9):
         for lane in range(LANES):
-            slope = (u1[i * LANES + lane] - u0[i * LANES + lane]) / h
-            kappa, sigma, c, s = con[C_KAP * LANES + lane], con[C_SIG * LANES + lane], con[ec * LANES + lane], con[es * LANES + lane]
-            z = y[i * LANES + lane] - (u0[i * LANES + lane] - slope * kappa)
-            zd = yd[i * LANES + lane] - slope
-            # The homogeneous solution at h; kappa = 1 / sigma.
-            y[i * LANES + lane] = u1[i * LANES + lane] - slope * kappa + z * (c + s) + zd * s * kappa
-            yd[i * LANES + lane] = slope + zd * (c - s) - 2.0 * sigma * z * s
+            s[X_P + i * LANES + lane] = x0[seg, 4 + i] + dx[3 + i, lane]
+    for i in range(3 * LANES):
+        s[E_X + i] = 0.0
 
 
-@nb.njit(**_jit)
-def _ahrs(dt: float, con: FloatArray, x: FloatArray, acc: FloatArray, e: FloatArray) -> None:
-    """Advances the AHRS tilt error e (3 * LANES,): it turns towards the accelerometer's level with gain k."""
+@nb.njit(**jit)
+def _settle_force(s: FloatArray) -> None:
+    """Without a step before it, the first mean force is that of the first half step."""
+    for i in range(3 * LANES):
+        s[S_FX + i] = s[F1_X + i]
+
+
+@nb.njit(**jit)
+def _copy(source: FloatArray, target: FloatArray) -> None:
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+# Rows are written out one by one below: a short loop over them would be unrolled first and then never be vectorised.
+
+
+@nb.njit(**jit)
+def _deliver(seg: int, row: int, k: int, mask: FloatArray, s: FloatArray, out: FloatArray) -> None:
+    """Writes the residuals of sample k, 0 where nothing was measured, to out[seg, row] (channels * LANES,)."""
+    lane_kernel()
     for lane in range(LANES):
-        qw, qx, qy, qz = x[0 * LANES + lane], x[1 * LANES + lane], x[2 * LANES + lane], x[3 * LANES + lane]
-        gx, gy, gz = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
-        ex, ey, ez = e[0 * LANES + lane], e[1 * LANES + lane], e[2 * LANES + lane]
-        hx, hy, hz = gx - (ey * gz - ez * gy), gy - (ez * gx - ex * gz), gz - (ex * gy - ey * gx)
-        sx = 0.5 * (acc[0 * LANES + lane] + acc[(1 * 3 + 0) * LANES + lane])
-        sy = 0.5 * (acc[1 * LANES + lane] + acc[(1 * 3 + 1) * LANES + lane])
-        sz = 0.5 * (acc[2 * LANES + lane] + acc[(1 * 3 + 2) * LANES + lane])
-        k = -con[C_AHRS * LANES + lane] / math.sqrt(sx * sx + sy * sy + sz * sz + 1e-9)
-        p, q, r = x[4 * LANES + lane], x[5 * LANES + lane], x[6 * LANES + lane]
-        e[0 * LANES + lane] = ex + dt * (k * (sy * hz - sz * hy) - (q * ez - r * ey))
-        e[1 * LANES + lane] = ey + dt * (k * (sz * hx - sx * hz) - (r * ex - p * ez))
-        e[2 * LANES + lane] = ez + dt * (k * (sx * hy - sy * hx) - (p * ey - q * ex))
+        out[seg, row, lane] = mask[k, 0] * s[RES + lane]
+        out[seg, row, LANES + lane] = mask[k, 1] * s[RES + LANES + lane]
+        out[seg, row, 2 * LANES + lane] = mask[k, 2] * s[RES + 2 * LANES + lane]
+        out[seg, row, 3 * LANES + lane] = mask[k, 3] * s[RES + 3 * LANES + lane]
+        out[seg, row, 4 * LANES + lane] = mask[k, 4] * s[RES + 4 * LANES + lane]
+        out[seg, row, 5 * LANES + lane] = mask[k, 5] * s[RES + 5 * LANES + lane]
+        out[seg, row, 6 * LANES + lane] = mask[k, 6] * s[RES + 6 * LANES + lane]
+        out[seg, row, 7 * LANES + lane] = mask[k, 7] * s[RES + 7 * LANES + lane]
+        out[seg, row, 8 * LANES + lane] = mask[k, 8] * s[RES + 8 * LANES + lane]
+    for c in range(9, mask.shape[1]):
+        for lane in range(LANES):
+            out[seg, row, c * LANES + lane] = mask[k, c] * s[RES + c * LANES + lane]
 
 
-@nb.njit(**_jit)
-def _delayed_attitude(
-    k: int, first: int, dt: float, theta: FloatArray, ring_q: FloatArray, ring_w: FloatArray, out: FloatArray
-) -> None:
-    """Attitude at t_k - delay from the ring of past states; before `first` the oldest state is extrapolated."""
-    for lane in range(LANES):
-        steps = max(theta[ix.ATT_DELAY * LANES + lane], 0.0) / dt
-        j = min(int(math.floor(steps)), RING - 2)
-        back = max(k - j, first)
-        h = (steps - (k - back)) * dt
-        slot, prev = back % RING, max(back - 1, first) % RING
-        phi = np.empty(3)
-        for i in range(3):
-            rate = (ring_w[slot, i * LANES + lane] - ring_w[prev, i * LANES + lane]) / dt
-            phi[i] = -0.5 * (ring_w[slot, i * LANES + lane] * h - 0.5 * rate * h * h)
-        w = 1.0 / math.sqrt(1.0 + phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
-        a, b, c = phi[0] * w, phi[1] * w, phi[2] * w
-        q0, q1, q2, q3 = ring_q[slot, 0 * LANES + lane], ring_q[slot, 1 * LANES + lane], ring_q[slot, 2 * LANES + lane], ring_q[slot, 3 * LANES + lane]
-        out[0 * LANES + lane] = q0 * w - q1 * a - q2 * b - q3 * c
-        out[1 * LANES + lane] = q0 * a + q1 * w + q2 * c - q3 * b
-        out[2 * LANES + lane] = q0 * b - q1 * c + q2 * w + q3 * a
-        out[3 * LANES + lane] = q0 * c + q1 * b - q2 * a + q3 * w
-
-
-@nb.njit(**_jit)
-def _compare(
-    k: int, theta: FloatArray, wm: FloatArray, fm: FloatArray, qm: FloatArray, e: FloatArray,
-    meas: FloatArray, with_imu: bool, with_ahrs: bool, out: FloatArray,
+@nb.njit(**jit)
+def _collect(
+    seg: int, row: int, k: int, weights: FloatArray, basis: FloatArray, s: FloatArray, total: FloatArray,
+    inside: FloatArray,
 ) -> None:  # fmt: skip
-    """Writes predicted minus measured at sample k: gyro, attitude (body rotation vector), accel.
+    """Adds the weighted residuals of sample k to their sum of squares and to their components along the basis.
 
     Args:
-        k: row of `meas`.
-        theta: (size * LANES,), for IMU scale, misalignment and bias.
-        wm, fm: rate and specific force reaching the IMU (3 * LANES,).
-        qm: attitude the AHRS reports (4 * LANES,), before its tilt error `e` (3 * LANES,).
-        meas: (n, 16): gyro 3, quaternion 4, accel 3, velocity 3, position 3.
-        out: (at least 9 * LANES,).
+        seg: segment.
+        row: its scored row.
+        k: row of the window.
+        weights: (n, channels).
+        basis: (segments, length * channels, directions).
+        s: rows.
+        total: sum of squares (LANES,), added to.
+        inside: components (directions, LANES), added to.
     """
+    lane_kernel()
+    channels = weights.shape[1]
+    at = row * channels
     for lane in range(LANES):
-        w0, w1, w2 = wm[0 * LANES + lane], wm[1 * LANES + lane], wm[2 * LANES + lane]
-        f0, f1, f2 = fm[0 * LANES + lane], fm[1 * LANES + lane], fm[2 * LANES + lane]
-        if with_imu:
-            mx, my, mz = theta[ix.MAX_ * LANES + lane], theta[ix.MAY * LANES + lane], theta[ix.MAZ * LANES + lane]
-            # v_sensor = exp([m]x) v_body, to second order in the angle
-            a0, a1, a2 = my * w2 - mz * w1, mz * w0 - mx * w2, mx * w1 - my * w0
-            w0 += a0 + 0.5 * (my * a2 - mz * a1)
-            w1 += a1 + 0.5 * (mz * a0 - mx * a2)
-            w2 += a2 + 0.5 * (mx * a1 - my * a0)
-            a0, a1, a2 = my * f2 - mz * f1, mz * f0 - mx * f2, mx * f1 - my * f0
-            f0 += a0 + 0.5 * (my * a2 - mz * a1)
-            f1 += a1 + 0.5 * (mz * a0 - mx * a2)
-            f2 += a2 + 0.5 * (mx * a1 - my * a0)
-            w0 = w0 * (1.0 + theta[ix.GSX * LANES + lane]) + theta[ix.GBX * LANES + lane]
-            w1 = w1 * (1.0 + theta[ix.GSY * LANES + lane]) + theta[ix.GBY * LANES + lane]
-            w2 = w2 * (1.0 + theta[ix.GSZ * LANES + lane]) + theta[ix.GBZ * LANES + lane]
-            f0 += theta[ix.ABX * LANES + lane]
-            f1 += theta[ix.ABY * LANES + lane]
-            f2 += theta[ix.ABZ * LANES + lane]
-        out[0 * LANES + lane], out[1 * LANES + lane], out[2 * LANES + lane] = w0 - meas[k, 0], w1 - meas[k, 1], w2 - meas[k, 2]
-        m0, m1, m2, m3 = meas[k, 3], meas[k, 4], meas[k, 5], meas[k, 6]
-        q0, q1, q2, q3 = qm[0 * LANES + lane], qm[1 * LANES + lane], qm[2 * LANES + lane], qm[3 * LANES + lane]
-        sign = 2.0 if m0 * q0 + m1 * q1 + m2 * q2 + m3 * q3 >= 0.0 else -2.0
-        out[3 * LANES + lane] = sign * (m0 * q1 - m1 * q0 - m2 * q3 + m3 * q2)
-        out[4 * LANES + lane] = sign * (m0 * q2 + m1 * q3 - m2 * q0 - m3 * q1)
-        out[5 * LANES + lane] = sign * (m0 * q3 - m1 * q2 + m2 * q1 - m3 * q0)
-        out[6 * LANES + lane], out[7 * LANES + lane], out[8 * LANES + lane] = f0 - meas[k, 7], f1 - meas[k, 8], f2 - meas[k, 9]
-    if with_ahrs:
-        for i in range(3):
+        s[RES + lane] *= weights[k, 0]
+        s[RES + LANES + lane] *= weights[k, 1]
+        s[RES + 2 * LANES + lane] *= weights[k, 2]
+        s[RES + 3 * LANES + lane] *= weights[k, 3]
+        s[RES + 4 * LANES + lane] *= weights[k, 4]
+        s[RES + 5 * LANES + lane] *= weights[k, 5]
+        s[RES + 6 * LANES + lane] *= weights[k, 6]
+        s[RES + 7 * LANES + lane] *= weights[k, 7]
+        s[RES + 8 * LANES + lane] *= weights[k, 8]
+        r0, r1, r2 = s[RES + lane], s[RES + LANES + lane], s[RES + 2 * LANES + lane]
+        r3, r4, r5 = s[RES + 3 * LANES + lane], s[RES + 4 * LANES + lane], s[RES + 5 * LANES + lane]
+        r6, r7, r8 = s[RES + 6 * LANES + lane], s[RES + 7 * LANES + lane], s[RES + 8 * LANES + lane]
+        total[lane] += r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3 + r4 * r4 + r5 * r5 + r6 * r6 + r7 * r7 + r8 * r8
+    for j in range(basis.shape[2]):
+        b0, b1, b2 = basis[seg, at, j], basis[seg, at + 1, j], basis[seg, at + 2, j]
+        b3, b4, b5 = basis[seg, at + 3, j], basis[seg, at + 4, j], basis[seg, at + 5, j]
+        b6, b7, b8 = basis[seg, at + 6, j], basis[seg, at + 7, j], basis[seg, at + 8, j]
+        for lane in range(LANES):
+            rate = b0 * s[RES + lane] + b1 * s[RES + LANES + lane] + b2 * s[RES + 2 * LANES + lane]
+            turn = b3 * s[RES + 3 * LANES + lane] + b4 * s[RES + 4 * LANES + lane] + b5 * s[RES + 5 * LANES + lane]
+            force = b6 * s[RES + 6 * LANES + lane] + b7 * s[RES + 7 * LANES + lane] + b8 * s[RES + 8 * LANES + lane]
+            inside[j, lane] += rate + turn + force
+    if channels > 9:
+        for lane in range(LANES):
+            s[RES + 9 * LANES + lane] *= weights[k, 9]
+            s[RES + 10 * LANES + lane] *= weights[k, 10]
+            s[RES + 11 * LANES + lane] *= weights[k, 11]
+            r0, r1, r2 = s[RES + 9 * LANES + lane], s[RES + 10 * LANES + lane], s[RES + 11 * LANES + lane]
+            total[lane] += r0 * r0 + r1 * r1 + r2 * r2
+        for j in range(basis.shape[2]):
+            b0, b1, b2 = basis[seg, at + 9, j], basis[seg, at + 10, j], basis[seg, at + 11, j]
             for lane in range(LANES):
-                out[(3 + i) * LANES + lane] += e[i * LANES + lane]
+                inside[j, lane] += (
+                    b0 * s[RES + 9 * LANES + lane] + b1 * s[RES + 10 * LANES + lane] + b2 * s[RES + 11 * LANES + lane]
+                )
+    if channels > 12:
+        for lane in range(LANES):
+            s[RES + 12 * LANES + lane] *= weights[k, 12]
+            s[RES + 13 * LANES + lane] *= weights[k, 13]
+            s[RES + 14 * LANES + lane] *= weights[k, 14]
+            r0, r1, r2 = s[RES + 12 * LANES + lane], s[RES + 13 * LANES + lane], s[RES + 14 * LANES + lane]
+            total[lane] += r0 * r0 + r1 * r1 + r2 * r2
+        for j in range(basis.shape[2]):
+            b0, b1, b2 = basis[seg, at + 12, j], basis[seg, at + 13, j], basis[seg, at + 14, j]
+            for lane in range(LANES):
+                inside[j, lane] += (
+                    b0 * s[RES + 12 * LANES + lane] + b1 * s[RES + 13 * LANES + lane] + b2 * s[RES + 14 * LANES + lane]
+                )
 
 
-@nb.njit(**_jit)
-def roll_segments(
-    u: FloatArray, held: bool, geometry: FloatArray, mass: float, reach: float, t0: float, dt: float,
-    span0: float, span1: float, meas: FloatArray, starts: NDArray[np.int64], n_pre: int, n_seg: int, x0: FloatArray,
-    theta: FloatArray, dx: FloatArray, full: bool, rotor_lanes: bool, factors: bool, imu_lag: bool, att_delay: bool,
-    imu_static: bool, ahrs: bool, channels: int, out: FloatArray, ends: FloatArray,
+@nb.njit(**jit)
+def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
+    """Adds a segment's cost, sum of squares less squared components, to `cost` (LANES,); empties the sums."""
+    lane_kernel()
+    for lane in range(LANES):
+        cost[lane] += total[lane]
+        total[lane] = 0.0
+    for j in range(len(inside)):
+        for lane in range(LANES):
+            cost[lane] -= inside[j, lane] * inside[j, lane]
+            inside[j, lane] = 0.0
+
+
+@nb.njit(**jit)
+def _march(
+    u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
+    mask: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs, channels: int,
+    n_seg: int, weights: FloatArray, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
+    s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray, total: FloatArray, inside: FloatArray,
+) -> None:  # fmt: skip
+    """The loop over segments and steps of `roll_segments`, with its work space."""
+    dt = flight.dt
+    sums = len(weights) > 0
+    steps = n_pre + n_seg
+    turned = 0  # rotor steps already taken
+    for seg in range(len(starts)):
+        first = starts[seg] - n_pre
+        following = starts[seg + 1] - n_pre if seg + 1 < len(starts) else -1
+        if not need.shared:
+            if turned > first:
+                _copy(ahead, rot)
+            for k in range(turned, first):  # rows no segment covers: rotors still turn
+                rotors_step(u, k, held, need.delayed, geometry, dt, rot, s)
+            turned = first + steps
+        _start(seg, x0, dx, s)
+        for i in range(steps):
+            k = first + i
+            if need.shared:
+                spread_moments(table, k, s)
+            else:
+                if k == following:
+                    _copy(rot, ahead)
+                rotors_step(u, k, held, need.delayed, geometry, dt, rot, s)
+            if need.factors:
+                flight_factors(flight.t0 + dt * k, flight.span0, flight.span1, dt, s)
+            if need.att_delay:
+                remember_attitude(i, s, past)
+            scored = i >= n_pre
+            if scored and channels > 9:
+                compare_motion(k, channels, measured, s)
+            # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
+            if need.full:
+                step_full(dt, s)
+            else:
+                step_core(dt, s)
+            if i == 0:
+                _settle_force(s)
+            if need.imu_lag:
+                if i == 0:
+                    start_filter(dt, s)
+                else:
+                    step_filter(dt, s)
+                use_filter(s)
+            if scored:
+                if need.att_delay:
+                    delay_attitude(i, dt, past, s)
+                if need.imu_static:
+                    distort_imu(s)
+                compare(k, measured, s)
+                if need.ahrs:
+                    add_tilt_error(s)
+                    step_tilt_error(dt, s)
+                if sums:
+                    _collect(seg, i - n_pre, k, weights, basis, s, total, inside)
+                else:
+                    _deliver(seg, i - n_pre, k, mask, s, out)
+        if sums:
+            _settle(total, inside, cost)
+        else:
+            for c in range(N_STATE):
+                for lane in range(LANES):
+                    ends[seg, c, lane] = s[X_QW + c * LANES + lane]
+
+
+@nb.njit(**allocating)
+def _roll_segments(
+    u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
+    mask: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray, dx: FloatArray,
+    need: Needs, channels: int, n_seg: int, weights: FloatArray, basis: FloatArray, out: FloatArray, ends: FloatArray,
+    cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
 
+    Each segment starts from its own initial state, `n_pre` steps before its first scored sample, and ends one step
+    after the last, because a logged acceleration is the mean over one sample centred on its time.  Rotor speeds do not
+    depend on the vehicle's state; they run through the whole window.
+
     Args:
-        u: rotor input (n, rotors) [rad/s]; `held` or linear between samples.
+        u: rotor input (n, rotors) [rad/s].
+        held: the input acts held, else linear between samples.
         geometry: (rotors, 3): x, y [m], spin.
-        mass: [kg]; reach: half the smallest rotor distance [m].
-        t0, dt: grid [s]; span0, span1: first and last time of the log [s].
-        meas: measured (n, 16), see `_compare`.
-        starts: first scored row of each segment; rows start - n_pre to start + n_seg must exist.
+        flight: numbers of the window.
+        table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
+        measured: (n, 16), see `compare`.
+        mask: (n, channels), 1 where measured, else 0.
+        starts: first scored row of each segment, rising; rows start - n_pre to start + n_seg must exist.
         n_pre: steps rolled before the first scored row, at least 1.
-        n_seg: scored rows a segment.
         x0: initial state at start - n_pre, (segments, 13).
-        theta: parameter vectors (size * LANES,); dx: tangent offsets of the initial state (LANES, 12).
-        full .. ahrs: which parts of the model any lane needs.
+        theta: parameter vectors (LANES, size).
+        dx: tangent offsets of the initial state (12, LANES).
+        need: which parts of the model any lane needs.
         channels: 9, 12 with velocity, 15 with position too.
-        out: residuals (segments, n_seg, channels * LANES), written.
-        ends: states one step after the last scored row (segments, 13 * LANES), written.
+        n_seg: scored rows a segment.
+        weights: see `_collect`; none to write residuals instead.
+        basis: see `_collect`.
+        out: residuals (segments, n_seg, channels * LANES), written unless there are weights.
+        ends: states one step after the last scored row (segments, 13, LANES), written unless there are weights.
+        cost: (LANES,), added to where there are weights.
     """
-    rotors = u.shape[1]
-    con = np.empty(N_CONST * LANES)
-    lane_constants(theta, mass, rotors, dt, reach, con)
-    w, inputs = np.empty(rotors * LANES), np.empty(6 * LANES)
-    for r in range(rotors):
-        for lane in range(LANES):
-            w[r * LANES + lane] = u[0, r]
-    total = n_pre + n_seg + 1
-    agg = np.ones((total, 2 * N_AGG * LANES))  # the factors of thrust and mass stay 1 unless asked for
-    x = np.empty(N_STATE * LANES)
-    acc = np.zeros(6 * LANES)
-    before = np.zeros(3 * LANES)
-    fm, wm, qm = np.empty(3 * LANES), np.empty(3 * LANES), np.empty(4 * LANES)
-    e = np.zeros(3 * LANES)
-    gy, gyd, ay, ayd = np.empty(3 * LANES), np.empty(3 * LANES), np.empty(3 * LANES), np.empty(3 * LANES)
-    f_prev, f_mid, w_prev = np.empty(3 * LANES), np.empty(3 * LANES), np.empty(3 * LANES)
-    ring_q, ring_w = np.empty((RING, 4 * LANES)), np.empty((RING, 3 * LANES))
-    done = 0  # rotor steps already taken
-    for seg in range(len(starts)):
-        first = starts[seg] - n_pre
-        kept = max(done - first, 0)
-        for i in range(kept):
-            agg[i] = agg[total - kept + i]
-        for k in range(done, first):  # rows no segment covers: rotors still turn
-            rotors_step(u, k, held, con, geometry, dt, w, agg[0], inputs, rotor_lanes)
-        for i in range(kept, total):
-            rotors_step(u, first + i, held, con, geometry, dt, w, agg[i], inputs, rotor_lanes)
-            if factors:
-                flight_factors(t0 + dt * (first + i), span0, span1, dt, con, agg[i])
-        done = first + total
-        _start(x0[seg], dx, x)
-        e[:] = 0.0
-        for i in range(total):
-            k = first + i
-            for c in range(3):
-                for lane in range(LANES):
-                    wm[c * LANES + lane] = x[(4 + c) * LANES + lane]
-            for c in range(4):
-                for lane in range(LANES):
-                    qm[c * LANES + lane] = x[c * LANES + lane]
-            if att_delay:
-                ring_q[k % RING], ring_w[k % RING] = qm, wm
-            # The step from t_k gives the first half of the accelerometer's mean at t_k; the previous gave the other.
-            scored = i >= n_pre and i < n_pre + n_seg
-            if i == total - 1:
-                for c in range(N_STATE):
-                    for lane in range(LANES):
-                        ends[seg, c * LANES + lane] = x[c * LANES + lane]
-                break
-            if scored and channels > 9:
-                for c in range(channels - 9):
-                    for lane in range(LANES):
-                        out[seg, i - n_pre, (9 + c) * LANES + lane] = x[(7 + c) * LANES + lane] - meas[k, 10 + c]
-            if full:
-                step_full(dt, con, agg[i], x, acc)
-            else:
-                step_core(dt, con, agg[i], x, acc)
-            for c in range(3):
-                for lane in range(LANES):
-                    first_half = acc[c * LANES + lane]
-                    fm[c * LANES + lane] = first_half if i == 0 else 0.5 * (before[c * LANES + lane] + first_half)
-                    before[c * LANES + lane] = acc[(1 * 3 + c) * LANES + lane]
-            if imu_lag:
-                if i == 0:
-                    for c in range(3):
-                        for lane in range(LANES):
-                            slope = (x[(4 + c) * LANES + lane] - wm[c * LANES + lane]) / dt
-                            gy[c * LANES + lane] = wm[c * LANES + lane] - slope * con[C_KAP * LANES + lane]
-                            gyd[c * LANES + lane] = slope
-                            ay[c * LANES + lane], ayd[c * LANES + lane] = fm[c * LANES + lane], 0.0
-                else:
-                    _filter(con, C_EC, C_ES, dt, w_prev, wm, gy, gyd)
-                    _filter(con, C_ECH, C_ESH, 0.5 * dt, f_prev, f_mid, ay, ayd)
-                    _filter(con, C_ECH, C_ESH, 0.5 * dt, f_mid, fm, ay, ayd)
-                for c in range(3):
-                    for lane in range(LANES):
-                        w_prev[c * LANES + lane], f_prev[c * LANES + lane] = wm[c * LANES + lane], fm[c * LANES + lane]
-                        f_mid[c * LANES + lane] = 0.5 * (acc[c * LANES + lane] + acc[(1 * 3 + c) * LANES + lane])
-                        wm[c * LANES + lane], fm[c * LANES + lane] = gy[c * LANES + lane], ay[c * LANES + lane]
-            if scored:
-                if att_delay:
-                    _delayed_attitude(k, first, dt, theta, ring_q, ring_w, qm)
-                _compare(
-                    k, theta, wm, fm, qm, e, meas, imu_static, ahrs, out[seg, i - n_pre]
-                )
-            if ahrs and i >= n_pre:
-                _ahrs(dt, con, x, acc, e)
+    rotors, dt = len(geometry), flight.dt
+    s = cache_aligned(N_ROWS * LANES)
+    s[:] = 0.0
+    s[A_G : A_G + 2 * LANES] = 1.0  # the factors of thrust and mass stay 1 unless asked for
+    s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
+    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    ahead = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    steps = n_pre + n_seg
+    past = cache_aligned(steps * 7 * LANES if need.att_delay else 0).reshape(-1, 7, LANES)
+    total = cache_aligned(LANES)
+    inside = cache_aligned(basis.shape[2] * LANES).reshape(basis.shape[2], LANES)
+    total[:] = 0.0
+    inside[:] = 0.0
+    body_constants(theta, flight.mass, rotors, flight.reach, s)
+    sensor_constants(theta, dt, s)
+    rotor_constants(theta, dt, rot, s)
+    rotors_start(u, rot)
+    _march(
+        u, held, geometry, flight, table, measured, mask, starts, n_pre, x0, dx, need, channels, n_seg, weights, basis,
+        out, ends, cost, s, rot, ahead, past, total, inside,
+    )  # fmt: skip
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def roll_segments(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _roll_segments(*arguments)
+
+    @nb.njit(**cached)
+    def needs_of(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        return _needs_of(*arguments)
+
+    return roll_segments, needs_of
+
+
+roll_segments, needs_of = _on_disk(SOURCES)
