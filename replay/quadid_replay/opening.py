@@ -49,6 +49,8 @@ def _reader(kind: Format) -> Callable[[Path, str], Recording]:
 def _head_and_hash(file: Path) -> tuple[bytes, str]:
     if file.is_dir():
         raise LogError(f"{file} is a directory", ALLOWED, "name one log file; for a folder use `quadid fleet`")
+    if file.exists() and not file.is_file():
+        raise LogError(f"{file} is no regular file", ALLOWED, "copy what it yields to a file first")
     digest = hashlib.sha256()
     head = b""
     try:

@@ -157,5 +157,7 @@ def test_opening_what_is_no_log(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
     with pytest.raises(LogError, match="is a directory"):
         open_log(tmp_path)
+    with pytest.raises(LogError, match="no regular file"):
+        open_log("/dev/zero")
     with pytest.raises(LogError, match="no file"):
         open_log(tmp_path / "absent.csv")

@@ -7,6 +7,7 @@ from io import BytesIO
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import pytest
 import quadid_replay.topic_writer
 import zstandard
@@ -76,3 +77,27 @@ def test_without_summary_everything_before_the_cut_is_read(small_chunks: Path) -
     assert not McapFile(small_chunks).has_summary
     assert any("not readable" in w for w in recording.warnings)
     assert len(recording.channels["gyro"].t) == pytest.approx(200, abs=40)
+
+
+def test_messages_outside_chunks_are_read(tmp_path: Path) -> None:
+    with small_log(tmp_path / "chunked").open("rb") as stream, (tmp_path / "plain").open("wb") as out:
+        reader = make_reader(stream)
+        writer = Writer(out, compression=CompressionType.NONE, use_chunking=False)
+        writer.start(profile="ros2")
+        numbers: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.topic not in numbers:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", kind)
+            writer.add_message(numbers[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    chunked_log, plain = open_log(tmp_path / "chunked"), open_log(tmp_path / "plain")
+    assert plain.warnings == ()
+    for name, kept in chunked_log.channels.items():
+        np.testing.assert_array_equal(plain.channels[name].values, kept.values)
+
+
+def small_log(path: Path) -> Path:
+    write_mcap(path, full_recording(1.0, 50.0))
+    return path
