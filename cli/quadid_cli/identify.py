@@ -96,11 +96,15 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
     """Where the fitted vehicle file goes; raises OutputError when that would overwrite the file it was made from."""
     from quadid_cli.output import OutputError
 
-    name = "".join(c if c.isalnum() or c in "-_+." else "_" for c in vehicle.name).lstrip(".") or "vehicle"
-    path = folder / f"{name}.fitted.yaml"
+    path = folder / f"{file_name(vehicle.name)}.fitted.yaml"
     if path.exists() and Path(given).exists() and path.samefile(given):
         raise OutputError(f"the result would overwrite {given}", "another folder", "give --out, or rename the vehicle")
     return path
+
+
+def file_name(name: str) -> str:
+    """A vehicle's name as part of a file name: letters, digits and ``-_+.`` only."""
+    return "".join(c if c.isalnum() or c in "-_+." else "_" for c in name).lstrip(".")[:100] or "vehicle"
 
 
 def run(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
     from quadid.identify.result import ScoredSet
+    from quadid_cli.diagnose import Diagnosed
     from quadid_cli.loading import Log
 
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
@@ -38,6 +39,19 @@ def identify_html(
         {"name": "vehicle file", "value": result["vehicle_file"]},
     ]
     return render(identify_page(result, sets, fit.noise, [quality(log) for log in logs], rows, truth))
+
+
+def diagnose_html(done: Diagnosed, vehicle: str, seed: int) -> str:
+    """The HTML report of a diagnosis."""
+    from quadid.report.diagnose_page import diagnose_page
+    from quadid.report.page import render
+
+    rows = provenance(done.logs) + [
+        {"name": "seed", "value": str(seed)},
+        {"name": "vehicle file", "value": done.result["vehicle_file"]},
+    ]
+    logs = [quality(log) for log in done.logs]
+    return render(diagnose_page(done.result, vehicle, done.sets, done.noise, logs, rows, done.result["warnings"]))
 
 
 def quality(log: Log) -> dict[str, Any]:

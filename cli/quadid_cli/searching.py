@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     from quadid.window import Window
     from quadid_cli.terminal import Advance
 
-OPTIMIZERS = ("pso_polish", "pso", "initial")
+OPTIMIZERS = (
+    "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
+)  # fmt: skip
+BUDGET = 4000
+"""Simulations of the data that any search but the standard one may spend."""
 
 
 def check_optimizer(name: str) -> None:
@@ -25,10 +29,19 @@ def check_optimizer(name: str) -> None:
 def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance) -> Fit:
     """Identifies the parameters with the search called `name`.
 
-    The sensor noise, which decides intervals and scores, always comes from the polished fit.
+    The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
+    the parameters are where that search ended, not where the standard fit ends.
     """
     from quadid.identify.fit import FitOptions, fit
 
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance)
-    raise ParameterError(f"optimizer '{name}' is not available yet")
+    from quadid.baselines.optimisers import minimise
+    from quadid.identify.at_point import fit_at
+    from quadid.identify.box import BoxProblem
+
+    standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
+    advance(name, 0.0)
+    problem = BoxProblem(windows, vehicle)
+    found = minimise(name, problem.cost, problem.start, problem.lower, problem.upper, BUDGET, seed, problem.residual)
+    return fit_at(windows, vehicle, problem.theta(found.x), standard.noise, found.evaluations, str(found.stop))

@@ -114,3 +114,28 @@ def print_horizons(console: Console, result: JsonDict) -> None:
         total = entry["sum"]
         table.add_row("", f"sum 1..{total['to']}", *(number(total[n]) for n in QUANTITIES), end_section=True)
     console.print(table)
+
+
+def print_findings(console: Console, findings: Sequence[JsonDict]) -> None:
+    """Prints every named cause with its numbers, what it gains on unseen data, and the best look-alike."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title="What the simulation gets wrong (error on unseen data in noise variances, 1 = noise floor)")
+    for heading in ("cause", "value", "95 % interval", "error without", "with", "best look-alike"):
+        table.add_column(heading, justify="right" if heading in ("error without", "with") else "left")
+    for finding in findings:
+        rival = min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
+        name = Text(finding["effect"], style="" if finding["confident"] else "yellow")
+        for i, p in enumerate(finding["parameters"]):
+            low, high = p["ci95"]
+            first = i == 0
+            table.add_row(
+                name if first else "",
+                f"{p['name']} = {number(p['value'])} {p['unit']}".rstrip(),
+                f"{number(low)} .. {number(high)}",
+                number(finding["gain"]["mse_before"], 3) if first else "",
+                number(finding["gain"]["mse_after"], 3) if first else "",
+                f"{rival['effect']} ({number(rival['mse_after'], 3)})" if first and rival else "",
+            )
+    console.print(table)

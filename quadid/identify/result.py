@@ -103,7 +103,7 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
     values = {p.name: p for p in parameters if p.name in ("J_xx", "J_yy", "J_zz")}
     if len(values) < 3 or any(p.status is Status.PRIOR_DOMINATED for p in values.values()):
         return []
-    why = impossible_inertia([values[n].value for n in ("J_xx", "J_yy", "J_zz")], slack=1.05)
+    why = impossible_inertia([values[n].value for n in ("J_xx", "J_yy", "J_zz")], slack=1.3)
     if why is None:
         return []
     return [

@@ -26,6 +26,8 @@ GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
     "velocity": ("Velocity", (9, 10, 11)),
     "position": ("Position", (12, 13, 14)),
 }
+PARAMETERS = ("current parameters", "proposed parameters")
+MODELS = ("model without the findings", "model with the findings")
 LABELS = {"phi": "φ", "theta": "θ", "psi": "ψ"}
 WHOLE_POINTS = 800
 """Points a trace over a whole log keeps at most."""
@@ -58,16 +60,18 @@ def short(values: FloatArray, resolution: float | None = None) -> list[float | N
     return [round(v, decimals) if math.isfinite(v) else None for v in values.tolist()]
 
 
-def channel_figures(scored: ScoredSet, prefix: str, logs: int = 1) -> list[JsonDict]:
+def channel_figures(
+    scored: ScoredSet, prefix: str, logs: int = 1, labels: tuple[str, str] = PARAMETERS
+) -> list[JsonDict]:
     """Measured and simulated outputs of one log, one figure a group of channels: the whole log and its liveliest part.
 
     Args:
         scored: the log with both scores.
         prefix: makes the figures' identifiers unique.
         logs: number of logs that share the page.
+        labels: what the two simulations are called.
     """
     series = scored.fitted.series
-    zero = float(series.t[0])
     share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + DETAIL_POINTS)))
     whole = _thinned(series.measured, int(share * WHOLE_POINTS))
     detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
@@ -76,18 +80,18 @@ def channel_figures(scored: ScoredSet, prefix: str, logs: int = 1) -> list[JsonD
         here = [c for c in channels if c < series.measured.shape[1] and np.isfinite(series.measured[:, c]).any()]
         if here:
             views = [
-                {"label": "Liveliest part, every sample", **_stack(scored, detail, here, zero)},
-                {"label": "Whole log", **_stack(scored, whole, here, zero)},
+                {"label": "Liveliest part, every sample", **_stack(scored, detail, here, labels)},
+                {"label": "Whole log", **_stack(scored, whole, here, labels)},
             ]
             shown = views if len(whole) > len(detail) else views[1:]
             out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
     return out
 
 
-def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], zero: float) -> JsonDict:
+def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], labels: tuple[str, str]) -> JsonDict:
     """Channels above each other with one time axis."""
     after, before = scored.fitted.series, scored.initial.series
-    t = after.t[rows] - zero
+    t = after.t[rows] - after.t[0]
     data, layout = [], dict[str, Any]()
     for i, c in enumerate(channels):
         axis = "" if i == 0 else str(i + 1)
@@ -96,8 +100,8 @@ def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], z
         low, high = _focus(measured)
         for role, label, y in (
             ("measured", "measured", measured),
-            ("before", "current parameters", before.simulated[rows, c]),
-            ("after", "proposed parameters", after.simulated[rows, c]),
+            ("before", labels[0], before.simulated[rows, c]),
+            ("after", labels[1], after.simulated[rows, c]),
         ):
             # A poor first guess may run far away; what leaves the picture need not be kept.
             inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
@@ -152,13 +156,13 @@ def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) ->
     return np.arange(first, first + width)
 
 
-def error_figure(scored: ScoredSet, identifier: str) -> JsonDict:
+def error_figure(scored: ScoredSet, identifier: str, labels: tuple[str, str] = PARAMETERS) -> JsonDict:
     """Error over time: mean squared residual of each second over that of a perfect model, before and after."""
     zero = float(scored.fitted.series.t[0])
     data = []
     for role, name, score in (
-        ("before", "current parameters", scored.initial),
-        ("after", "proposed parameters", scored.fitted),
+        ("before", labels[0], scored.initial),
+        ("after", labels[1], scored.fitted),
     ):
         t, ratio = error_over_time(score, scored.fitted)
         data.append(trace(role, name, t - zero, ratio))
@@ -224,3 +228,28 @@ def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str
         "views": views,
         "height": 60 + 38 * len(names) + 60,
     }
+
+
+def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> JsonDict:
+    """Error on unseen data with the finding, with each look-alike in its place, and without either.
+
+    Args:
+        finding: of the form ``quadid.diagnose/1``.
+        floor: noise floor in the same measure.
+        identifier: of the figure.
+    """
+    title = finding["effect"].replace("_", " ")
+    rows = [("without it", finding["gain"]["mse_before"], "before"), (title, finding["gain"]["mse_after"], "after")]
+    rows += [(a["effect"].replace("_", " "), a["mse_after"], "measured") for a in finding["alternatives"]]
+    data = [
+        {"role": role, "name": name, "type": "bar", "orientation": "h", "x": [value], "y": [name], "showlegend": False}
+        for name, value, role in rows[::-1]
+    ]
+    highest = max([v for _, v, _ in rows if v is not None and math.isfinite(v)], default=floor)
+    layout = {
+        "xaxis": {"title": {"text": "squared error / noise on unseen data"}, "range": [0.9 * floor, 1.05 * highest]},
+        "yaxis": {"type": "category"},
+        "hovermode": "closest",
+    }
+    views = [{"label": "", "data": data, "layout": layout}]
+    return {"id": identifier, "title": "What it is worth", "views": views, "height": 90 + 32 * len(rows)}

@@ -22,7 +22,7 @@ def render(page: JsonDict) -> str:
 
     Args:
         page: what the template shows; absent parts are left out.  ``title``, ``subtitle``, ``verdict`` (of
-            `quadid.report.verdict`), ``parameters``, ``parameter_figure``, ``findings``, ``sets``, ``quality``,
+            `quadid.report.verdict`), ``parameters``, ``parameter_figure``, ``diagnoses``, ``sets``, ``quality``,
             ``noise``, ``warnings``, ``provenance``.
     """
     from jinja2 import Environment, StrictUndefined
@@ -43,7 +43,7 @@ def render(page: JsonDict) -> str:
 
 
 _EMPTY: dict[str, Any] = {
-    "subtitle": "", "verdict": None, "parameters": [], "parameter_figure": None, "findings": [], "sets": [],
+    "subtitle": "", "verdict": None, "parameters": [], "parameter_figure": None, "diagnoses": [], "sets": [],
     "quality": [], "noise": [], "warnings": [], "provenance": [],
 }  # fmt: skip
 
@@ -51,7 +51,10 @@ _EMPTY: dict[str, Any] = {
 def all_figures(page: JsonDict) -> dict[str, Any]:
     """Every figure of the page by its identifier."""
     found = [page.get("parameter_figure")]
-    for part in (*page.get("findings", ()), *page.get("sets", ())):
+    parts = list(page.get("sets", ()))
+    for diagnosis in page.get("diagnoses", ()):
+        parts += [*diagnosis["findings"], *diagnosis["logs"]]
+    for part in parts:
         found.extend(part.get("figures", ()))
     return {figure["id"]: figure for figure in found if figure is not None}
 

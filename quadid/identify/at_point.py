@@ -1,0 +1,52 @@
+"""What the data say about the parameters at a point that some other search found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.fit import FIT_SECONDS, Fit
+from quadid.identify.noise import NoiseModel
+from quadid.identify.polish import Convergence, default_prior
+from quadid.identify.score import settle_states
+from quadid.identify.shooting import Shooting
+from quadid.identify.uncertainty import parameter_set, uncertainty
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+
+def fit_at(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel, evaluations: int, how: str
+) -> Fit:
+    """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
+
+    Args:
+        windows: training data.
+        vehicle: as given.
+        theta: full parameter vector, shape (size,).
+        noise: sensor noise.
+        evaluations: parameter vectors that the search simulated.
+        how: sentence on how it ended.
+    """
+    shooting = Shooting(windows, vehicle, FIT_SECONDS, noise)
+    settle_states(shooting, theta)
+    free = shooting.free(NOMINAL_NAMES)
+    lin = shooting.linearise(theta, free)
+    prior = default_prior(shooting, free)
+    unc = uncertainty(lin, free, prior, theta)
+    parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
+    precision = lin.gram.sum(axis=0) + np.diag(1.0 / prior.sigma**2)
+    step = np.linalg.solve(precision, lin.grad.sum(axis=0))
+    warnings = []
+    far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
+    if far:
+        warnings.append(
+            f"the search ended ({how}), but over whole seconds the data would still move {', '.join(far)}; "
+            "optimizer pso_polish goes all the way"
+        )
+    return Fit(vehicle, theta, parameters, noise, unc, Convergence.BUDGET, evaluations, tuple(warnings))

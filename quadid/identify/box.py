@@ -1,0 +1,81 @@
+"""The identification as a plain problem in a box, for optimisers that know nothing of vehicles.
+
+Coordinates are logarithms of the free parameters.  The residual is that of short segments with their initial states
+projected out at the start (variable projection), as the swarm sees it; half its sum of squares is the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import NotIdentifiableError
+from quadid.identify.fit import SWARM_SECONDS, SWARM_SEGMENTS
+from quadid.identify.shooting import Shooting
+from quadid.model.kernel import LANES
+from quadid.model.rollout import Segments
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+
+class BoxProblem:
+    """Residual and cost of the paper's six parameters on flight data.
+
+    Attributes:
+        lower: bounds of the logarithms, shape (6,).
+        upper: likewise.
+        start: the vehicle file's guess, shape (6,).
+    """
+
+    def __init__(self, windows: Sequence[Window], vehicle: Vehicle) -> None:
+        """Cuts `windows` into short segments, thinned as for the swarm.
+
+        Raises:
+            NotIdentifiableError: no stretch is long enough.
+        """
+        shooting = Shooting(windows, vehicle, SWARM_SECONDS)
+        if not shooting.rollouts:
+            raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
+        every = -(-shooting.count // SWARM_SEGMENTS)
+        shooting.segments = [
+            Segments(s.length, s.lead, np.ascontiguousarray(s.starts[::every])) for s in shooting.segments
+        ]
+        self._shooting = shooting
+        self._theta = shooting.layout.initial(vehicle)
+        none = shooting.free([])
+        self._index = shooting.free(NOMINAL_NAMES).index
+        self._bases = [np.ascontiguousarray(b) for b, _, _ in shooting.eliminated(self._theta, none)]
+        (self._states,) = shooting.snapshot().values()
+        (self._n_pre,) = shooting.snapshot()
+        self.lower, self.upper = np.log(vehicle.bounds).T
+        self.start = np.clip(np.log(vehicle.initial), self.lower, self.upper)
+
+    def theta(self, point: FloatArray) -> FloatArray:
+        """Full parameter vector of a point, shape (size,)."""
+        out = self._theta.copy()
+        out[self._index] = np.exp(point)
+        return out
+
+    def residual(self, points: FloatArray) -> FloatArray:
+        """Residuals in standard deviations, shapes (k, 6) -> (k, samples)."""
+        thetas = np.array([self.theta(p) for p in points])
+        s = self._shooting
+        sigma = np.sqrt(s.noise.variance)
+        parts = []
+        for rollout, segments, x0, basis in zip(s.rollouts, s.segments, self._states, self._bases, strict=True):
+            rows = segments.starts[:, None] + np.arange(segments.length)
+            weights = rollout.valid[rows][..., : s.channels] / sigma
+            out, _ = rollout.roll(segments, thetas, x0, None, self._n_pre)
+            flat = (out[..., : s.channels, :] * weights[..., None]).reshape(*out.shape[:2], -1, LANES)
+            flat = flat - np.matmul(basis, np.matmul(basis.transpose(0, 2, 1), flat))
+            parts.append(flat.transpose(0, 3, 1, 2).reshape(-1, flat.shape[1] * flat.shape[2])[: len(points)])
+        return np.concatenate(parts, axis=1)
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Half the sum of squared residuals, shapes (k, 6) -> (k,)."""
+        return np.asarray(0.5 * np.sum(self.residual(points) ** 2, axis=1))
