@@ -234,6 +234,7 @@ def derivative(
         # hook below the CG: (0, 0, depth) x F
         roll -= odd.load_depth * body.mass * pull_y
         pitch += odd.load_depth * body.mass * pull_x
+    spring_x = spring_y = 0.0
     if odd.slosh_share != 0.0:
         stiff = odd.slosh_speed * odd.slosh_speed
         drag = 2.0 * odd.slosh_damping * odd.slosh_speed
@@ -244,9 +245,6 @@ def derivative(
         f_y += odd.slosh_share * spring_y
         roll += body.mass * odd.slosh_share * (-odd.slosh_depth * spring_y - y[30] * f_z)
         pitch += body.mass * odd.slosh_share * (odd.slosh_depth * spring_x + y[29] * f_z)
-        dy[29], dy[30] = y[31], y[32]
-        dy[31] = -spring_x - f_x
-        dy[32] = -spring_y - f_y
 
     # J nu' = tau - nu x (J nu) + J_r Omega_r (nu x z), full tensor
     inertia, inverse = body.inertia[changed], body.inverse[changed]
@@ -262,6 +260,10 @@ def derivative(
     r_dot = inverse[2, 0] * m_x + inverse[2, 1] * m_y + inverse[2, 2] * m_z + push[5]
     if odd.lift_roll != 0.0:
         p_dot += odd.lift_roll * u * v
+    if odd.slosh_share != 0.0:
+        dy[29], dy[30] = y[31], y[32]
+        dy[31] = -spring_x - f_x - q_dot * odd.slosh_depth
+        dy[32] = -spring_y - f_y + p_dot * odd.slosh_depth
 
     dy[0], dy[1], dy[2] = y[3], y[4], y[5]
     dy[3] = r00 * f_x + r01 * f_y + r02 * f_z

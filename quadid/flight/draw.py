@@ -50,12 +50,13 @@ COMPANION = {"rotor_drag_moment": "rotor_drag", "wind": "rotor_drag"}
 
 
 def _scales(vehicle: Vehicle | None) -> dict[str, float]:
-    """Factors from a Pelican's sizes to this vehicle's: length, inertia, rotor inertia, rotor speed."""
+    """Factors from a Pelican's sizes to this vehicle's: length, inertia over mass, inertia, rotor inertia and speed."""
     if vehicle is None:
-        return {"length": 1.0, "inertia": 1.0, "rotor": 1.0, "speed": 1.0}
+        return {"length": 1.0, "lever": 1.0, "inertia": 1.0, "rotor": 1.0, "speed": 1.0}
     arm = float(np.mean(np.linalg.norm(vehicle.rotor_positions[:, :2], axis=1)))
     return {
         "length": arm / 0.21,
+        "lever": min(1.0, vehicle.parameters["J_xx"].initial / vehicle.mass / (8.0e-3 / 1.30)),
         "inertia": min(1.0, vehicle.parameters["J_xx"].initial / 8.0e-3),
         "rotor": vehicle.parameters["J_r"].initial / 3.0e-5,
         "speed": vehicle.hover_speed() / 370.0,
@@ -63,14 +64,14 @@ def _scales(vehicle: Vehicle | None) -> dict[str, float]:
 
 
 SCALED_BY = {
-    "rotor_drag_moment": "length",
-    "cg_offset": "length",
+    "rotor_drag_moment": "lever",
+    "cg_offset": "lever",
     "imu_lever_arm": "length",
     "product_of_inertia": "inertia",
     "rotor_spin_up": "rotor",
     "thrust_curve": "speed",
 }
-"""Effects whose size depends on the vehicle's."""
+"""Effects whose size depends on the vehicle's; a moment's lever goes with inertia over mass, as the response does."""
 
 
 def _one(

@@ -65,6 +65,9 @@ def _sticks(profile: str, seed: int, plan: Plan, segments: Sequence[Segment] | N
             raise ParameterError("profile 'scripted' without segments", fix="give the manoeuvre's segments")
         sticks = np.zeros((total, 4))
         sticks[lead:] = scripted(segments, seed, total - lead)
+    elif profile == "one_axis":
+        sticks = np.zeros((total, 4))
+        sticks[lead:] = stick_profile(profile, seed, total - lead)
     else:
         sticks = stick_profile(profile, seed, total)
         ramp = np.minimum(1.0, np.arange(total) / max(lead, 1))

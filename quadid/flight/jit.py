@@ -1,18 +1,45 @@
-"""The one place that knows how kernels of the flown vehicle are compiled."""
+"""The one place that knows how kernels of the flown vehicle are compiled.
+
+numba keeps machine code on disk by the content of the file a kernel is in, and does not see that a kernel it calls, in
+another file, has changed: after an upgrade the old physics would go on flying.  The stamp of every kernel here
+therefore covers all sources of this room.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
-from typing import TypeVar, cast
+from functools import cache
+from importlib import resources
+from typing import Any, TypeVar, cast
 
 import numba
 
+from quadid.vehicle import GRAVITY
+
 F = TypeVar("F", bound=Callable[..., object])
+
+
+@cache
+def fingerprint() -> str:
+    """Hash of every source file of this package and of the constants its kernels take from outside."""
+    digest = hashlib.sha256(repr(GRAVITY).encode())
+    for entry in sorted(resources.files(__package__ or "quadid.flight").iterdir(), key=lambda e: e.name):
+        if entry.name.endswith(".py"):
+            digest.update(entry.read_bytes())
+    return digest.hexdigest()
 
 
 def kernel(function: F) -> F:
     """Compiles `function` with numba: no interpreter lock, cached on disk, IEEE arithmetic (no fastmath).
 
-    The truth is a reference, so no arithmetic is re-ordered: the same seed gives the same bits.
+    The truth is a reference, so no arithmetic is re-ordered: the same seed gives the same bits.  Where nothing can be
+    written to disk, every start compiles anew.
     """
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    try:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:
+        return cast(F, numba.njit(nogil=True, error_model="numpy")(function))
+    file = compiled._cache._cache_file
+    file._source_stamp = f"{file._source_stamp} {fingerprint()}"
+    return cast(F, compiled)

@@ -66,7 +66,7 @@ def _effects() -> tuple[OutsideEffect, ...]:
         make(
             "slosh", "structure", "Fluid moves in a tank.",
             {"share": s(0.08, 0.2, ""), "frequency": s(0.8, 1.5, "Hz", fixed), "damping": s(0.05, 0.1, "", fixed),
-             "depth": s(0.02, 0.06, "m", fixed)}, f.slosh),
+             "depth": s(0.05, 0.1, "m", fixed)}, f.slosh),
         make(
             "gimbal_torque", "structure", "An unbalanced gimbal turns steadily.",
             {"roll": s(0.5, 1.5, "rad/s^2"), "pitch": s(0.5, 1.5, "rad/s^2"),
@@ -79,13 +79,13 @@ def _effects() -> tuple[OutsideEffect, ...]:
             {"rate": s(1.4, 2.2, "hover speeds per s", fixed)}, f.esc_slew),
         make(
             "esc_ceiling", "propulsion", "Rotors saturate below what is commanded.",
-            {"ceiling": s(1.14, 1.2, "hover speeds", fixed)}, f.esc_ceiling),
+            {"ceiling": s(1.18, 1.24, "hover speeds", fixed)}, f.esc_ceiling),
         make(
             "esc_grain", "propulsion", "Rotor speed comes in coarse steps.",
             {"grain": s(0.03, 0.06, "hover speeds")}, f.esc_grain),
         make(
             "rotor_dropout", "propulsion", "One rotor loses thrust now and then.",
-            {"share": s(0.12, 0.3, ""), "every": s(5.0, 12.0, "s", fixed), "lasts": s(0.6, 2.0, "s", fixed)},
+            {"share": s(0.08, 0.2, ""), "every": s(5.0, 12.0, "s", fixed), "lasts": s(0.6, 2.0, "s", fixed)},
             f.rotor_dropout),
         make(
             "gusts", "environment", "Turbulence pushes and turns (Dryden-like).",

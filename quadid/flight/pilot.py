@@ -40,7 +40,7 @@ class Pilot(NamedTuple):
     climb_hold: float = 0.5
     climb_brake: float = 1.2
     trim: float = 0.1
-    horizon: float = 0.4
+    horizon: float = 0.8
     reach: float = 2.0
     tilt_limit: float = 0.5
     throttle_limits: tuple[float, float] = (0.08, 0.85)

@@ -19,11 +19,13 @@ KINDS = ("step", "pulse", "doublet", "3211", "sine", "chirp", "multisine", "nois
 
 
 def band_noise(rng: np.random.Generator, n: int, low: float, high: float, rms: float) -> FloatArray:
-    """Gaussian noise in a band [Hz] with a given rms, `n` samples at 50 Hz."""
+    """Gaussian noise in a band [Hz] with a given expected rms, `n` samples at 50 Hz; a longer one starts the same."""
     settle = int(4.0 / (low * PILOT_STEP))
     sections = butter(2, [low, high], btype="bandpass", fs=1.0 / PILOT_STEP, output="sos")
-    raw = sosfilt(sections, rng.standard_normal(n + settle))[settle:]
-    return np.asarray(raw * (rms / max(float(np.std(raw)), 1e-12)))
+    impulse = np.zeros(5 * settle)
+    impulse[0] = 1.0
+    gain = float(np.linalg.norm(sosfilt(sections, impulse)))
+    return np.asarray(sosfilt(sections, rng.standard_normal(n + settle))[settle:] * (rms / gain))
 
 
 def doublets(rng: np.random.Generator, n: int, every: float, width: tuple[float, float], size: float) -> FloatArray:
@@ -48,18 +50,20 @@ def doublets(rng: np.random.Generator, n: int, every: float, width: tuple[float,
 
 
 def _tilt(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    slow = band_noise(rng, n, 0.06, 0.25, 0.125)
-    quick = band_noise(rng, n, 0.25, 1.5, 0.06)
-    return scale * (slow + quick + doublets(rng, n, 10.0, (0.25, 0.6), 0.2))
+    a, b, c = rng.spawn(3)
+    slow, quick = band_noise(a, n, 0.06, 0.25, 0.115), band_noise(b, n, 0.25, 1.5, 0.05)
+    return scale * (slow + quick + doublets(c, n, 10.0, (0.25, 0.6), 0.2))
 
 
 def _yaw(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    rate = band_noise(rng, n, 0.01, 0.5, 0.5) + doublets(rng, n, 9.0, (0.6, 1.5), 0.9)
+    a, b = rng.spawn(2)
+    rate = band_noise(a, n, 0.01, 0.5, 0.5) + doublets(b, n, 9.0, (0.6, 1.5), 0.9)
     return np.asarray(scale * np.cumsum(np.clip(rate, -1.2, 1.2)) * PILOT_STEP)
 
 
 def _collective(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
-    return scale * (band_noise(rng, n, 0.15, 1.8, 0.09) + doublets(rng, n, 11.0, (0.3, 0.7), 0.13))
+    a, b = rng.spawn(2)
+    return scale * (band_noise(a, n, 0.15, 1.8, 0.09) + doublets(b, n, 11.0, (0.3, 0.7), 0.13))
 
 
 def excited(rng: np.random.Generator, n: int) -> FloatArray:
@@ -69,9 +73,10 @@ def excited(rng: np.random.Generator, n: int) -> FloatArray:
 
 def gentle(rng: np.random.Generator, n: int) -> FloatArray:
     """Near hover with slow small moves; says little about inertia."""
-    tilt = [band_noise(rng, n, 0.04, 0.15, 0.02) for _ in range(2)]
-    yaw = np.cumsum(band_noise(rng, n, 0.02, 0.08, 0.04)) * PILOT_STEP
-    return np.column_stack([*tilt, yaw, band_noise(rng, n, 0.03, 0.1, 0.008)])
+    a, b, c, d = rng.spawn(4)
+    tilt = [band_noise(stream, n, 0.04, 0.15, 0.02) for stream in (a, b)]
+    yaw = np.cumsum(band_noise(c, n, 0.02, 0.08, 0.04)) * PILOT_STEP
+    return np.column_stack([*tilt, yaw, band_noise(d, n, 0.03, 0.1, 0.008)])
 
 
 def hover(rng: np.random.Generator, n: int) -> FloatArray:

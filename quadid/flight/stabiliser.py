@@ -60,6 +60,7 @@ def default_gains(vehicle: Vehicle) -> dict[str, float]:
     base = TruthParameters.of(vehicle)
     hover = base.hover_speed(len(vehicle.rotors))
     yaw_torque = 0.3 * base.d * len(vehicle.rotors) * hover**2
+    fastest = min(MAX_OVER_HOVER * hover, vehicle.command.max_speed or np.inf)
     return {
         "roll_p": ANGLE_BANDWIDTH,
         "pitch_p": ANGLE_BANDWIDTH,
@@ -76,7 +77,7 @@ def default_gains(vehicle: Vehicle) -> dict[str, float]:
         "thrust_coefficient": base.b,
         "drag_coefficient": base.d,
         "min_speed": MIN_OVER_HOVER * hover,
-        "max_speed": MAX_OVER_HOVER * hover,
+        "max_speed": float(fastest),
     }
 
 

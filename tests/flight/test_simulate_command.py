@@ -1,0 +1,134 @@
+"""`quadid simulate`: files, effects on the command line, JSON, refusals, live MAVLink."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quadid_cli.main import app_main
+from quadid_cli.simulate import SimulateError, check_target, parse_effects, read_manoeuvre, stream
+from quadid_replay import open_log
+
+from quadid.errors import ParameterError
+from quadid.flight import fly
+from quadid.vehicle import Vehicle
+
+PELICAN = Vehicle.shipped("pelican")
+
+
+Outcome = tuple[int, str, str]
+"""Exit code, stdout, stderr."""
+
+
+@pytest.fixture
+def quadid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Outcome]:
+    """Runs the command line in an empty folder."""
+
+    def run(*arguments: str) -> Outcome:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["quadid", *arguments])
+        code = app_main()
+        told = capsys.readouterr()
+        return code, told.out, told.err
+
+    return run
+
+
+@pytest.mark.parametrize("suffix", ["csv", "mcap", "tlog"])
+def test_files(suffix: str, tmp_path: Path, quadid: Callable[..., Outcome]) -> None:
+    code, out, err = quadid(
+        "simulate", f"a.{suffix}", "--seconds", "5", "--seed", "7", "--effect", "rotor_drag:k_x=0.3,k_y=0.2",
+        "--json", "-",
+    )  # fmt: skip
+    assert code == 0, err
+    result = json.loads(out)
+    assert result["schema"] == "quadid.simulate/1"
+    assert result["effects"] == {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}}
+    assert result["log"] == str(tmp_path / f"a.{suffix}")
+    flight = fly(PELICAN, seconds=5.0, seed=7, effects={"rotor_drag": {"k_x": 0.3, "k_y": 0.2}})
+    read = open_log(tmp_path / f"a.{suffix}")
+    assert flight.window.gyro is not None
+    np.testing.assert_allclose(read.channels["gyro"].values, flight.window.gyro, atol=1e-6)
+    np.testing.assert_allclose(read.channels["rotor_speed"].values, flight.window.rotor_speed, atol=0.06)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["a.txt"], ".mcap"),
+        (["nowhere/a.csv"], "folder"),
+        (["a.csv", "--effect", "rotor_drug"], "rotor_drag"),
+        (["a.csv", "--effect", "rotor_drag:k_z=1"], "k_x"),
+        (["a.csv", "--seconds", "-3"], "36000"),
+        (["a.csv", "--vehicle", "pelikan"], "pelican"),
+        (["a.csv", "--profile", "wild"], "excited"),
+        (["udpout:14550"], "HOST:PORT"),
+    ],
+)
+def test_refusals_are_one_line(
+    arguments: list[str], reason: str, tmp_path: Path, quadid: Callable[..., Outcome]
+) -> None:
+    code, _, err = quadid("simulate", *arguments)
+    assert code == 2
+    assert reason in err
+    assert len(err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_effects_without_values_are_drawn() -> None:
+    effects, outside = parse_effects(["motor_lag", "wind", "gusts", "gyro_bias:x=0.01"], PELICAN, 1, 60.0)
+    assert set(effects) == {"motor_lag", "wind", "rotor_drag", "gyro_bias"}
+    assert effects["gyro_bias"] == {"x": 0.01}
+    assert set(outside) == {"gusts"}
+    for text in ("motor_lag:tau", "motor_lag:tau=fast"):
+        with pytest.raises(ParameterError, match="NAME:KEY=NUMBER"):
+            parse_effects([text], PELICAN, 1, 60.0)
+
+
+def test_manoeuvre_files(tmp_path: Path) -> None:
+    file = tmp_path / "m.yaml"
+    file.write_text("segments:\n  - {axis: roll, kind: doublet, start: 1, duration: 1, amplitude: 0.2}\n")
+    assert read_manoeuvre(file)[0].axis == "roll"
+    for text in ("[]", "segments: 3", "- 5", "{", "- {axis: roll}"):
+        file.write_text(text)
+        with pytest.raises((SimulateError, ParameterError)):
+            read_manoeuvre(file)
+    with pytest.raises(SimulateError, match="no manoeuvre file"):
+        read_manoeuvre(tmp_path / "none.yaml")
+
+
+def test_live_mavlink_arrives_in_real_time() -> None:
+    flight = fly(PELICAN, seconds=1.0, seed=1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5.0)
+        sender = threading.Thread(
+            target=stream, args=(f"udpout:127.0.0.1:{receiver.getsockname()[1]}", flight.recording)
+        )
+        sender.start()
+        kinds: dict[int, int] = {}
+        while sender.is_alive() or not kinds:
+            frame = receiver.recv(512)
+            assert frame[0] == 0xFD
+            kind = int.from_bytes(frame[7:10], "little")
+            kinds[kind] = kinds.get(kind, 0) + 1
+            if kinds.get(105, 0) == 50 and kinds.get(31, 0) == 50:
+                break
+        sender.join()
+    assert kinds[0] >= 1  # HEARTBEAT
+    assert kinds[105] == 50  # HIGHRES_IMU
+
+
+def test_targets() -> None:
+    check_target("udpout:127.0.0.1:14550")
+    for wrong in ("udpout:host", "udpout::14550", "udpout:host:99999", "flight"):
+        with pytest.raises(SimulateError):
+            check_target(wrong)

@@ -1,0 +1,128 @@
+"""The stabiliser: its pure step replays the log, gains travel through the vehicle file, the mixer inverts geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from quadid.errors import ParameterError
+from quadid.flight import (
+    GAIN_NAMES,
+    TruthParameters,
+    default_gains,
+    fly,
+    mixer_matrix,
+    pack_gains,
+    stabiliser_step,
+)
+from quadid.vehicle import Stabiliser, Vehicle
+
+FloatArray = NDArray[np.float64]
+NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mixer_inverts_the_geometry(name: str) -> None:
+    vehicle = Vehicle.shipped(name)
+    gains = default_gains(vehicle)
+    b, d = gains["thrust_coefficient"], gains["drag_coefficient"]
+    at = vehicle.rotor_positions
+    forward = np.vstack([np.full(len(at), b), -b * at[:, 1], b * at[:, 0], d * vehicle.spins])
+    np.testing.assert_allclose(forward @ mixer_matrix(vehicle, gains), np.eye(4), atol=1e-3)
+
+
+def test_logged_sensors_and_references_give_the_logged_commands() -> None:
+    """The stabiliser reads exactly what is logged, so its pure step replays the log, noise and all."""
+    flight = fly(Vehicle.shipped("pelican"), seconds=20.0, seed=4)
+    w, gains = flight.window, flight.gains
+    mixer = mixer_matrix(flight.vehicle, gains)
+    assert w.attitude is not None
+    assert w.gyro is not None
+    b, d = gains["thrust_coefficient"], gains["drag_coefficient"]
+    at = flight.vehicle.rotor_positions
+    forward = np.vstack([-b * at[:, 1], b * at[:, 0], d * flight.vehicle.spins])
+    # the integral torques before the first row: what its command holds beyond the proportional part
+    first, _ = stabiliser_step(gains, mixer, flight.references[0], w.attitude[0], w.gyro[0], np.zeros(3), 0.02)
+    integral = forward @ (w.rotor_speed[0] ** 2 - first**2)
+    worst = 0.0
+    for k in range(len(w)):
+        command, integral = stabiliser_step(
+            gains, mixer, flight.references[k], w.attitude[k], w.gyro[k], integral, w.dt
+        )
+        worst = max(worst, float(np.abs(command - w.rotor_speed[k]).max()))
+    assert worst < 1e-6
+
+
+def test_step_is_pure() -> None:
+    vehicle = Vehicle.shipped("pelican")
+    gains, integral = default_gains(vehicle), np.array([0.01, -0.02, 0.001])
+    arguments = (np.array([0.1, 0.0, 0.2, 0.3]), np.array([1.0, 0, 0, 0]), np.array([0.1, 0.2, 0.3]))
+    one = stabiliser_step(gains, mixer_matrix(vehicle, gains), *arguments, integral, 0.02)
+    two = stabiliser_step(gains, mixer_matrix(vehicle, gains), *arguments, integral, 0.02)
+    np.testing.assert_array_equal(one[0], two[0])
+    np.testing.assert_array_equal(one[1], two[1])
+    np.testing.assert_array_equal(integral, [0.01, -0.02, 0.001])
+
+
+@pytest.mark.parametrize(("axis", "gain"), [(0, "roll_rate_p"), (1, "pitch_rate_p"), (2, "yaw_rate_p")])
+def test_torque_opposes_the_error(axis: int, gain: str) -> None:
+    """Tilted by +angle with a level reference, the commanded torque is negative about that axis alone."""
+    vehicle = Vehicle.shipped("pelican")
+    gains = {**default_gains(vehicle), "roll_rate_i": 0.0, "pitch_rate_i": 0.0, "yaw_rate_i": 0.0}
+    turn = np.zeros(3)
+    turn[axis] = 0.05
+    q = Rotation.from_rotvec(turn).as_quat()[[3, 0, 1, 2]]
+    mixer = mixer_matrix(vehicle, gains)
+    command, _ = stabiliser_step(gains, mixer, np.array([0, 0, 0, 0.3]), q, np.zeros(3), np.zeros(3), 0.02)
+    b, d, at = gains["thrust_coefficient"], gains["drag_coefficient"], vehicle.rotor_positions
+    torque = np.vstack([-b * at[:, 1], b * at[:, 0], d * vehicle.spins]) @ command**2
+    expected = np.zeros(3)
+    expected[axis] = -gains[gain] * gains[["roll_p", "pitch_p", "yaw_p"][axis]] * np.sin(0.05)
+    np.testing.assert_allclose(torque, expected, atol=1e-12)
+
+
+def test_gains_travel_through_the_vehicle_file() -> None:
+    vehicle = Vehicle.shipped("pelican")
+    gains = {**default_gains(vehicle), "roll_p": 3.7}
+    with_gains = vehicle.model_copy(update={"stabiliser": Stabiliser(gains=gains)})
+    back = Vehicle.from_yaml(with_gains.to_yaml())
+    assert back.stabiliser is not None
+    assert back.stabiliser.gains == gains
+    assert fly(back, seconds=2.0).gains["roll_p"] == 3.7
+
+
+def test_wrong_gains_are_named() -> None:
+    gains = default_gains(Vehicle.shipped("pelican"))
+    assert tuple(gains) == GAIN_NAMES
+    with pytest.raises(ParameterError, match="roll_p"):
+        pack_gains({**gains, "rol_p": 1.0})
+    with pytest.raises(ParameterError, match="yaw_rate_i"):
+        pack_gains({k: v for k, v in gains.items() if k != "yaw_rate_i"})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_follows_its_references(name: str) -> None:
+    """Hover after a flight's worth of sticks: attitude follows the reference within a few degrees rms."""
+    flight = fly(Vehicle.shipped(name), seconds=30.0, seed=6)
+    q = flight.truth.quaternion
+    angles = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_euler("ZYX")[:, ::-1]
+    error = angles[:, :2] - flight.references[:, :2]
+    assert error.std(axis=0).max() < 0.13
+    assert flight.truth.rates.std(axis=0).max() < 0.8
+
+
+def test_a_normalized_command_has_its_ceiling() -> None:
+    data = Vehicle.shipped("pelican").model_dump()
+    data["command"] = {"kind": "normalized", "max_speed": 500.0}
+    vehicle = Vehicle.model_validate(data)
+    flight = fly(vehicle, seconds=5.0)
+    assert default_gains(vehicle)["max_speed"] <= 500.0
+    command = flight.recording.channels["motor_command"].values
+    np.testing.assert_allclose(vehicle.command.to_rotor_speed(command), flight.window.rotor_speed)
+    assert command.max() <= 1.0
+    data["command"] = {"kind": "pwm", "max_speed": 800.0, "range": (1000.0, 2000.0)}
+    pulses = fly(Vehicle.model_validate(data), seconds=5.0).recording.channels["motor_command"].values
+    assert 1000.0 < pulses.min() < pulses.max() <= 2000.0
+    assert TruthParameters.of(vehicle).b == 2.33e-5
