@@ -25,6 +25,8 @@ class Candidate:
         family: look-alikes; when one of a family is short-listed all of it is refitted.
         requires: effect that must be in the model first.
         timed: index of its time entry, when it begins at an unknown moment.
+        label: tells candidates of one effect apart.
+        split: for causes that show only together (drag in wind): what it stands for once accepted.
     """
 
     effect: str
@@ -34,6 +36,7 @@ class Candidate:
     requires: str | None = None
     timed: int | None = None
     label: str = field(default="")
+    split: tuple[Candidate, ...] = ()
 
     def __post_init__(self) -> None:
         """Labels the candidate by its effect, and by its rotor for `weak_rotor`."""
@@ -89,7 +92,19 @@ def candidates(layout: Layout, has_velocity: bool, has_position: bool) -> list[C
         out.append(
             Candidate(effect, names, _STARTS.get(effect, ()), _FAMILY.get(effect, effect), requires, timed)
         )
+    if has_velocity:
+        out.append(_in_wind(out))
     return out
+
+
+def _in_wind(listed: list[Candidate]) -> Candidate:
+    """Rotor drag with wind free beside it: drag alone explains nothing when the air moves faster than the vehicle."""
+    drag = next(c for c in listed if c.effect == "rotor_drag")
+    wind = next(c for c in listed if c.effect == "wind")
+    start = (*drag.starts[0], 0.0, 0.0)
+    return Candidate(
+        "rotor_drag", (*drag.names, *wind.names), (start,), "drag", label="rotor_drag in wind", split=(drag, wind)
+    )
 
 
 def all_names(listed: list[Candidate]) -> list[str]:

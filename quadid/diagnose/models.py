@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class Model:
         cost: deviance with prior.
         states: initial states that belong to it.
         held_out: deviance of each block under parameters fitted to the others.
+        worth: gain of each cause when it was accepted, by label.
     """
 
     causes: tuple[Candidate, ...]
@@ -40,6 +41,7 @@ class Model:
     cost: float
     states: States
     held_out: FloatArray
+    worth: dict[str, float] = field(default_factory=dict)
 
     @property
     def deviance(self) -> float:
@@ -102,16 +104,28 @@ def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Can
     return Model(causes, free, prior, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
 
 
-def extend(shooting: Shooting, model: Model, candidate: Candidate, iterations: int = 6) -> Model:
-    """Refits `model` with `candidate` added, from each of its starts; returns the best."""
+def extend(shooting: Shooting, model: Model, candidate: Candidate, iterations: int = 6, far: bool = False) -> Model:
+    """Refits `model` with `candidate` added, from each of its starts; returns the best.
+
+    Args:
+        shooting: the problem; model: what to extend; candidate: the cause to add.
+        iterations: linearisations a start may spend.
+        far: also start from the vehicle file's nominal parameters, because without the cause the nominal ones may have
+            been driven far away.
+    """
     causes = (*model.causes, candidate)
+    thetas = [model.theta]
+    if far:
+        nominal = shooting.layout.initial(shooting.vehicle)
+        thetas.append(np.concatenate([nominal[: len(NOMINAL_NAMES)], model.theta[len(NOMINAL_NAMES) :]]))
     best: Model | None = None
-    for start in candidate.starts or ((),):
-        theta = model.theta.copy()
-        if start:
-            theta[shooting.free(list(candidate.names)).index] = start
-        trial = fit_model(shooting, theta, causes, model.states, iterations)
-        if best is None or trial.deviance < best.deviance:
-            best = trial
+    for base in thetas:
+        for start in candidate.starts or ((),):
+            theta = base.copy()
+            if start:
+                theta[shooting.free(list(candidate.names)).index] = start
+            trial = replace(fit_model(shooting, theta, causes, model.states, iterations), worth=model.worth)
+            if best is None or trial.deviance < best.deviance:
+                best = trial
     assert best is not None
     return best

@@ -34,6 +34,9 @@ FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 DECIDE_SECONDS = 1.0
+NOISE_ROUNDS = 2
+NOISE_FELL = 0.7
+"""When a channel's noise variance falls below this share once the causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.03
@@ -89,9 +92,16 @@ def diagnose(
     listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
     listed = [c for c in listed if c.effect not in vehicle.effects]
     search = select(short, decisive, first.theta, listed, report)
-    if search.model.causes:
+    for _ in range(NOISE_ROUNDS):
+        if not search.model.causes:
+            break
         report("noise floor", 0.5)
+        before = decisive.noise.variance
         search = _with_better_noise(windows, short, decisive, search)
+        if np.all(decisive.noise.variance > NOISE_FELL * before):
+            break
+        short.noise = decisive.noise
+        search = select(short, decisive, first.theta, listed, report)
     left = remainder(decisive, search.model, seed)
     verdict = judge(search.nominal, search.model, left)
     report("validation", 0.0)

@@ -55,7 +55,7 @@ def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Sc
     present = {c.label for c in model.causes}
     scores = []
     for candidate in listed:
-        if candidate.label in present or (candidate.requires and candidate.requires not in model.effects):
+        if candidate.label in present or any(c.label in present for c in candidate.split) or (candidate.requires and candidate.requires not in model.effects):
             continue
         mine = np.array([place[n] for n in candidate.names])
         if candidate.timed is None:

@@ -34,7 +34,7 @@ of a simulation or of an autopilot's own filter can imitate."""
 RELATIVE_GAIN = 1e-4
 """… and this share of all gains so far, so that the tail of a huge effect is not named as another."""
 FAMILY_SHARE = 0.01
-"""… and, where a look-alike is already in the model, this share of all gains so far: the rest of a fading thrust that
+"""… and, where a look-alike is already in the model, this share of what that one gained: the rest of a fading thrust that
 is not quite linear is no second cause."""
 
 
@@ -107,16 +107,19 @@ def select(
         accepted = _choose(trials, model, base)
         rounds.append(Round(tuple(trials), accepted, tuple(scores)))
         if accepted is not None:
+            worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
+            accepted = replace(accepted, model=split_causes(replace(accepted.model, worth=worth)))
             model = _prune(shooting, accepted.model, accepted.candidate, base, tests)
         if shooting is short:
-            longer = fit_model(decisive, model.theta, model.causes, iterations=10)
+            longer = replace(fit_model(decisive, model.theta, model.causes, iterations=10), worth=model.worth)
             if longer.misfit < LINEAR_MISFIT or accepted is None:
-                shooting, model, base = decisive, longer, nominal
+                shooting, model, base = decisive, swap_look_alikes(decisive, longer, listed), nominal
                 continue
         if accepted is None:
             break
     if shooting is short:
         model = fit_model(decisive, model.theta, model.causes, iterations=10)
+    model = swap_look_alikes(decisive, model, listed)
     return Search(nominal, model, tuple(rounds), tests)
 
 
@@ -148,7 +151,7 @@ def _try(shooting: Shooting, model: Model, score: Score, tests: int) -> Trial:
         theta = model.theta.copy()
         theta[candidate.timed] = score.time
         start = replace(model, theta=theta)
-    extended = extend(shooting, start, candidate)
+    extended = extend(shooting, start, candidate, far=model.misfit > LINEAR_MISFIT)
     if candidate.timed is not None:
         extended = _refine_time(shooting, extended, candidate)
     gain = paired_gain(model.held_out, extended.held_out)
@@ -168,31 +171,39 @@ def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Mode
             theta[candidate.timed] += offset * step
             costs.append((float(shooting.linearise(theta, none).cost.sum()), offset, theta))
         best_theta = min(costs, key=lambda c: c[0])[2]
-    return fit_model(shooting, best_theta, model.causes, model.states, iterations=4)
+    return replace(fit_model(shooting, best_theta, model.causes, model.states, iterations=4), worth=model.worth)
 
 
 @dataclass(frozen=True)
 class _Context:
-    """What a gain is measured against: all gains so far, independent rows, families already in the model."""
+    """What a gain is measured against: all gains so far, independent rows, and how much each family has gained."""
 
     earned: float
     rows: float
-    families: frozenset[str]
+    families: dict[str, float]
 
 
 def _significant(gain: Gain, evidence: float, cause: Candidate, tests: int, context: _Context) -> bool:
     """Whether a gain on unseen blocks is real, worth having, and beyond what so many trials bring by luck."""
-    share = FAMILY_SHARE if cause.family in context.families else RELATIVE_GAIN
+    least = max(
+        LEAST_GAIN,
+        LEAST_SHARE * context.rows,
+        RELATIVE_GAIN * context.earned,
+        FAMILY_SHARE * context.families.get(cause.family, 0.0),
+    )
     return (
         gain.total > ERRORS * gain.error
-        and gain.total > max(LEAST_GAIN, LEAST_SHARE * context.rows, share * context.earned)
+        and gain.total > least
         and float(stats.chi2.sf(evidence, len(cause.names))) * tests < FALSE_ALARM
     )
 
 
 def _context(model: Model, nominal: Model) -> _Context:
     earned = float(nominal.held_out.sum() - model.held_out.sum())
-    return _Context(earned, model.rows, frozenset(c.family for c in model.causes))
+    families: dict[str, float] = {}
+    for cause in model.causes:
+        families[cause.family] = families.get(cause.family, 0.0) + model.worth.get(cause.label, 0.0)
+    return _Context(earned, model.rows, families)
 
 
 def _choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
@@ -211,6 +222,39 @@ def _choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
     return best
 
 
+def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Model:
+    """Puts a look-alike in the place of a cause where that fits unseen blocks better.
+
+    Which of two look-alikes was taken first may have been decided on segments too short to tell them apart, or before
+    another cause was known.
+    """
+    for cause in model.causes:
+        if any(c.requires == cause.effect for c in model.causes):
+            continue
+        present = {c.label for c in model.causes}
+        rivals = [
+            c for c in listed
+            if c.family == cause.family and c.label not in present and not c.split and c.timed is None
+            and c.effect != cause.effect
+        ]  # fmt: skip
+        if not rivals:
+            continue
+        rest = without(shooting, model, cause)
+        best = min((extend(shooting, rest, r) for r in rivals), key=lambda m: float(m.held_out.sum()))
+        gain = paired_gain(model.held_out, best.held_out)
+        if gain.total > LEAST_GAIN and gain.total > gain.error:
+            model = best
+    return model
+
+
+def split_causes(model: Model) -> Model:
+    """Replaces a joint cause by the causes it stands for; the parameters are the same."""
+    causes: list[Candidate] = []
+    for c in model.causes:
+        causes += [part for part in (c.split or (c,)) if part.label not in {x.label for x in causes}]
+    return replace(model, causes=tuple(causes))
+
+
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """Refits `model` without `cause` and what requires it."""
     left = tuple(c for c in model.causes if c.label != cause.label and c.requires != cause.effect)
@@ -220,13 +264,13 @@ def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
         theta[shooting.free(list(c.names)).index] = 0.0
         if c.timed is not None:
             theta[c.timed] = NEVER
-    return fit_model(shooting, theta, left, model.states)
+    return replace(fit_model(shooting, theta, left, model.states), worth=model.worth)
 
 
 def _prune(shooting: Shooting, model: Model, newest: Candidate, nominal: Model, tests: int) -> Model:
     """Drops causes that the newest one made superfluous."""
     for cause in [c for c in model.causes if c.label != newest.label]:
-        if cause not in model.causes or any(c.requires == cause.effect for c in model.causes):
+        if cause.label not in {c.label for c in model.causes} or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)
         gain = paired_gain(rest.held_out, model.held_out)

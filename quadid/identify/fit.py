@@ -29,6 +29,8 @@ SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
 SPECTRUM_SECONDS = 0.5
+FLEXIBLE_DRAG = 0.1
+"""Rotor drag [1/s] the flexible fit starts from, because velocities and moments of drag show only where there is any."""
 
 
 @dataclass(frozen=True)
@@ -216,8 +218,8 @@ def residual_noise(shooting: Shooting, polished: Polished) -> NoiseModel:
 
 def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     """Everything the catalogue can free at once on these data: the model that leaves only noise."""
-    # Left out: what is neutral in a product (moments of a drag that is absent), needs a time, or doubles another cause.
-    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "rotor_drag_moment", "command_delay"}
+    # Left out: what needs a time or height, or doubles another cause.
+    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "command_delay"}
     if not shooting.has_velocity:
         skip.add("parasitic_drag")
     out = list(NOMINAL_NAMES)
@@ -247,7 +249,10 @@ def noise_floor(
     names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
     wide = short.free(names)
     keep = short.snapshot()
-    first = polish(short, theta, wide, iterations=iterations)
+    start = theta.copy()
+    drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
+    start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
+    first = polish(short, start, wide, iterations=iterations)
     noise = residual_noise(short, first)
     short.restore(keep)
     longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, noise, short.layout)

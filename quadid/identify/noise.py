@@ -23,7 +23,7 @@ SLOW_TIME = 0.66
 SHAPE_POINTS = 51
 """Frequencies on which a noise spectrum is kept."""
 _DEFAULT = np.array([0.02] * 3 + [0.005] * 3 + [0.2] * 3 + [0.1] * 3 + [0.05] * 3)
-_POLYNOMIAL = (1, 2, 0, 2, 3)
+_POLYNOMIAL = (1, 2, 0, 1, 2)
 """Order of the trend that fitting a segment's initial state takes out of rate, attitude, specific force, velocity,
 position."""
 

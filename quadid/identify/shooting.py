@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from quadid.identify.gram_kernel import segment_grams
 from quadid.identify.noise import NoiseModel
@@ -22,7 +23,7 @@ from quadid.model.layout import Entry, Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -32,8 +33,10 @@ LEAD_SECONDS = 0.2
 _TANGENT_STEP = np.array([1e-6] * 3 + [1e-6] * 3 + [1e-5] * 3 + [1e-5] * 3)
 _RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 """Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
-VELOCITY_PRIOR = 8.0
-"""Standard deviation [m/s] of a segment's unknown initial velocity where none is measured."""
+VELOCITY_PRIOR = 4.0
+"""Standard deviation [m/s] of a segment's initial velocity around dead reckoning where none is measured."""
+LEAK_SECONDS = 8.0
+"""Time in which dead-reckoned velocity is forgotten."""
 _VELOCITY_NAMES = ("rotor_drag.", "parasitic_drag.", "rotor_drag_moment.", "axial_inflow.", "ground_effect.", "wind.")
 _WARM_UP_NAMES = ("imu_lag.", "attitude_delay.")
 _WARM_UP_INDEX = (ix.IMU_PERIOD, ix.ATT_DELAY)
@@ -140,6 +143,7 @@ class Shooting:
         self.length, self.lead = length, lead
         self.noise = noise or NoiseModel.guess(self.channels, vehicle.noise)
         self._x0: dict[int, list[FloatArray]] = {}
+        self._reckoned: dict[int, list[FloatArray]] = {}
         self.robust: list[FloatArray | None] = [None] * len(self.rollouts)
 
     @property
@@ -155,7 +159,8 @@ class Shooting:
         """Current initial states `n_pre` rows before the segments; measured ones at first."""
         if n_pre not in self._x0:
             pairs = zip(self.rollouts, self.segments, strict=True)
-            self._x0[n_pre] = [r.initial_states(s, n_pre) for r, s in pairs]
+            self._x0[n_pre] = [_first_states(r, s, n_pre) for r, s in pairs]
+            self._reckoned[n_pre] = [x[:, 7:10].copy() for x in self._x0[n_pre]]
         return self._x0[n_pre]
 
     def set_states(self, n_pre: int, states: list[FloatArray]) -> None:
@@ -230,7 +235,8 @@ class Shooting:
             out, steps = self._roll_directions(rollout, segments, theta, free, states[i], n_pre, k)
             grams = self._grams(out, steps, weights)
             base = np.ascontiguousarray(out[0, ..., : self.channels, 0])
-            parts.append(self._eliminate(i, grams, base, weights, states[i], segments, k))
+            away = states[i][:, 7:10] - self._reckoned[n_pre][i]
+            parts.append(self._eliminate(i, grams, base, weights, away, segments, k))
         return _join(parts)
 
     def _roll_directions(
@@ -266,7 +272,7 @@ class Shooting:
         return grams
 
     def _eliminate(
-        self, i: int, grams: FloatArray, base: FloatArray, weights: FloatArray, x0: FloatArray, segments: Segments,
+        self, i: int, grams: FloatArray, base: FloatArray, weights: FloatArray, v: FloatArray, segments: Segments,
         k: int,
     ) -> Linearised:  # fmt: skip
         count, width = len(grams), grams.shape[1] - 1
@@ -279,7 +285,6 @@ class Shooting:
         haa[:, range(k), range(k)] += 1.0 / _RIDGE[:k] ** 2
         occam = np.zeros(count)
         if k >= 9 and not self._has_velocity(i):
-            v = x0[:, 7:10]
             haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
             ga[:, 6:9] += v / VELOCITY_PRIOR**2
             cost += np.sum(v * v, axis=1) / VELOCITY_PRIOR**2
@@ -358,6 +363,32 @@ def _log_determinant_beyond(h: FloatArray, first: int) -> FloatArray:
     """Log-determinant of the Schur complement of the leading `first` directions in each matrix of h."""
     whole, lead = np.linalg.slogdet(h)[1], np.linalg.slogdet(h[:, :first, :first])[1]
     return np.asarray(whole - lead)
+
+
+def _first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray:
+    """Measured initial states; where velocity is not measured, that of dead reckoning."""
+    x0 = rollout.initial_states(segments, n_pre)
+    if rollout.window.velocity is None:
+        x0[:, 7:10] = dead_reckoning(rollout.window)[segments.starts - n_pre]
+    return x0
+
+
+def dead_reckoning(window: Window) -> FloatArray:
+    """Rough velocity (n, 3) [m/s], NED: integrated specific force, leaking to zero; zeros without attitude or accel.
+
+    The leak bounds what accelerometer and tilt errors add up to.  A starting point for fits in which velocity matters.
+    """
+    n = len(window)
+    if window.accel is None or window.attitude is None:
+        return np.zeros((n, 3))
+    q, f = window.attitude, window.accel
+    good = np.isfinite(q).all(axis=1) & np.isfinite(f).all(axis=1)
+    w, v = q[:, :1], q[:, 1:]
+    cross = np.cross(v, f)
+    acceleration = f + 2.0 * (w * cross + np.cross(v, cross)) + np.array([0.0, 0.0, GRAVITY])
+    acceleration[~good] = 0.0
+    keep = np.exp(-window.dt / LEAK_SECONDS)
+    return np.asarray(lfilter([window.dt], [1.0, -keep], acceleration, axis=0))
 
 
 def _weights(rollout: Rollout, segments: Segments, channels: int) -> FloatArray:

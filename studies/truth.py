@@ -1,0 +1,147 @@
+"""Does the fit tell the truth?  Errors against the Cramer-Rao bound, coverage of intervals, bias with noise, status.
+
+    python -m studies.truth --seeds 1000 --out docs/results
+
+Each seed is a new individual Pelican, a new 60 s flight with all axes moving, and a poor initial guess.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.validation import settle
+from quadid.flight import draw_truth, fly
+from quadid.identify.excitation import bounds_of
+from quadid.identify.fit import FitOptions, fit
+from quadid.identify.noise import NoiseModel
+from quadid.identify.shooting import Shooting
+from quadid.identify.spectrum import shaped_noise
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+SEGMENT = 1.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One seed: log errors, stated log sigma, bound, status of each nominal parameter."""
+
+    seed: int
+    error: FloatArray
+    sigma: FloatArray
+    bound: FloatArray
+    status: tuple[str, ...]
+
+
+def poor_guess(vehicle: Vehicle, truth: dict[str, float], seed: int, spread: float = 0.3) -> Vehicle:
+    """The vehicle with each initial value off by a log-uniform factor up to exp(`spread`)."""
+    rng = np.random.default_rng([seed, 5])
+    priors = {n: ParameterPrior(initial=truth[n] * float(np.exp(rng.uniform(-spread, spread)))) for n in NOMINAL_NAMES}
+    return vehicle.model_copy(update={"parameters": priors})
+
+
+def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
+    """Cramer-Rao bound of the log parameters at the truth, with the noise spectrum found at the truth."""
+    shooting = Shooting([window], vehicle, SEGMENT)
+    theta = shooting.layout.neutral()
+    theta[: len(truth)] = truth
+    settle(shooting, theta, [])
+    free = shooting.free([])
+    shooting.noise = _white(shooting, theta)
+    settle(shooting, theta, [])
+    shooting.noise = shaped_noise(shooting, theta, free)
+    settle(shooting, theta, [])
+    return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES)).gram.sum(axis=0))
+
+
+def _white(shooting: Shooting, theta: FloatArray) -> NoiseModel:
+    from quadid.identify.noise import estimate_noise
+
+    lin = shooting.linearise(theta, shooting.free([]))
+    return estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0)
+
+
+def run(job: tuple[int, str, float, float]) -> Outcome:
+    """Flies and fits one seed: (seed, profile, seconds, noise scale)."""
+    seed, profile, seconds, noise_scale = job
+    craft = Vehicle.shipped("pelican")
+    truth = draw_truth(craft, seed)
+    values = np.array(list(truth.as_dict().values()))
+    window = fly(craft, truth, seconds, seed, profile, noise_scale=noise_scale).window
+    result = fit([window], poor_guess(craft, truth.as_dict(), seed), FitOptions(iterations=0, seed=seed))
+    return Outcome(
+        seed,
+        np.log(result.theta[: len(values)] / values),
+        result.uncertainty.sigma,
+        bound(window, craft, values),
+        tuple(p.status.value for p in result.parameters),
+    )
+
+
+def study(jobs: list[tuple[int, str, float, float]], processes: int) -> list[Outcome]:
+    """Runs all jobs in worker processes."""
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        return list(pool.imap(run, jobs, chunksize=4))
+
+
+def table(outcomes: list[Outcome]) -> str:
+    """Markdown table of efficiency and coverage."""
+    error, sigma = np.array([o.error for o in outcomes]), np.array([o.sigma for o in outcomes])
+    limit = np.array([o.bound for o in outcomes])
+    n = len(outcomes)
+    inside = np.mean(np.abs(error) <= 1.959964 * sigma, axis=0)
+    rows = ["| parameter | RMS error % | bound % | ratio | bias % ± s.e. | coverage % ± s.e. |", "|---|---|---|---|---|---|"]
+    for j, name in enumerate(NOMINAL_NAMES):
+        rms, crb = np.sqrt(np.mean(error[:, j] ** 2)), np.sqrt(np.mean(limit[:, j] ** 2))
+        normal = np.sqrt(np.mean((error[:, j] / limit[:, j]) ** 2))
+        mean, spread = np.mean(error[:, j]), np.std(error[:, j]) / np.sqrt(n)
+        cover = inside[j]
+        rows.append(
+            f"| {name} | {100 * rms:.4f} | {100 * crb:.4f} | {normal:.3f} | {100 * mean:.4f} ± {100 * spread:.4f} | "
+            f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f} |"
+        )
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Command line of the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1000)
+    parser.add_argument("--few", type=int, default=20, help="seeds of the noise and status parts")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--out", default="")
+    options = parser.parse_args()
+    text = ["# Truth: efficiency, coverage, bias, status", "", f"`python -m studies.truth --seeds {options.seeds}`", ""]
+    main_part = study([(s, "excited", 60.0, 1.0) for s in range(options.seeds)], options.processes)
+    text += [f"## {options.seeds} excited flights of 60 s", "", table(main_part), ""]
+    for scale in (0.3, 3.0):
+        part = study([(10_000 + s, "excited", 60.0, scale) for s in range(options.few)], options.processes)
+        text += [f"## Noise × {scale}, {options.few} flights", "", table(part), ""]
+    for profile in ("hover", "one_axis", "roll_pitch"):
+        part = study([(20_000 + s, profile, 60.0, 1.0) for s in range(options.few)], options.processes)
+        text += [f"## Status, {profile}, {options.few} flights of 60 s", "", "| parameter | status: flights | bound % |",
+                 "|---|---|---|"]  # fmt: skip
+        for j, name in enumerate(NOMINAL_NAMES):
+            names = [o.status[j] for o in part]
+            counts = ", ".join(f"{s}: {names.count(s)}" for s in sorted(set(names)))
+            text.append(f"| {name} | {counts} | {100 * np.median([o.bound[j] for o in part]):.2f} |")
+        text.append("")
+    print("\n".join(text))
+    if options.out:
+        Path(options.out).mkdir(parents=True, exist_ok=True)
+        (Path(options.out) / "truth.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
