@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid_cli.identify import GRID, file_name, fitted_path, vehicle_header
+from quadid_cli.identify import GRID, file_name, vehicle_header
 from quadid_cli.options import (
     JsonTarget,
     Logs,
@@ -68,12 +68,11 @@ def diagnose(
     output.check_file(report, "--report")
     described = loading.load_vehicle(vehicle)
     folder = output.out_folder(out)
-    fitted_path(folder, described, vehicle)
     hertz = GRID if rate is None else rate
     train = loading.load_logs(logs, described, hertz, start, stop, preset)
     held = loading.load_logs(validate or [], described, hertz, start, stop, preset)
     with terminal.progress() as advance:
-        done = run(described, train, held, seed, folder, advance)
+        done = run(described, train, held, seed, folder, vehicle, advance)
     if report is not None:
         from quadid_cli.reporting import diagnose_html
 
@@ -84,21 +83,39 @@ def diagnose(
 
 
 def run(
-    vehicle: Vehicle, train: Sequence[Log], held: Sequence[Log], seed: int, folder: Path, advance: Advance
+    vehicle: Vehicle, train: Sequence[Log], held: Sequence[Log], seed: int, folder: Path, given: str, advance: Advance
 ) -> Diagnosed:
-    """Diagnoses, scores without and with the findings, and writes the extended vehicle file into `folder`."""
+    """Diagnoses, scores without and with the findings, and writes the extended vehicle file.
+
+    Args:
+        vehicle: nominal vehicle.
+        train: logs to diagnose.
+        held: logs to measure the gain on.
+        seed: of all random numbers.
+        folder: for the vehicle file.
+        given: name of the vehicle file that was read, which is never overwritten.
+        advance: told how far it is.
+    """
     from quadid.diagnose import diagnose as diagnose_windows
     from quadid_cli.output import write_text
 
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
     found, workings = diagnose_windows(windows, vehicle, unseen, seed, advance)
-    target = folder / f"{file_name(found.vehicle_name)}.yaml"
+    target = extended_path(folder, found.vehicle_name, bool(found.findings), given)
     result = found.to_dict(str(write_text(target, vehicle_header(train) + found.vehicle_yaml)))
     result["warnings"] = [*result.get("warnings", []), *(text for log in (*train, *held) for text in log.warnings)]
     sets = [
         scored(log, role, vehicle, workings) for role, part in (("train", train), ("validate", held)) for log in part
     ]
     return Diagnosed(result, sets, workings.decisive.noise, [*train, *held])
+
+
+def extended_path(folder: Path, name: str, extended: bool, given: str) -> Path:
+    """Where the vehicle file goes: ``pelican+motor_lag.yaml``, or ``pelican.fitted.yaml`` without findings."""
+    path = folder / f"{file_name(name)}{'' if extended else '.fitted'}.yaml"
+    if path.exists() and Path(given).exists() and path.samefile(given):
+        return path.with_suffix(".new.yaml")
+    return path
 
 
 def scored(log: Log, role: str, vehicle: Vehicle, workings: Workings) -> ScoredSet:

@@ -76,9 +76,7 @@ def print_sets(console: Console, sets: Sequence[JsonDict]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title="Simulation over 1 s stretches; error in noise variances, 1 = noise floor; fit: 100 % = perfect"
-    )
+    table = Table(title="Simulation over 1 s stretches (error: 1 = noise floor; fit: 100 % = perfect)")
     for heading in ("log", "role", "error before", "after", *(f"fit {n}" for n in _RATES)):
         table.add_column(heading, justify="left" if heading in ("log", "role") else "right")
     for s in sets:

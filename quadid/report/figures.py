@@ -35,7 +35,7 @@ DETAIL_POINTS = 600
 DETAIL_SECONDS = 12.0
 MOST_LOGS = 4
 """Logs that get pictures; the others are in the tables."""
-BUDGET = 110_000
+BUDGET = 90_000
 """Numbers that all pictures of channels may take together, so that a page stays below 6 MB."""
 
 

@@ -29,6 +29,7 @@ def render(page: JsonDict) -> str:
     from markupsafe import Markup
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     environment.filters |= {"number": number, "code": code}
     scripts = {name: _script(name) for name in ("plotly", "page")}
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())

@@ -1,0 +1,4 @@
+"""A vehicle's parameters in the forms of other programs: PX4, ArduPilot, Gazebo, RotorPy."""
+
+from quadid.report.programs.forms import FORMATS as FORMATS
+from quadid.report.programs.forms import export as export

@@ -1,0 +1,113 @@
+"""What other programs want to know of a vehicle, worked out once: geometry about the CG, inertia, origins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.parameters import NOMINAL_UNITS
+from quadid.vehicle import GRAVITY, Vehicle
+
+FloatArray = NDArray[np.float64]
+
+Z95 = 1.96
+TO_FLU = np.diag([1.0, -1.0, -1.0])
+"""Turns body FRD into body FLU (its own inverse)."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """A vehicle as other programs describe it.
+
+    Attributes:
+        vehicle: the vehicle file.
+        source: its name, for headers.
+    """
+
+    vehicle: Vehicle
+    source: str
+
+    def value(self, name: str) -> float:
+        """Value of a nominal parameter, SI."""
+        return self.vehicle.parameters[name].initial
+
+    def effect(self, name: str, key: str) -> float:
+        """Value of an effect's parameter; 0 where the vehicle has no such effect."""
+        return float(self.vehicle.effects.get(name, {}).get(key, 0.0))
+
+    def origin(self, name: str) -> str:
+        """Says whether a nominal parameter came from data."""
+        prior = self.vehicle.parameters[name]
+        if prior.sigma is None:
+            return "not from data: the guess of the vehicle file"
+        return f"fitted, 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
+
+    @cached_property
+    def arms(self) -> FloatArray:
+        """Rotor positions from the CG, FRD [m], shape (rotors, 3)."""
+        cg = np.array([self.effect("cg_offset", "x"), self.effect("cg_offset", "y"), 0.0])
+        return np.asarray(self.vehicle.rotor_positions - cg)
+
+    @cached_property
+    def inertia(self) -> FloatArray:
+        """Inertia tensor about the CG, FRD [kg m^2], shape (3, 3)."""
+        out = np.diag([self.value("J_xx"), self.value("J_yy"), self.value("J_zz")])
+        for (i, j), key in (((0, 1), "J_xy"), ((0, 2), "J_xz"), ((1, 2), "J_yz")):
+            out[i, j] = out[j, i] = -self.effect("product_of_inertia", key)
+        return out
+
+    @cached_property
+    def thrust(self) -> FloatArray:
+        """Thrust coefficient of every rotor [N s^2/rad^2], shape (rotors,)."""
+        b = np.full(len(self.vehicle.rotors), self.value("b"))
+        weak = int(self.effect("weak_rotor", "rotor"))
+        if weak > 0:
+            b[weak - 1] *= 1.0 - self.effect("weak_rotor", "loss")
+        return b
+
+    @property
+    def torque_per_thrust(self) -> float:
+        """Drag torque over thrust, d / b [m]."""
+        return self.value("d") / self.value("b")
+
+    @property
+    def hover_speed(self) -> float:
+        """Rotor speed in hover [rad/s]."""
+        return self.vehicle.hover_speed()
+
+    @property
+    def hover_speeds(self) -> float:
+        """Sum of all rotor speeds in hover [rad/s]."""
+        return self.hover_speed * len(self.vehicle.rotors)
+
+    @property
+    def max_speed(self) -> float | None:
+        """Rotor speed at full command [rad/s], where the vehicle file knows it."""
+        return self.vehicle.command.max_speed
+
+    @property
+    def hover_thrust(self) -> float | None:
+        """Share of the full thrust that hovers, where the full rotor speed is known."""
+        if self.max_speed is None:
+            return None
+        return self.vehicle.mass * GRAVITY / (float(self.thrust.sum()) * self.max_speed**2)
+
+    def header(self, used: tuple[str, ...]) -> list[str]:
+        """Lines that say what this is, what came from data, and which effects the other program cannot hold.
+
+        Args:
+            used: effects that the form carries.
+        """
+        left = [name for name in self.vehicle.effects if name not in used]
+        lines = [
+            f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",
+            "Where the values come from:",
+        ]
+        lines += [f"  {n} = {self.value(n):.6g} {unit}: {self.origin(n)}" for n, unit in NOMINAL_UNITS.items()]
+        lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
+        if left:
+            lines.append(f"Effects that have no place here: {', '.join(left)}")
+        return ["".join(c if c.isprintable() else "?" for c in line) for line in lines]

@@ -1,0 +1,41 @@
+"""Every form by name."""
+
+from __future__ import annotations
+
+from quadid.errors import ParameterError, nearest
+from quadid.report.programs.ardupilot import ardupilot_frame, ardupilot_parameters
+from quadid.report.programs.facts import Facts
+from quadid.report.programs.gazebo import gazebo
+from quadid.report.programs.px4 import px4
+from quadid.report.programs.rotorpy import rotorpy
+from quadid.vehicle import Vehicle
+
+FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy")
+
+
+def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
+    """Writes a vehicle in the form of another program.
+
+    Args:
+        vehicle: with its fitted values as initial values.
+        form: one of `FORMATS`.
+        source: what the vehicle was read from, for the header.
+
+    Returns:
+        Text by the ending of the file name it belongs in.
+
+    Raises:
+        ParameterError: unknown form.
+    """
+    facts = Facts(vehicle, source)
+    if form == "yaml":
+        return {".yaml": "".join(f"# {line}\n" for line in facts.header(tuple(vehicle.effects))) + vehicle.to_yaml()}
+    if form == "px4":
+        return {".params": px4(facts)}
+    if form == "ardupilot":
+        return {".param": ardupilot_parameters(facts), ".sitl.json": ardupilot_frame(facts)}
+    if form == "gazebo":
+        return {".sdf": gazebo(facts)}
+    if form == "rotorpy":
+        return {"_params.py": rotorpy(facts)}
+    raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
