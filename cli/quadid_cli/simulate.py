@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".mcap", ".tlog", ".csv")
 LIVE = "udpout:"
+LONGEST = 3600.0
+"""Longest flight [s]: every step of it is held in memory."""
 _LARGEST_MANOEUVRE = 1 << 20
 
 
@@ -70,8 +72,8 @@ def simulate(
 
     check_target(out)
     check_file(json, "--json")
-    if not (math.isfinite(seconds) and 0.0 < seconds <= 36000.0):
-        raise SimulateError(f"a flight of {seconds:g} s", "more than 0 and at most 36000 s")
+    if not (math.isfinite(seconds) and 0.0 < seconds <= LONGEST):
+        raise SimulateError(f"a flight of {seconds:g} s", f"more than 0 and at most {LONGEST:g} s")
     described = load_vehicle(vehicle)
     truth = draw_truth(described, seed, spread) if spread > 0.0 else TruthParameters.of(described)
     effects, outside = parse_effects(effect or [], described, seed, seconds)

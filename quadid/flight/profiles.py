@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,19 @@ AXES = ("roll", "pitch", "yaw", "throttle")
 KINDS = ("step", "pulse", "doublet", "3211", "sine", "chirp", "multisine", "noise")
 
 
+@cache
+def _band(low: float, high: float) -> tuple[FloatArray, float]:
+    """Band-pass sections and the rms that they give white noise of unit rms."""
+    sections = butter(2, [low, high], btype="bandpass", fs=1.0 / PILOT_STEP, output="sos")
+    impulse = np.zeros(int(10.0 / (low * PILOT_STEP)))
+    impulse[0] = 1.0
+    return sections, float(np.sqrt(np.sum(sosfilt(sections, impulse) ** 2)))
+
+
 def band_noise(rng: np.random.Generator, n: int, low: float, high: float, rms: float) -> FloatArray:
     """Gaussian noise in a band [Hz] with a given expected rms, `n` samples at 50 Hz; a longer one starts the same."""
-    settle = int(4.0 / (low * PILOT_STEP))
-    sections = butter(2, [low, high], btype="bandpass", fs=1.0 / PILOT_STEP, output="sos")
-    impulse = np.zeros(5 * settle)
-    impulse[0] = 1.0
-    gain = float(np.linalg.norm(sosfilt(sections, impulse)))
+    settle = int(3.0 / (low * PILOT_STEP))
+    sections, gain = _band(low, high)
     return np.asarray(sosfilt(sections, rng.standard_normal(n + settle))[settle:] * (rms / gain))
 
 

@@ -67,7 +67,7 @@ def test_files(suffix: str, tmp_path: Path, quadid: Callable[..., Outcome]) -> N
         (["nowhere/a.csv"], "folder"),
         (["a.csv", "--effect", "rotor_drug"], "rotor_drag"),
         (["a.csv", "--effect", "rotor_drag:k_z=1"], "k_x"),
-        (["a.csv", "--seconds", "-3"], "36000"),
+        (["a.csv", "--seconds", "-3"], "3600"),
         (["a.csv", "--vehicle", "pelikan"], "pelican"),
         (["a.csv", "--profile", "wild"], "excited"),
         (["udpout:14550"], "HOST:PORT"),
