@@ -265,7 +265,7 @@ class Shooting:
         sigma, coloured = np.sqrt(self.noise.variance), self.noise.coloured
 
         def run(first: int, last: int) -> None:
-            segment_grams(out, 1.0 / steps, weights, sigma, coloured, whitener, self.channels, first, last, grams)
+            segment_grams(out, steps, weights, sigma, coloured, whitener, first, last, grams)
 
         halves = [(0, count // 2), (count // 2, count)] if count > 20 else [(0, count)]
         list(worker_threads().map(lambda half: run(*half), halves))
