@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from quadid.errors import ParameterError, nearest
 FloatArray = NDArray[np.float64]
 
 
-class Status(str, Enum):
+class Status(StrEnum):
     """What the data say about one parameter."""
 
     IDENTIFIED = "identified"

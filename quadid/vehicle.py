@@ -105,7 +105,7 @@ class Noise(_Strict):
 
 
 class Stabiliser(_Strict):
-    """Gains of the on-board attitude stabiliser, where known: angle P [1/s], rate P and D, yaw, as in `quadid.flight`."""
+    """Gains of the on-board attitude stabiliser, where known; names as in `quadid.flight.stabiliser`."""
 
     gains: dict[str, float]
 
@@ -171,7 +171,9 @@ class Vehicle(_Strict):
         arms = np.array([r.position for r in self.rotors])[:, :2]
         spread = np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)
         if spread[-1] < 1e-4:
-            raise ValueError("all rotors lie on one line: roll and pitch cannot both be controlled; check positions [m]")
+            raise ValueError(
+                "all rotors lie on one line: roll and pitch cannot both be controlled; check positions [m]"
+            )
         if len({r.spin for r in self.rotors}) == 1:
             raise ValueError("all rotors spin the same way: yaw cannot be balanced; give both +1 and -1")
         return self
@@ -229,7 +231,9 @@ class Vehicle(_Strict):
         folder = resources.files("quadid") / "vehicles"
         names = sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".yaml"))
         if name not in names:
-            raise VehicleError(f"no shipped vehicle '{name}'", ", ".join(names) + ", or a YAML file", nearest(name, names))
+            raise VehicleError(
+                f"no shipped vehicle '{name}'", ", ".join(names) + ", or a YAML file", nearest(name, names)
+            )
         return cls.from_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"), f"{name}.yaml")
 
     def to_yaml(self) -> str:

@@ -123,7 +123,7 @@ class Window:
         position: shape (n, 3) [m], world NED; or None.
         battery: shape (n, 1) [V]; or None.
         attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
-        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading at t_k, linear between.
+        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
         name: where it came from.
         log_span: first and last time [s] of the whole log, for effects that run over a flight.
     """
@@ -151,7 +151,9 @@ class Window:
         rotor = _frozen(self.rotor_speed, "rotor_speed", None)
         if not np.all(np.isfinite(rotor)):
             bad = int(np.count_nonzero(~np.isfinite(rotor).all(axis=1)))
-            raise WindowError(f"{bad} rows of rotor_speed are not finite", "finite rotor speeds", "split the window there")
+            raise WindowError(
+                f"{bad} rows of rotor_speed are not finite", "finite rotor speeds", "split the window there"
+            )
         object.__setattr__(self, "rotor_speed", rotor)
         for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference"):
             values = getattr(self, name)

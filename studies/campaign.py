@@ -99,12 +99,17 @@ def _case(group: str, n: int) -> Case:
         return draw_effect(name, n, scale, craft, seconds)
 
     blank = Case(group, n, {}, (), vehicle=vehicle)
+    hidden: dict[str, dict[str, float]]
     if group == "null":
         return blank
     if group in ("single", "noisy", "short", "weak"):
         name = SINGLES[n % len(SINGLES)]
         hidden = draw(name, seconds=60.0 if group == "short" else 120.0)
-        changed = {"noisy": {"noise_scale": 3.0}, "short": {"seconds": 60.0}, "weak": {"profile": "gentle"}}
+        changed: dict[str, dict[str, Any]] = {
+            "noisy": {"noise_scale": 3.0},
+            "short": {"seconds": 60.0},
+            "weak": {"profile": "gentle"},
+        }
         return replace(blank, hidden=hidden, expected=tuple(hidden), **changed.get(group, {}))
     if group.startswith("size_"):
         name = SINGLES[n % len(SINGLES)]
@@ -120,7 +125,7 @@ def _case(group: str, n: int) -> Case:
         return replace(blank, outside={name: draw_outside(name, n)})
     if group == "clutter":
         large = SINGLES[n % len(SINGLES)]
-        hidden: dict[str, dict[str, float]] = {}
+        hidden = {}
         for i, name in enumerate(SINGLES):
             if name not in ("mass_change", "thrust_drop", "ground_effect", "wind"):
                 hidden.update({k: v for k, v in draw_effect(name, n + 1000 * i, 0.05, craft).items() if k == name})
@@ -208,6 +213,15 @@ def right(g: Graded) -> bool:
     return set(g.named) == set(g.case.expected)
 
 
+def _line(g: Graded) -> str:
+    """One wrong answer, for the log of a campaign."""
+    what = g.case.expected if g.case.group == "clutter" else g.case.hidden or g.case.outside
+    return (
+        f"{g.case.number} {g.case.vehicle} {g.verdict} {list(g.listed)} hidden {what} "
+        f"mse {g.mse_nominal:.3f} -> {g.mse_extended:.3f} rest {g.rest:.3f} {g.note}"
+    )
+
+
 def run_many(todo: Sequence[Case], processes: int = 2) -> list[Graded]:
     """Runs cases in worker processes, in order."""
     if processes <= 1:
@@ -233,10 +247,7 @@ def main() -> None:
         print(f"{group}: {good} of {len(graded)} right", flush=True)
         for g in graded:
             if not right(g):
-                what = g.case.hidden or g.case.outside
-                print("   ", g.case.number, g.case.vehicle, g.verdict, list(g.listed), "hidden", what if group != "clutter"
-                      else g.case.expected, f"mse {g.mse_nominal:.3f} -> {g.mse_extended:.3f} rest {g.rest:.3f}", g.note,
-                      flush=True)  # fmt: skip
+                print("   ", _line(g), flush=True)
         everything += [asdict(g) for g in graded]
     if options.out:
         Path(options.out).mkdir(parents=True, exist_ok=True)

@@ -101,7 +101,10 @@ def table(outcomes: list[Outcome]) -> str:
     limit = np.array([o.bound for o in outcomes])
     n = len(outcomes)
     inside = np.mean(np.abs(error) <= 1.959964 * sigma, axis=0)
-    rows = ["| parameter | RMS error % | bound % | ratio | bias % ± s.e. | coverage % ± s.e. |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| parameter | RMS error % | bound % | ratio | bias % ± s.e. | coverage % ± s.e. |",
+        "|---|---|---|---|---|---|",
+    ]
     for j, name in enumerate(NOMINAL_NAMES):
         rms, crb = np.sqrt(np.mean(error[:, j] ** 2)), np.sqrt(np.mean(limit[:, j] ** 2))
         normal = np.sqrt(np.mean((error[:, j] / limit[:, j]) ** 2))
@@ -130,8 +133,8 @@ def main() -> None:
         text += [f"## Noise × {scale}, {options.few} flights", "", table(part), ""]
     for profile in ("hover", "one_axis", "roll_pitch"):
         part = study([(20_000 + s, profile, 60.0, 1.0) for s in range(options.few)], options.processes)
-        text += [f"## Status, {profile}, {options.few} flights of 60 s", "", "| parameter | status: flights | bound % |",
-                 "|---|---|---|"]  # fmt: skip
+        text += [f"## Status, {profile}, {options.few} flights of 60 s", ""]
+        text += ["| parameter | status: flights | bound % |", "|---|---|---|"]
         for j, name in enumerate(NOMINAL_NAMES):
             names = [o.status[j] for o in part]
             counts = ", ".join(f"{s}: {names.count(s)}" for s in sorted(set(names)))

@@ -23,7 +23,7 @@ FEWEST_BLOCKS = 10
 
 
 def block_labels(lin: Linearised) -> NDArray[np.intp]:
-    """Block number of each segment, shape (segments,): stretches of 10 s, shorter when there would be fewer than ten."""
+    """Block number of each segment, shape (segments,): stretches of 10 s, shorter if there would be fewer than ten."""
     step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
     total = step * len(lin.time)
     length = min(BLOCK_SECONDS, max(total / FEWEST_BLOCKS, 2.0 * step))

@@ -75,7 +75,8 @@ def candidates(layout: Layout, has_velocity: bool, has_position: bool) -> list[C
 
     Args:
         layout: parameter vector of the vehicle.
-        has_velocity, has_position: which optional channels are measured.
+        has_velocity: velocity is measured.
+        has_position: position is measured.
     """
     out = []
     for effect in EFFECTS:
@@ -89,9 +90,7 @@ def candidates(layout: Layout, has_velocity: bool, has_position: bool) -> list[C
         names = tuple(n for n in layout.entries if n.split(".")[0] == effect and not n.endswith(".time"))
         timed = {"mass_change": ix.MASS_TIME, "thrust_drop": ix.DROP_TIME}.get(effect)
         requires = "rotor_drag" if effect in ("rotor_drag_moment", "wind") else None
-        out.append(
-            Candidate(effect, names, _STARTS.get(effect, ()), _FAMILY.get(effect, effect), requires, timed)
-        )
+        out.append(Candidate(effect, names, _STARTS.get(effect, ()), _FAMILY.get(effect, effect), requires, timed))
     if has_velocity:
         out.append(_in_wind(out))
     return out
@@ -113,7 +112,7 @@ def all_names(listed: list[Candidate]) -> list[str]:
 
 
 def unset_times(theta: FloatArray, active: set[str]) -> FloatArray:
-    """Vector whose unused change times lie before the log, so that the derivative to their fraction covers all of it."""
+    """Vector whose unused change times lie before the log, so that the derivative to a fraction covers all of it."""
     out = theta.copy()
     for effect, index in (("mass_change", ix.MASS_TIME), ("thrust_drop", ix.DROP_TIME)):
         if effect not in active:

@@ -30,9 +30,7 @@ def _sigmas(model: Model) -> dict[str, float]:
     return {e.name: float(s * k) for e, s, k in zip(model.free.entries, unc.sigma, scale, strict=True)}
 
 
-def _finding(
-    shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool
-) -> Finding:
+def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool) -> Finding:
     cause = worth.cause
     numbers = _numbers(shooting, search.model, cause, sigma)
     values = {p.name: p.value for p in numbers}
@@ -49,9 +47,7 @@ def _finding(
     )
 
 
-def _numbers(
-    shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]
-) -> tuple[FoundParameter, ...]:
+def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]) -> tuple[FoundParameter, ...]:
     spec = EFFECTS[cause.effect]
     if cause.effect == "weak_rotor":
         entry = shooting.layout.entry(cause.names[0])

@@ -108,7 +108,9 @@ def extend(shooting: Shooting, model: Model, candidate: Candidate, iterations: i
     """Refits `model` with `candidate` added, from each of its starts; returns the best.
 
     Args:
-        shooting: the problem; model: what to extend; candidate: the cause to add.
+        shooting: the problem.
+        model: what to extend.
+        candidate: the cause to add.
         iterations: linearisations a start may spend.
         far: also start from the vehicle file's nominal parameters, because without the cause the nominal ones may have
             been driven far away.

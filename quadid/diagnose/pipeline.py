@@ -36,7 +36,7 @@ Progress = Callable[[str, float], None]
 DECIDE_SECONDS = 1.0
 NOISE_ROUNDS = 2
 NOISE_FELL = 0.7
-"""When a channel's noise variance falls below this share once the causes are known, the selection is repeated with it."""
+"""When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.03
@@ -114,10 +114,8 @@ def diagnose(
     return result, Workings(search, short, decisive, left)
 
 
-def _with_better_noise(
-    windows: Sequence[Window], short: Shooting, decisive: Shooting, search: Search
-) -> Search:
-    """Re-estimates the noise around the selected model, where the flexible fit is closest to linear, and refits both."""
+def _with_better_noise(windows: Sequence[Window], short: Shooting, decisive: Shooting, search: Search) -> Search:
+    """Re-estimates the noise around the selected model, where the flexible fit is nearly linear, and refits both."""
     short.restore({})
     wide = short.free(free_names(search.model.causes))
     decisive.noise, _ = noise_floor(windows, short, search.model.theta, wide)

@@ -2,8 +2,8 @@
 
 The whitened residual of each segment, initial state eliminated, is taken apart into cosine modes.  Pure noise leaves
 every mode with the power that the elimination itself leaves it, which is computed with the same projection on drawn
-noise.  Modes that stand above the noise model by more than chance are structure, at a frequency, in a channel.  The noise
-model comes from a flexible fit and is flat below 3 Hz, so slow structure cannot hide in it.
+noise.  Modes that stand above the noise model by more than chance are structure, at a frequency, in a channel.  The
+noise model comes from a flexible fit and is flat below 3 Hz, so slow structure cannot hide in it.
 """
 
 from __future__ import annotations

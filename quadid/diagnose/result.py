@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 from quadid.diagnose.remainder import Remainder
 
 
-class Verdict(str, Enum):
+class Verdict(StrEnum):
     """Overall answer."""
 
     NOTHING_FOUND = "nothing_found"

@@ -55,7 +55,11 @@ def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Sc
     present = {c.label for c in model.causes}
     scores = []
     for candidate in listed:
-        if candidate.label in present or any(c.label in present for c in candidate.split) or (candidate.requires and candidate.requires not in model.effects):
+        if (
+            candidate.label in present
+            or any(c.label in present for c in candidate.split)
+            or (candidate.requires and candidate.requires not in model.effects)
+        ):
             continue
         mine = np.array([place[n] for n in candidate.names])
         if candidate.timed is None:
@@ -74,7 +78,7 @@ def _reduced(
     # Directions the model's own parameters already explain carry no information; keep them finite.
     s = s + np.diag(1e-9 * np.diag(h_mm) + 1e-2)
     z = -np.linalg.solve(s, g)
-    return float(-g @ z), z
+    return float(-g @ z), np.asarray(z, dtype=np.float64)
 
 
 def _score(

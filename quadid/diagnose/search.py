@@ -29,13 +29,13 @@ ERRORS = 2.0
 LEAST_GAIN = 15.0
 """… and this much deviance …"""
 LEAST_SHARE = 0.0012
-"""… and this share of the noise that no model can remove: less is of no use to anybody, and within what the time step
-of a simulation or of an autopilot's own filter can imitate."""
+"""… and this share of the noise that no model can remove: less is of no use to anybody, and within what the time
+step of a simulation or of an autopilot's own filter can imitate."""
 RELATIVE_GAIN = 1e-4
 """… and this share of all gains so far, so that the tail of a huge effect is not named as another."""
 FAMILY_SHARE = 0.01
-"""… and, where a look-alike is already in the model, this share of what that one gained: the rest of a fading thrust that
-is not quite linear is no second cause."""
+"""… and, where a look-alike is already in the model, this share of what that one gained: the rest of a fading thrust
+that is not quite linear is no second cause."""
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,7 @@ class Worth:
     deviance: float
 
 
-def validate(
-    decisive: Shooting, search: Search, logs: Sequence[Window]
-) -> tuple[Validation, tuple[Worth, ...]]:
+def validate(decisive: Shooting, search: Search, logs: Sequence[Window]) -> tuple[Validation, tuple[Worth, ...]]:
     """Scores nominal and extended model on unseen data, and each cause by leaving it out.
 
     Returns:
@@ -101,7 +99,8 @@ def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: in
     """Fits the initial states of all segments at fixed parameters and returns the last linearisation.
 
     Args:
-        scorer: the data; theta: full vector.
+        scorer: the data.
+        theta: full vector.
         names: entries in use (they decide whether velocity matters and filters must settle).
         rounds: Gauss-Newton steps on the initial states.
     """

@@ -1,4 +1,4 @@
-"""One sentence a finding, for a pilot: what it is, how large, how it shows, what it is worth."""
+"""One sentence a finding, for a pilot: what it is, how large, what it is worth."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _FORMS: dict[str, str] = {
     "attitude_delay": "the attitude estimate arrives {delay:.0f} ms late against the integrated gyro",
     "rotor_drag": "the rotors drag against sideways flight by {k_x:.2f} and {k_y:.2f} m/s^2 for each m/s",
     "parasitic_drag": "the frame's air drag grows with the square of speed, {c:.3f} 1/m",
-    "rotor_drag_moment": "rotor drag acts off the centre of gravity, {h_x:.1f} and {h_y:.1f} mm, and tilts the vehicle in "
-    "sideways flight",
+    "rotor_drag_moment": "rotor drag acts {h_x:.1f} and {h_y:.1f} mm off the centre of gravity and tilts the vehicle "
+    "in sideways flight",
     "rate_damping": "the air damps roll and pitch rotation by {l_p:.2f} and {m_q:.2f} 1/s",
     "axial_inflow": "thrust falls by {k_z:.2f} m/s^2 for each m/s of climb",
     "wind": "the air moved by {north:.1f} m/s north and {east:.1f} m/s east",
@@ -54,9 +54,12 @@ def evidence(effect: str, values: Mapping[str, float], before: float, after: flo
     Args:
         effect: contract name.
         values: its numbers in contract units.
-        before, after: mean squared error on unseen data without and with it (noise floor 1).
+        before: mean squared error on unseen data without it (noise floor 1).
+        after: the same with it.
     """
     factor = _FACTOR.get(effect, {})
     shown = {k: v * factor.get(k, 1.0) for k, v in values.items()}
     body = _FORMS[effect].format(**shown)
-    return f"{body[0].upper()}{body[1:]}; on unseen data the error falls from {before:.3g} to {after:.3g} times the noise."
+    return (
+        f"{body[0].upper()}{body[1:]}; on unseen data the error falls from {before:.3g} to {after:.3g} times the noise."
+    )

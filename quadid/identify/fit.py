@@ -30,7 +30,7 @@ FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
 SPECTRUM_SECONDS = 0.5
 FLEXIBLE_DRAG = 0.1
-"""Rotor drag [1/s] the flexible fit starts from, because velocities and moments of drag show only where there is any."""
+"""Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,9 @@ class Fit:
 def check_windows(windows: Sequence[Window]) -> None:
     """Raises when `windows` lack what identification needs, saying what is missing and how to get it."""
     if not windows:
-        raise WindowError("no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight")
+        raise WindowError(
+            "no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight"
+        )
     if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
         raise NotIdentifiableError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
     if len({round(w.dt, 9) for w in windows}) > 1:

@@ -31,7 +31,8 @@ def segment_grams(
         sigma: standard deviation of each channel (C,), for rows that are not whitened.
         coloured: True for channels to whiten, in segments that have all their samples.
         whitener: (C, length, length).
-        first, last: range of segments.
+        first: first segment.
+        last: one past the last.
         grams: (segments, width + 1, width + 1), written: products of the columns, the base residual last.
     """
     length, channels = weights.shape[1:]
@@ -81,7 +82,9 @@ def _columns(
                 for block in range(out.shape[0]):
                     row = out[block, first + s, i]
                     for lane in range(LANES):
-                        to[block * LANES + lane] = (row[c * LANES + lane] - base) * inverse[block * LANES + lane] * scale
+                        to[block * LANES + lane] = (
+                            (row[c * LANES + lane] - base) * inverse[block * LANES + lane] * scale
+                        )
                 to[0] = base * scale
 
 

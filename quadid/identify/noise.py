@@ -120,14 +120,14 @@ def estimate_noise(
     white, slow = guess.white.copy(), np.zeros(channels)
     for c in range(channels):
         complete = np.all(weights[:, :, c] > 0.0, axis=1)
-        basis, forms = _forms(length, round(dt / SLOW_TIME, 9), min(_POLYNOMIAL[c // 3], length - 2))
+        basis, forms = _forms(length, round(float(dt) / SLOW_TIME, 9), min(_POLYNOMIAL[c // 3], length - 2))
         if np.count_nonzero(complete) < 5:
             used = weights[:, :, c] > 0.0
             if np.count_nonzero(used) > 20:
                 # Scattered samples: fitting the initial state takes `order` of each segment's samples.
                 order = _POLYNOMIAL[c // 3]
                 left = np.count_nonzero(used) - order * np.count_nonzero(used.any(axis=1))
-                white[c] = np.sqrt(np.sum(residuals[:, :, c][used] ** 2) / max(left, 1) / freedom)
+                white[c] = np.sqrt(np.sum(residuals[:, :, c][used] ** 2) / max(float(left), 1.0) / freedom)
             continue
         r = residuals[complete, :, c]
         r = r - (r @ basis) @ basis.T
@@ -153,9 +153,7 @@ def _forms(length: int, step: float, order: int) -> tuple[FloatArray, tuple[Floa
     project = np.eye(length) - basis @ basis.T
     slow = _correlation(length, step)
     forms = [np.eye(length), slow]
-    expectation = np.array(
-        [[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms]
-    )
+    expectation = np.array([[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms])
     return basis, (forms[0], forms[1], expectation)
 
 

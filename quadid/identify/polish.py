@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ HUBER = 4.0
 """Residuals beyond this many sigma are down-weighted (Huber); Gaussian data lose nothing measurable."""
 
 
-class Convergence(str, Enum):
+class Convergence(StrEnum):
     """How a polish ended; the values read as sentences."""
 
     CONVERGED = "the step fell below the statistical resolution"

@@ -9,21 +9,22 @@ the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
+from quadid.identify.free import Free as Free
 from quadid.identify.gram_kernel import segment_grams
+from quadid.identify.initial_states import first_states, retract
+from quadid.identify.linearised import Linearised as Linearised
+from quadid.identify.linearised import join, log_determinant_beyond
 from quadid.identify.noise import NoiseModel
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES
-from quadid.model.layout import Entry, Layout
+from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
-from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -35,86 +36,11 @@ _RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 """Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
 VELOCITY_PRIOR = 4.0
 """Standard deviation [m/s] of a segment's initial velocity around dead reckoning where none is measured."""
-LEAK_SECONDS = 8.0
-"""Time in which dead-reckoned velocity is forgotten."""
 _VELOCITY_NAMES = ("rotor_drag.", "parasitic_drag.", "rotor_drag_moment.", "axial_inflow.", "ground_effect.", "wind.")
 _WARM_UP_NAMES = ("imu_lag.", "attitude_delay.")
 _WARM_UP_INDEX = (ix.IMU_PERIOD, ix.ATT_DELAY)
 _VELOCITY_INDEX = (ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.GROUND)
 _STEP_FRACTION = 1e-4
-
-
-@dataclass(frozen=True)
-class Free:
-    """The free parameters of a problem and how they are scaled.
-
-    Nominal parameters are searched on the log scale, effects in units of their typical size.
-
-    Attributes:
-        entries: in vector order.
-    """
-
-    entries: tuple[Entry, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Dotted names."""
-        return tuple(e.name for e in self.entries)
-
-    @property
-    def index(self) -> NDArray[np.intp]:
-        """Places in the full vector."""
-        return np.array([e.index for e in self.entries], dtype=np.intp)
-
-    @property
-    def is_log(self) -> NDArray[np.bool_]:
-        """True for parameters on the log scale."""
-        return np.array([e.name in NOMINAL_NAMES for e in self.entries], dtype=bool)
-
-    @property
-    def scale(self) -> FloatArray:
-        """Size of one unit of a linear parameter."""
-        return np.array([e.typical for e in self.entries])
-
-    def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
-        """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
-        out = theta.copy()
-        for e, step in zip(self.entries, z, strict=True):
-            value = out[e.index] * np.exp(step) if e.name in NOMINAL_NAMES else out[e.index] + step * e.typical
-            out[e.index] = min(max(value, e.lower), e.upper)
-        return out
-
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        """d parameter / d z at `theta`, shape (parameters,)."""
-        return np.where(self.is_log, theta[self.index], self.scale)
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """Per-segment quadratic model of the cost in the free parameters, initial states eliminated.
-
-    Attributes:
-        gram: shape (segments, P, P); grad: (segments, P); cost: (segments,), all for scaled parameters z:
-            ``cost(z) = cost + 2 grad z + z gram z``.
-        occam: what freeing unmeasured initial velocities costs, shape (segments,): the log-determinant that turns the
-            profile deviance into the marginal one; added when models are compared, zero where velocity matters not.
-        rows: independent residuals of each segment, measured samples less fitted initial-state directions.
-        residuals: predicted - measured at the linearisation point, channel units, (segments, length, channels).
-        weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
-        back: what gives the initial-state steps back: (offset (segments, k), slope (segments, k, P)).
-        window: index of the window of each segment; time: its first scored time [s].
-    """
-
-    gram: FloatArray
-    grad: FloatArray
-    cost: FloatArray
-    occam: FloatArray
-    rows: FloatArray
-    residuals: FloatArray
-    weights: FloatArray
-    back: tuple[FloatArray, FloatArray]
-    window: NDArray[np.intp]
-    time: FloatArray
 
 
 class Shooting:
@@ -159,7 +85,7 @@ class Shooting:
         """Current initial states `n_pre` rows before the segments; measured ones at first."""
         if n_pre not in self._x0:
             pairs = zip(self.rollouts, self.segments, strict=True)
-            self._x0[n_pre] = [_first_states(r, s, n_pre) for r, s in pairs]
+            self._x0[n_pre] = [first_states(r, s, n_pre) for r, s in pairs]
             self._reckoned[n_pre] = [x[:, 7:10].copy() for x in self._x0[n_pre]]
         return self._x0[n_pre]
 
@@ -207,18 +133,13 @@ class Shooting:
             columns = rolled[0, ..., : self.channels, 1 : k + 1] - rolled[0, ..., : self.channels, :1]
             flat = (columns / steps * weights[..., None]).reshape(len(x0), -1, k)
             flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / _RIDGE[:k])[None], len(flat), axis=0)], axis=1)
-            basis = np.linalg.qr(flat)[0][:, : -k]
-            jobs.append((rollout, cut, x0, weights, np.ascontiguousarray(basis.transpose(0, 2, 1))))
+            basis = np.linalg.qr(flat)[0][:, :-k]
+            row_weights = rollout.valid[:, : self.channels] / np.sqrt(self.noise.variance)
+            jobs.append((rollout, cut, x0, row_weights, basis))
 
         def cost(thetas: FloatArray) -> FloatArray:
-            total = np.zeros(len(thetas))
-            for rollout, cut, x0, weights, basis in jobs:
-                out, _ = rollout.roll(cut, thetas, x0, None, n_pre)
-                flat = (out[..., : self.channels, :] * weights[..., None]).reshape(*out.shape[:2], -1, LANES)
-                inside = np.matmul(basis, flat)
-                part = np.sum(flat * flat, axis=(1, 2)) - np.sum(inside * inside, axis=(1, 2))
-                total += part.reshape(-1)[: len(thetas)]
-            return total
+            parts = [r.costs(cut, thetas, x0, weights, basis, n_pre) for r, cut, x0, weights, basis in jobs]
+            return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
 
         return cost
 
@@ -237,7 +158,7 @@ class Shooting:
             base = np.ascontiguousarray(out[0, ..., : self.channels, 0])
             away = states[i][:, 7:10] - self._reckoned[n_pre][i]
             parts.append(self._eliminate(i, grams, base, weights, away, segments, k))
-        return _join(parts)
+        return join(parts)
 
     def _roll_directions(
         self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, n_pre: int, k: int
@@ -288,7 +209,7 @@ class Shooting:
             haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
             ga[:, 6:9] += v / VELOCITY_PRIOR**2
             cost += np.sum(v * v, axis=1) / VELOCITY_PRIOR**2
-            occam = _log_determinant_beyond(haa, 6) + 6.0 * np.log(VELOCITY_PRIOR)
+            occam = log_determinant_beyond(haa, 6) + 6.0 * np.log(VELOCITY_PRIOR)
         solved = np.linalg.solve(haa, np.concatenate([hab, ga[..., None]], axis=2))
         slope, offset = solved[..., :-1], solved[..., -1]
         hab_t = hab.transpose(0, 2, 1)
@@ -306,9 +227,7 @@ class Shooting:
             time=self.rollouts[i].window.t[segments.starts],
         )
 
-    def eliminated(
-        self, theta: FloatArray, free: Free
-    ) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_]]]:
+    def eliminated(self, theta: FloatArray, free: Free) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_]]]:
         """For each window, what the elimination of initial states does to the residual at `theta`.
 
         Yields:
@@ -350,7 +269,7 @@ class Shooting:
         da = np.clip(da, -limit, limit)
         out, place = [], 0
         for x0 in self.states(n_pre):
-            out.append(_retract(x0, da[place : place + len(x0)]))
+            out.append(retract(x0, da[place : place + len(x0)]))
             place += len(x0)
         return out
 
@@ -359,64 +278,6 @@ class Shooting:
         self.set_states(self._shape(theta, free)[0], states)
 
 
-def _log_determinant_beyond(h: FloatArray, first: int) -> FloatArray:
-    """Log-determinant of the Schur complement of the leading `first` directions in each matrix of h."""
-    whole, lead = np.linalg.slogdet(h)[1], np.linalg.slogdet(h[:, :first, :first])[1]
-    return np.asarray(whole - lead)
-
-
-def _first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray:
-    """Measured initial states; where velocity is not measured, that of dead reckoning."""
-    x0 = rollout.initial_states(segments, n_pre)
-    if rollout.window.velocity is None:
-        x0[:, 7:10] = dead_reckoning(rollout.window)[segments.starts - n_pre]
-    return x0
-
-
-def dead_reckoning(window: Window) -> FloatArray:
-    """Rough velocity (n, 3) [m/s], NED: integrated specific force, leaking to zero; zeros without attitude or accel.
-
-    The leak bounds what accelerometer and tilt errors add up to.  A starting point for fits in which velocity matters.
-    """
-    n = len(window)
-    if window.accel is None or window.attitude is None:
-        return np.zeros((n, 3))
-    q, f = window.attitude, window.accel
-    good = np.isfinite(q).all(axis=1) & np.isfinite(f).all(axis=1)
-    w, v = q[:, :1], q[:, 1:]
-    cross = np.cross(v, f)
-    acceleration = f + 2.0 * (w * cross + np.cross(v, cross)) + np.array([0.0, 0.0, GRAVITY])
-    acceleration[~good] = 0.0
-    keep = np.exp(-window.dt / LEAK_SECONDS)
-    return np.asarray(lfilter([window.dt], [1.0, -keep], acceleration, axis=0))
-
-
 def _weights(rollout: Rollout, segments: Segments, channels: int) -> FloatArray:
     rows = segments.starts[:, None] + np.arange(segments.length)
-    return rollout.valid[rows][..., :channels].astype(np.float64)
-
-
-def _retract(x0: FloatArray, da: FloatArray) -> FloatArray:
-    out = x0.copy()
-    half = 0.5 * da[:, :3]
-    dq = np.column_stack([np.ones(len(half)), half])
-    dq /= np.linalg.norm(dq, axis=1, keepdims=True)
-    w, v = x0[:, 0], x0[:, 1:4]
-    dw, dv = dq[:, 0], dq[:, 1:]
-    out[:, 0] = w * dw - np.sum(v * dv, axis=1)
-    out[:, 1:4] = w[:, None] * dv + dw[:, None] * v + np.cross(v, dv)
-    k = da.shape[1]
-    out[:, 4 : 4 + k - 3] += da[:, 3:]
-    return out
-
-
-def _join(parts: list[Linearised]) -> Linearised:
-    if len(parts) == 1:
-        return parts[0]
-
-    def cat(name: str) -> FloatArray:
-        return np.concatenate([getattr(p, name) for p in parts])
-
-    back = (np.concatenate([p.back[0] for p in parts]), np.concatenate([p.back[1] for p in parts]))
-    fields = ("gram", "grad", "cost", "occam", "rows", "residuals", "weights", "window", "time")
-    return replace(parts[0], back=back, **{f: cat(f) for f in fields})
+    return np.asarray(rollout.valid[rows][..., :channels], dtype=np.float64)

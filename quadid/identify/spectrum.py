@@ -34,7 +34,8 @@ def mode_power(
 
     Args:
         shooting: problem, with initial states at their optimum.
-        theta: full parameter vector; free: free parameters of the model (decide what is eliminated).
+        theta: full parameter vector.
+        free: free parameters of the model (decide what is eliminated).
         rng: for the drawn noise.
 
     Returns:

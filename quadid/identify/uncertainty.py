@@ -84,7 +84,11 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
     for j, e in enumerate(free.entries):
         value, half = float(theta[e.index]), Z95 * float(sigma[j])
         log = bool(free.is_log[j])
-        ci = (value * math.exp(-half), value * math.exp(half)) if log else (value - half * e.typical, value + half * e.typical)
+        ci = (
+            (value * math.exp(-half), value * math.exp(half))
+            if log
+            else (value - half * e.typical, value + half * e.typical)
+        )
         status, partner = _status(j, free, unc)
         out.append(
             Parameter(

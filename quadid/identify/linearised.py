@@ -1,0 +1,60 @@
+"""The quadratic model of every segment's cost, initial states eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Per-segment quadratic model of the cost in the free parameters, initial states eliminated.
+
+    Attributes:
+        gram: shape (segments, P, P); grad: (segments, P); cost: (segments,), all for scaled parameters z:
+            ``cost(z) = cost + 2 grad z + z gram z``.
+        occam: what freeing unmeasured initial velocities costs, shape (segments,): the log-determinant that turns the
+            profile deviance into the marginal one; added when models are compared, zero where velocity matters not.
+        rows: independent residuals of each segment, measured samples less fitted initial-state directions.
+        residuals: predicted - measured at the linearisation point, channel units, (segments, length, channels).
+        weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
+        back: what gives the initial-state steps back: (offset (segments, k), slope (segments, k, P)).
+        window: index of the window of each segment; time: its first scored time [s].
+    """
+
+    gram: FloatArray
+    grad: FloatArray
+    cost: FloatArray
+    occam: FloatArray
+    rows: FloatArray
+    residuals: FloatArray
+    weights: FloatArray
+    back: tuple[FloatArray, FloatArray]
+    window: NDArray[np.intp]
+    time: FloatArray
+
+
+def join(parts: list[Linearised]) -> Linearised:
+    """Puts the segments of several windows one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def cat(name: str) -> FloatArray:
+        return np.concatenate([getattr(p, name) for p in parts])
+
+    back = (np.concatenate([p.back[0] for p in parts]), np.concatenate([p.back[1] for p in parts]))
+    window = np.concatenate([p.window for p in parts])
+    fields = ("gram", "grad", "cost", "occam", "rows", "residuals", "weights", "time")
+    arrays: dict[str, Any] = {f: cat(f) for f in fields}
+    return replace(parts[0], back=back, window=window, **arrays)
+
+
+def log_determinant_beyond(h: FloatArray, first: int) -> FloatArray:
+    """Log-determinant of the Schur complement of the leading `first` directions in each matrix of h."""
+    whole, lead = np.linalg.slogdet(h)[1], np.linalg.slogdet(h[:, :first, :first])[1]
+    return np.asarray(whole - lead)
