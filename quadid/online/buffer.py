@@ -1,0 +1,247 @@
+"""Buffer of a live stream: samples of different rates, in any order, become rows of one uniform grid.
+
+The rules of resampling are those of logs (`quadid.tracks`): no lag is invented, gaps are not bridged.  Rows leave in
+blocks once every channel had `SETTLE` seconds to arrive, so the order in which messages of different topics come in
+changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import QuadidError
+from quadid.online.timebase import TimeBase
+from quadid.resample import split_stretches
+from quadid.rotor_signal import rotor_signal
+from quadid.tracks import GAP, OPTIONAL, REQUIRED, Track, make_plan, on_grid
+from quadid.vehicle import Vehicle
+from quadid.window import CHANNELS, Channel, Recording, Sample, Sampling
+
+FloatArray = NDArray[np.float64]
+
+SETTLE = 0.5
+"""Rows leave this long [s] after their time, so that slower and delayed channels are there."""
+BLOCK = 10
+"""Rows that leave at once."""
+HISTORY = 2.0
+"""Past samples kept [s]: rates and gaps are judged from them."""
+LOST = 2.05
+"""Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
+MOST_SAMPLES = 400_000
+"""A channel holds no more samples than this; a flood beyond is dropped and counted."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Consecutive rows of the grid.
+
+    Attributes:
+        t: times [s], shape (n,).
+        columns: values by channel, NaN where nothing was measured; only channels that say something.
+        sampling: meaning of the rotor rows; source: where the rotor speeds come from.
+        fresh: True when the grid was anchored anew before the first row: nothing may be joined across.
+        problem: why there are no rotor speeds, or empty.
+    """
+
+    t: FloatArray
+    columns: dict[str, FloatArray]
+    sampling: Sampling
+    source: str
+    fresh: bool = False
+    problem: str = ""
+
+
+class _Line:
+    """Samples of one channel, sorted by time."""
+
+    def __init__(self, columns: int) -> None:
+        self.t = np.empty(0)
+        self.values = np.empty((0, columns))
+        self.waiting_t: list[float] = []
+        self.waiting: list[tuple[float, ...]] = []
+
+    def settle(self, oldest: float) -> tuple[int, int]:
+        """Sorts waiting samples in; returns how many were too late (before `oldest`) and how many were duplicates."""
+        if not self.waiting_t:
+            return 0, 0
+        t, values = np.array(self.waiting_t), np.array(self.waiting)
+        self.waiting_t, self.waiting = [], []
+        in_time = t >= oldest
+        late = len(t) - int(np.count_nonzero(in_time))
+        t, values = np.concatenate([self.t, t[in_time]]), np.concatenate([self.values, values[in_time]])
+        steps = np.diff(t)
+        doubles = 0
+        if np.any(steps <= 0.0):
+            order = np.argsort(t, kind="stable")
+            t, values = t[order], values[order]
+            keep = np.concatenate([[True], np.diff(t) > 0.0])
+            doubles = len(t) - int(np.count_nonzero(keep))
+            t, values = t[keep], values[keep]
+        self.t, self.values = t, values
+        return late, doubles
+
+    def forget(self, before: float) -> None:
+        """Drops samples before a time [s]."""
+        first = int(np.searchsorted(self.t, before))
+        if first:
+            self.t, self.values = self.t[first:], self.values[first:]
+
+    def between(self, name: str, a: float, b: float) -> Channel | None:
+        """The samples in [a, b] as a channel; None when there are fewer than two."""
+        low, high = int(np.searchsorted(self.t, a)), int(np.searchsorted(self.t, b, side="right"))
+        if high - low < 2:
+            return None
+        values = self.values[low:high]
+        return Channel(name, self.t[low:high], _continuous(values) if name == "attitude" else values, name)
+
+
+class Buffer:
+    """Samples in, rows out.
+
+    Attributes:
+        faults: dropped samples by ``channel: reason``.
+        time: the time base.
+        counts: accepted samples by channel.
+        last: newest session time by channel [s].
+    """
+
+    def __init__(self, vehicle: Vehicle, rate: float = 50.0) -> None:
+        """Prepares for the channels of `vehicle` on a grid of `rate` [Hz]."""
+        self.faults: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
+        self.last: dict[str, float] = {}
+        self.time = TimeBase()
+        self._vehicle = vehicle
+        self._step = 1.0 / rate
+        rotors = len(vehicle.rotors)
+        self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
+        self._lines = {name: _Line(count) for name, count in self._columns.items()}
+        self._anchor: float | None = None
+        self._row = 0
+        self._steps_seen = 0
+        self._fresh = True
+
+    def push(self, sample: Sample) -> None:
+        """Takes one sample; what cannot be used is dropped and counted in `faults`."""
+        name, values = sample.channel, sample.values
+        columns = self._columns.get(name)
+        if columns is None:
+            self.faults["unknown channel"] += 1
+            return
+        if len(values) != columns:
+            self.faults[f"{name}: {len(values)} values instead of {columns}"] += 1
+            return
+        if not math.isfinite(sum(values)):
+            self.faults[f"{name}: not finite"] += 1
+            return
+        if name == "attitude" and (values := _unit(values)) == ():
+            self.faults["attitude: not a unit quaternion"] += 1
+            return
+        t = self.time.time(sample.t)
+        if t is None:
+            self.faults[f"{name}: unconfirmed time"] += 1
+            return
+        line = self._lines[name]
+        if len(line.waiting_t) >= MOST_SAMPLES:
+            self.faults[f"{name}: flood"] += 1
+            return
+        line.waiting_t.append(t)
+        line.waiting.append(values)
+        self.counts[name] += 1
+        if t > self.last.get(name, -math.inf):
+            self.last[name] = t
+
+    def next_rows(self) -> Rows | None:
+        """The next block of rows, or None until enough has arrived."""
+        if len(self.time.steps) > self._steps_seen:
+            self._steps_seen = len(self.time.steps)
+            self._restart(self.time.steps[-1])
+        if self._anchor is None and not self._set_anchor():
+            return None
+        assert self._anchor is not None
+        at: FloatArray = self._anchor + self._step * np.arange(self._row, self._row + BLOCK, dtype=np.float64)
+        if self.time.newest < at[-1] + SETTLE:
+            return None
+        self._settle(float(at[0]))
+        rows = self._grid(at)
+        self._row += BLOCK
+        self._fresh = False
+        for line in self._lines.values():
+            line.forget(float(at[0]) - HISTORY)
+        return rows
+
+    def _restart(self, start: float) -> None:
+        """Begins anew after a step of the clock: samples before it are done with."""
+        self._anchor, self._row, self._fresh = None, 0, True
+        for line in self._lines.values():
+            first = next((i for i, t in enumerate(line.waiting_t) if t >= start), len(line.waiting_t))
+            del line.waiting_t[:first], line.waiting[:first]
+            line.t, line.values = line.t[:0], line.values[:0]
+
+    def _set_anchor(self) -> bool:
+        """Puts the first grid point on the first sample of the gyro, so that a log on the grid passes bit for bit."""
+        if not self.time.newest > -math.inf or not self._lines["gyro"].waiting_t:
+            return False
+        first = min(self._lines["gyro"].waiting_t)
+        if self.time.newest < first + SETTLE:
+            return False
+        self._anchor, self._row = first, 0
+        return True
+
+    def _settle(self, start: float) -> None:
+        for name, line in self._lines.items():
+            late, doubles = line.settle(start - HISTORY if self._fresh else start - SETTLE)
+            if late:
+                self.faults[f"{name}: late"] += late
+            if doubles:
+                self.faults[f"{name}: duplicate"] += doubles
+
+    def _grid(self, at: FloatArray) -> Rows:
+        channels = {}
+        for name, line in self._lines.items():
+            channel = line.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
+            if channel is not None:
+                channels[name] = channel
+        recording = Recording("live", "stream", channels)
+        try:
+            rotor = rotor_signal(recording, self._vehicle)
+        except QuadidError as error:
+            empty = np.full((len(at), len(self._vehicle.rotors)), np.nan)
+            return Rows(at, {"rotor_speed": empty}, "held", "", self._fresh, str(error))
+        plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, 1.0 / self._step)
+        columns = {}
+        for name in (*REQUIRED, *OPTIONAL):
+            if name in plan.tracks:
+                values = on_grid(name, self._mended(plan.tracks[name]), at, plan)
+                if name in REQUIRED or not np.isnan(values).all():
+                    columns[name] = values
+        return Rows(at, columns, plan.sampling, rotor.source, self._fresh)
+
+    def _mended(self, track: Track) -> Track:
+        """The track with stretches joined where only a few packets of a fast stream were lost."""
+        longest = LOST * self._step
+        if len(track.stretches) < 2 or GAP * track.period >= longest:
+            return track
+        return replace(track, stretches=tuple(split_stretches(track.t, longest)))
+
+
+def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
+    """The quaternion at unit length; empty for what is no attitude."""
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if not 0.5 < norm < 2.0:
+        return ()
+    return q if abs(norm - 1.0) <= 1e-3 else tuple(c / norm for c in q)
+
+
+def _continuous(q: FloatArray) -> FloatArray:
+    """Signs such that neighbours are less than half a turn apart; shape (n, 4)."""
+    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+
+
+__all__ = ["BLOCK", "HISTORY", "SETTLE", "Buffer", "Rows"]

@@ -1,0 +1,212 @@
+"""What a sudden change was: look-alikes fitted to the seconds after it, everything known before held fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from quadid.errors import QuadidError
+from quadid.identify.noise import NoiseModel
+from quadid.identify.polish import Prior, polish
+from quadid.identify.shooting import Shooting
+from quadid.model import layout as ix
+from quadid.model.layout import LOSS, NEVER, Layout
+from quadid.online.monitor import Change
+from quadid.online.records import Alternative, OnlineFinding
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+SEGMENT = 0.5
+"""Length of the shooting segments [s]."""
+HELD = 0.01
+"""Nominal parameters may differ this much (log scale) from what was known before the change,"""
+HELD_THRUST = 0.003
+"""... the thrust coefficient only this much."""
+LOADED = 0.05
+"""... and inertias this much where mass was taken up."""
+PENALTY = 2.0
+"""Deviance that a free number has to earn (Akaike)."""
+CLEAR = 12.0
+"""Deviance by which a cause must beat its look-alikes to be named with confidence."""
+EFFECT_SIGMA = 0.3
+"""Prior of the size of a sudden change."""
+
+
+@dataclass(frozen=True)
+class ChangeRequest:
+    """A change to be explained.
+
+    Attributes:
+        number: counts requests of a session.
+        vehicle: the vehicle.
+        windows: data from the change on.
+        start, stop: their time [s].
+        theta: full vector known before; z_sigma: standard deviations of its nominal entries, log scale, shape (6,).
+        noise: sensor noise.
+        change: what was seen, at session time.
+        time: when, refined; in the time of the stream's stamps [s].
+    """
+
+    number: int
+    vehicle: Vehicle
+    windows: tuple[Window, ...]
+    start: float
+    stop: float
+    theta: FloatArray
+    z_sigma: FloatArray
+    noise: NoiseModel | None
+    change: Change
+    time: float
+
+
+@dataclass(frozen=True)
+class ChangeReply:
+    """Answer: findings (most likely first), or why there is none."""
+
+    number: int
+    finding: OnlineFinding | None = None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class _Cause:
+    effect: str
+    names: tuple[str, ...]
+    start: tuple[float, ...]
+    rotor: int = 0
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    cause: _Cause
+    theta: FloatArray
+    sigma: FloatArray
+    deviance: float
+    mse: float
+
+
+def explain_change(request: ChangeRequest) -> ChangeReply:
+    """Fits every look-alike to the data after the change; trouble is told in the reply, never raised."""
+    try:
+        return _explain(request)
+    except (QuadidError, np.linalg.LinAlgError) as error:
+        return ChangeReply(request.number, problem=str(error))
+
+
+def _explain(request: ChangeRequest) -> ChangeReply:
+    layout = Layout(request.vehicle)
+    shooting = Shooting(request.windows, request.vehicle, SEGMENT, request.noise, layout)
+    if shooting.count < 3:
+        return ChangeReply(request.number, problem="too little data after the change")
+    nothing = _fit(shooting, request, _Cause("", (), ()))
+    kept = shooting.snapshot()
+    outcomes = []
+    for cause in _causes(request):
+        shooting.restore(kept)
+        outcome = _fit(shooting, request, cause)
+        if np.isfinite(outcome.deviance):
+            outcomes.append(outcome)
+    outcomes = _without_idle(outcomes)
+    best = outcomes[0] if outcomes else nothing
+    drop = nothing.deviance - best.deviance
+    if not outcomes or drop < float(chi2.isf(1e-3 / len(outcomes), max(len(best.cause.names), 1))):
+        return ChangeReply(request.number, problem="no known cause explains it")
+    return ChangeReply(request.number, _finding(request, nothing, outcomes))
+
+
+def _causes(request: ChangeRequest) -> list[_Cause]:
+    size = request.change.size if request.change.channel == "thrust" else -0.05
+    rotors = len(request.vehicle.rotors)
+    return [
+        _Cause("mass_change", ("mass_change.fraction",), (float(np.clip(np.expm1(-size), -0.5, 0.8)),)),
+        _Cause("thrust_drop", ("thrust_drop.fraction",), (float(np.clip(-np.expm1(size), -0.5, 0.5)),)),
+        _Cause("cg_offset", ("cg_offset.x", "cg_offset.y"), (0.0, 0.0)),
+        _Cause("mass_change", ("mass_change.fraction", "cg_offset.x", "cg_offset.y"), (0.0, 0.0, 0.0), rotor=-1),
+        *(_Cause("weak_rotor", (f"weak_rotor.loss_{i + 1}",), (0.05,), i + 1) for i in range(rotors)),
+    ]
+
+
+def _without_idle(outcomes: list[_Outcome]) -> list[_Outcome]:
+    """Most likely first, without causes whose extra numbers earn nothing over a simpler one that they contain."""
+
+    def idle(outcome: _Outcome) -> bool:
+        mine = set(outcome.cause.names)
+        return any(
+            set(o.cause.names) < mine and o.deviance < outcome.deviance + CLEAR * max(o.mse, 1.0) for o in outcomes
+        )
+
+    return sorted((o for o in outcomes if not idle(o)), key=lambda o: o.deviance + PENALTY * len(o.cause.names))
+
+
+def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause) -> _Outcome:
+    free = shooting.free([*NOMINAL_NAMES, *cause.names])
+    theta = request.theta.copy()
+    theta[[ix.MASS_TIME, ix.DROP_TIME]] = -NEVER
+    place = free.index[len(NOMINAL_NAMES) :]
+    theta[place] = cause.start
+    known = np.hypot(request.z_sigma, HELD)
+    known[0] = np.hypot(request.z_sigma[0], HELD_THRUST)
+    if cause.effect == "mass_change":
+        loaded = [NOMINAL_NAMES.index(n) for n in ("J_xx", "J_yy", "J_zz")]
+        known[loaded] = np.hypot(request.z_sigma[loaded], LOADED)
+    width = EFFECT_SIGMA / free.scale[len(NOMINAL_NAMES) :]
+    if cause.effect == "cg_offset" or cause.rotor < 0:
+        width[-2:] = 20.0
+    prior = Prior(
+        np.concatenate([request.theta[: len(NOMINAL_NAMES)], np.zeros(len(place))]), np.concatenate([known, width])
+    )
+    result = polish(shooting, theta, free, prior, iterations=8)
+    covariance = np.linalg.inv(result.lin.gram.sum(axis=0) + np.diag(1.0 / prior.sigma**2))
+    sigma = np.sqrt(np.diag(covariance))[len(NOMINAL_NAMES) :] * free.scale[len(NOMINAL_NAMES) :]
+    rows = max(float(result.lin.rows.sum()), 1.0)
+    return _Outcome(cause, result.theta, sigma, result.cost, float(result.lin.cost.sum()) / rows)
+
+
+def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]) -> OnlineFinding:
+    best = outcomes[0]
+    rivals: dict[str, _Outcome] = {}
+    for outcome in outcomes[1:]:
+        if outcome.cause.effect != best.cause.effect:
+            rivals.setdefault(outcome.cause.effect, outcome)
+    scale = max(best.mse, 1.0)
+    lead = min((r.deviance - best.deviance for r in rivals.values()), default=np.inf) / scale
+    drop = (nothing.deviance - best.deviance) / scale
+    values, sigma, units = _numbers(request, best)
+    p_value = float(min(1.0, chi2.sf(drop, len(best.cause.names)) * len(outcomes)))
+    alternatives = tuple(Alternative(name, r.mse) for name, r in rivals.items())
+    finding = OnlineFinding(
+        best.cause.effect, values, sigma, units, nothing.mse, best.mse, p_value, alternatives, "", lead > CLEAR
+    )  # fmt: skip
+    return replace(finding, evidence=_evidence(request, finding))
+
+
+def _numbers(request: ChangeRequest, best: _Outcome) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
+    """Values, standard deviations and units in the form of the vehicle file."""
+    cause = best.cause
+    if cause.effect == "weak_rotor":
+        loss = float(best.theta[LOSS + cause.rotor - 1])
+        return {"rotor": float(cause.rotor), "loss": loss}, {"loss": float(best.sigma[0])}, {"rotor": "", "loss": ""}
+    if cause.effect == "cg_offset":
+        x, y = float(best.theta[ix.CGX]), float(best.theta[ix.CGY])
+        sigma = {"x": float(best.sigma[0]), "y": float(best.sigma[1])}
+        return {"x": x, "y": y}, sigma, {"x": "m", "y": "m"}
+    place = ix.MASS_FRACTION if cause.effect == "mass_change" else ix.DROP_FRACTION
+    values = {"time": request.time, "fraction": float(best.theta[place])}
+    return values, {"time": 0.05, "fraction": float(best.sigma[0])}, {"time": "s", "fraction": ""}
+
+
+def _evidence(request: ChangeRequest, finding: OnlineFinding) -> str:
+    seen = request.change
+    text = (
+        f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
+        f"residual {finding.mse_before:.2f} falls to {finding.mse_after:.2f} with {finding.effect}"
+    )
+    if finding.alternatives:
+        text += f", to {min(a.mse_after for a in finding.alternatives):.2f} with the next look-alike"
+    return text

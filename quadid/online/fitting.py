@@ -1,0 +1,197 @@
+"""The fit of one window: what the background worker does.  A pure function of its request."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import QuadidError
+from quadid.identify.excitation import bounds_of
+from quadid.identify.fit import SWARM_SECONDS, FitOptions, residual_noise, swarm_search
+from quadid.identify.noise import NoiseModel
+from quadid.identify.polish import Polished, Prior, polish, robust_weights
+from quadid.identify.shooting import Free, Shooting
+from quadid.model.layout import Layout
+from quadid.online.fusion import WindowEstimate
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+FIT_SECONDS = 1.0
+"""Length of the shooting segments [s]."""
+SEARCH = FitOptions(particles=48, iterations=40)
+"""Swarm of the first fit: six parameters, a factor of 4 each way."""
+EXCITED = 0.02
+"""A window is excited when roll and pitch inertia can be had from it alone to this relative standard deviation."""
+TIGHTEST = 0.2
+"""Smallest standard deviation (log scale) that a vehicle file's own may have as a prior online."""
+RATED = ("J_xx", "J_yy")
+"""Parameters whose bound decides on excitation."""
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """A window to be fitted.
+
+    Attributes:
+        number: counts requests of a session.
+        vehicle: the vehicle.
+        windows: stretches of data on one grid.
+        start, stop: the time they stand for [s].
+        theta: full parameter vector to start from.
+        noise: sensor noise; None lets the fit estimate it.
+        search: run the swarm first: nothing is known yet, or the vehicle has changed.
+        seed: of the swarm.
+        measure: measure the sensor noise in this window too.
+    """
+
+    number: int
+    vehicle: Vehicle
+    windows: tuple[Window, ...]
+    start: float
+    stop: float
+    theta: FloatArray
+    noise: NoiseModel | None
+    search: bool
+    seed: int
+    measure: bool = False
+
+
+@dataclass(frozen=True)
+class FitReply:
+    """Answer to a request.
+
+    Attributes:
+        number: of the request.
+        problem: why there is no estimate, or empty.
+        excitation: relative standard deviations that this window alone allows, shape (6,); None after a failure.
+        excited: whether they suffice.
+        estimate: quadratic model at the optimum.
+        theta: full parameter vector there.
+        noise: noise it was weighted with.
+        measured: noise measured in this window, when that was asked for.
+    """
+
+    number: int
+    problem: str = ""
+    excitation: FloatArray | None = None
+    excited: bool = False
+    estimate: WindowEstimate | None = None
+    theta: FloatArray | None = None
+    noise: NoiseModel | None = None
+    measured: NoiseModel | None = None
+
+
+def scaled(free: Free, theta: FloatArray) -> FloatArray:
+    """Scaled parameters of a full vector: logarithms of nominal ones, typical sizes for effects; shape (P,)."""
+    values = theta[free.index]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(free.is_log, np.log(values), values / free.scale)
+
+
+def unscaled(free: Free, theta: FloatArray, z: FloatArray) -> FloatArray:
+    """Full vector `theta` with the free entries replaced by scaled parameters `z`."""
+    out = theta.copy()
+    out[free.index] = np.where(free.is_log, np.exp(z), z * free.scale)
+    return out
+
+
+def prior_of(vehicle: Vehicle) -> Prior:
+    """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
+    sigma = []
+    for name in NOMINAL_NAMES:
+        p = vehicle.parameters[name]
+        low, high = p.limits
+        wide = 0.5 * float(np.log(high / low))
+        sigma.append(min(max(p.sigma / p.initial, TIGHTEST), wide) if p.sigma else wide)
+    return Prior(vehicle.initial, np.array(sigma))
+
+
+def fit_window(request: FitRequest) -> FitReply:
+    """Fits one window; trouble is told in the reply, never raised."""
+    try:
+        return _fit(request)
+    except (QuadidError, np.linalg.LinAlgError) as error:
+        return FitReply(request.number, problem=str(error))
+
+
+def _fit(request: FitRequest) -> FitReply:
+    layout = Layout(request.vehicle)
+    theta, noise = request.theta, request.noise
+    shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+    if shooting.count == 0:
+        return FitReply(request.number, problem="no stretch is long enough for one segment")
+    free = shooting.free(list(NOMINAL_NAMES))
+    bounds = bounds_of(shooting.linearise(theta, free).gram.sum(axis=0))
+    if not is_excited(bounds):
+        return FitReply(request.number, excitation=bounds)
+    if request.search or noise is None:
+        theta, noise = _search(request, layout)
+        shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+    result = _polish(shooting, theta, free)
+    if not np.isfinite(result.cost):
+        return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
+    lin = result.lin
+    information = lin.gram.sum(axis=0)
+    estimate = WindowEstimate(
+        request.start, request.stop, scaled(free, result.theta), information, lin.grad.sum(axis=0),
+        float(lin.cost.sum()), float(lin.rows.sum()),
+    )  # fmt: skip
+    measured = _measure_noise(request, layout, result.theta, noise) if request.measure else None
+    return FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured)
+
+
+def is_excited(bounds: FloatArray) -> bool:
+    """Whether a window reveals roll and pitch dynamics."""
+    place = [NOMINAL_NAMES.index(name) for name in RATED]
+    return bool(np.all(bounds[place] <= EXCITED))
+
+
+def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel]:
+    """Global search and sensor noise from short segments, all structure counted as noise."""
+    short = Shooting(request.windows, request.vehicle, SWARM_SECONDS, request.noise, layout)
+    free = short.free(list(NOMINAL_NAMES))
+    options = FitOptions(SEARCH.particles, SEARCH.iterations, seed=request.seed)
+    theta, _ = swarm_search(short, request.theta, free, options, lambda stage, share: None)
+    result = polish(short, theta, free, iterations=8)
+    short.noise = residual_noise(short, result)
+    result = polish(short, result.theta, free, iterations=8)
+    return result.theta, residual_noise(short, result)
+
+
+def _measure_noise(request: FitRequest, layout: Layout, theta: FloatArray, noise: NoiseModel) -> NoiseModel:
+    """Sensor noise of this window, from short segments around the optimum."""
+    short = Shooting(request.windows, request.vehicle, SWARM_SECONDS, noise, layout)
+    return residual_noise(short, polish(short, theta, short.free(list(NOMINAL_NAMES)), iterations=3))
+
+
+def _polish(shooting: Shooting, theta: FloatArray, free: Free) -> Polished:
+    """Gauss-Newton to the optimum, then once more with outliers down-weighted."""
+    prior = prior_of(shooting.vehicle)
+    result = polish(shooting, theta, free, prior, iterations=8)
+    if not np.isfinite(result.cost):
+        return result
+    shooting.robust = list(robust_weights(shooting, result.lin))
+    return polish(shooting, result.theta, free, prior, iterations=4)
+
+
+def warm_up(vehicle: Vehicle) -> None:
+    """Compiles or loads every kernel that a fit needs, on two seconds of made-up hover."""
+    rows, dt = 150, 0.02
+    speed = np.full((rows, len(vehicle.rotors)), vehicle.hover_speed())
+    speed += 5.0 * np.sin(np.arange(rows)[:, None] * 0.3 + np.arange(speed.shape[1]))
+    attitude = np.zeros((rows, 4))
+    attitude[:, 0] = 1.0
+    accel = np.zeros((rows, 3))
+    accel[:, 2] = -9.80665
+    for sampling in ("held", "instant"):
+        window = Window(0.0, dt, speed, np.zeros((rows, 3)), attitude, accel, sampling=sampling)
+        layout = Layout(vehicle)
+        request = FitRequest(0, vehicle, (window,), 0.0, 3.0, layout.initial(vehicle), None, True, 0)
+        theta, noise = _search(request, layout)
+        shooting = Shooting((window,), vehicle, FIT_SECONDS, noise, layout)
+        _polish(shooting, theta, shooting.free(list(NOMINAL_NAMES)))

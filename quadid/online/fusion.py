@@ -1,0 +1,212 @@
+"""Fusion of window estimates over time: information adds up, old information fades, changes are detected.
+
+Every window gives a quadratic model of its cost around its estimate.  In scaled parameters z (logarithms of the nominal
+six) that is a Fisher information matrix H and a vector h = H z - g; both add.  Windows overlap, so each counts with the
+share of its time that no earlier window has counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+FloatArray = NDArray[np.float64]
+
+DRIFT = 0.02
+"""Parameters may honestly differ this much (log scale) from window to window: what no simulation of this kind has."""
+CHANGE_PROBABILITY = 1e-5
+"""A window whose disagreement with the fused estimate is less probable than this tells a change, if the next agrees."""
+SCATTER_PRIOR = 30.0
+"""Degrees of freedom with which windows are believed to scatter as they claim."""
+KEPT_WINDOWS = 120
+"""Window estimates kept for agreement and held-out gain."""
+
+
+@dataclass(frozen=True)
+class WindowEstimate:
+    """What one window says.
+
+    Attributes:
+        start, stop: its time [s].
+        z: scaled parameters where it was linearised, shape (P,).
+        information: Fisher information there, without prior, shape (P, P).
+        score: half the gradient of the cost there, shape (P,).
+        cost: cost at z; rows: independent residuals, so that cost / rows is 1 at the noise floor.
+    """
+
+    start: float
+    stop: float
+    z: FloatArray
+    information: FloatArray
+    score: FloatArray
+    cost: float
+    rows: float
+
+    @property
+    def mse(self) -> float:
+        """Mean squared whitened residual; 1 at the noise floor."""
+        return self.cost / max(self.rows, 1.0)
+
+    @property
+    def scale(self) -> float:
+        """Factor on its information: residuals above the noise floor make it count less."""
+        return 1.0 / max(self.mse, 1.0)
+
+    def deviance(self, z: FloatArray) -> float:
+        """Cost of `z` in this window above that of its own estimate, in units of its residual level."""
+        step = z - self.z
+        return float(2.0 * self.score @ step + step @ self.information @ step) * self.scale
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A fused estimate: scaled parameters and covariance (prior included), shapes (P,) and (P, P)."""
+
+    z: FloatArray
+    covariance: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations, shape (P,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a window agrees with what was known before it.
+
+    Attributes:
+        statistic: squared Mahalanobis distance; limit: its allowed value.
+        known: False when nothing was known before it.
+    """
+
+    statistic: float
+    limit: float
+    known: bool = True
+
+    @property
+    def agrees(self) -> bool:
+        """True when the window fits what was known."""
+        return not self.known or self.statistic <= self.limit
+
+
+@dataclass(frozen=True)
+class _Sum:
+    """Accumulated information up to a time."""
+
+    stop: float
+    matrix: FloatArray
+    vector: FloatArray
+
+
+class Fusion:
+    """Running estimate of one vehicle.
+
+    Attributes:
+        windows: estimates that were taken in, oldest first.
+        counted: end of the data taken in [s].
+    """
+
+    def __init__(self, mean: FloatArray, sigma: FloatArray, memory: float, drift: float = DRIFT) -> None:
+        """Starts from the prior.
+
+        Args:
+            mean: scaled parameters of the prior, shape (P,).
+            sigma: its standard deviations, shape (P,).
+            memory: time constant of forgetting [s] of data taken in.
+            drift: honest difference between windows, log scale.
+        """
+        self._mean, self._precision = mean, np.diag(1.0 / sigma**2)
+        self._memory, self._drift = memory, drift
+        self.windows: deque[WindowEstimate] = deque(maxlen=KEPT_WINDOWS)
+        self._sums: deque[_Sum] = deque(maxlen=KEPT_WINDOWS)
+        self.counted = -math.inf
+
+    def forget(self) -> None:
+        """Drops everything learned: the vehicle has changed."""
+        self.windows.clear()
+        self._sums.clear()
+
+    def judge(self, window: WindowEstimate) -> Verdict:
+        """Compares a window with the estimate from data before it (chi-square with the honest drift allowed)."""
+        earlier = self._before(window.start)
+        limit = float(chi2.isf(CHANGE_PROBABILITY, len(self._mean)))
+        if earlier is None:
+            return Verdict(0.0, limit, known=False)
+        before, own = self._solve(earlier), self._alone(window)
+        spread = before.covariance + own.covariance + self._drift**2 * np.eye(len(self._mean))
+        difference = own.z - before.z
+        return Verdict(float(difference @ np.linalg.solve(spread, difference)), limit)
+
+    def add(self, window: WindowEstimate) -> None:
+        """Takes a window in, with the share of its time that is new."""
+        fresh = window.stop - max(window.start, self.counted)
+        share = min(max(fresh / (window.stop - window.start), 0.0), 1.0)
+        size = len(self._mean)
+        old = self._sums[-1] if self._sums else _Sum(-math.inf, np.zeros((size, size)), np.zeros(size))
+        fade = math.exp(-max(fresh, 0.0) / self._memory) if math.isfinite(old.stop) else 0.0
+        weight = share * window.scale
+        matrix = fade * old.matrix + weight * window.information
+        vector = fade * old.vector + weight * (window.information @ window.z - window.score)
+        self._sums.append(_Sum(window.stop, matrix, vector))
+        self.windows.append(window)
+        self.counted = max(self.counted, window.stop)
+
+    def estimate(self) -> Fused | None:
+        """The fused estimate, its covariance widened where windows scatter more than they should; None before data."""
+        if not self._sums:
+            return None
+        fused = self._solve(self._sums[-1])
+        return Fused(fused.z, fused.covariance * self.scatter(fused.z))
+
+    def before(self, start: float) -> FloatArray | None:
+        """Scaled parameters from windows that ended by `start`; None when there are none."""
+        earlier = self._before(start)
+        return None if earlier is None else self._solve(earlier).z
+
+    def disjoint(self, most: int = 12) -> list[WindowEstimate]:
+        """Newest windows that share no sample, newest first."""
+        out: list[WindowEstimate] = []
+        for window in reversed(self.windows):
+            if not out or window.stop <= out[-1].start + 1e-6:
+                out.append(window)
+                if len(out) == most:
+                    break
+        return out
+
+    def scatter(self, z: FloatArray) -> float:
+        """Variance of disjoint windows about `z` relative to what they claim, at least 1, shrunk towards 1."""
+        windows = self.disjoint()
+        if len(windows) < 3:
+            return 1.0
+        total = 0.0
+        for window in windows:
+            own = self._alone(window)
+            difference = own.z - z
+            total += float(difference @ np.linalg.solve(own.covariance, difference))
+        freedom = len(z) * (len(windows) - 1)
+        return max((total + SCATTER_PRIOR) / (freedom + SCATTER_PRIOR), 1.0)
+
+    def distance(self, window: WindowEstimate, z: FloatArray) -> float:
+        """Squared Mahalanobis distance of a window's own estimate from `z`, honest drift allowed."""
+        own = self._alone(window)
+        difference = own.z - z
+        return float(difference @ np.linalg.solve(own.covariance + self._drift**2 * np.eye(len(z)), difference))
+
+    def _before(self, start: float) -> _Sum | None:
+        return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)
+
+    def _alone(self, window: WindowEstimate) -> Fused:
+        matrix = window.scale * window.information
+        vector = window.scale * (window.information @ window.z - window.score)
+        return self._solve(_Sum(window.stop, matrix, vector))
+
+    def _solve(self, total: _Sum) -> Fused:
+        matrix = total.matrix + self._precision
+        z = np.linalg.solve(matrix, total.vector + self._precision @ self._mean)
+        return Fused(np.asarray(z), np.asarray(np.linalg.inv(matrix)))

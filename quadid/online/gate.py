@@ -1,0 +1,238 @@
+"""The gate: ordered checks between an estimate and the parameter topic, each with a reason a person can act on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from quadid.online.quality import Quality
+from quadid.online.records import OnlineSet, SetState
+from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status, impossible_inertia
+
+MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
+"""Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
+Z95 = 1.959963984540054
+
+
+class GateSettings(BaseModel):
+    """How cautious the gate is.
+
+    Attributes:
+        approval: ``auto``: what passes is published; ``manual``: it waits for a person.
+        windows: windows without a common sample that must agree.
+        width: largest half-width of the 95 % interval of b, J_xx, J_yy, relative.
+        yaw_width: the same of d, J_zz, J_r where the data claim to know them.
+        step: largest change of a parameter from the set in force, relative.
+        creep: largest change from the last set that a person approved, or the first of this flight.
+        agility: largest change of torque over inertia from the set in force, relative: what a controller's gain margin
+            has to bear.
+        inertia_slack: how far the triangle inequality of the inertias may be broken.
+        gain: deviance per held-out window that counts as a real gain over the set in force.
+        sharper: a set is also published when the interval of a parameter has shrunk to this share.
+        watch: deviance by which a new set may lose to its predecessor before it is taken back.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    approval: Literal["auto", "manual"] = "auto"
+    windows: int = Field(default=3, ge=2, le=20)
+    width: float = Field(default=0.05, gt=0.0, le=1.0)
+    yaw_width: float = Field(default=0.3, gt=0.0, le=3.0)
+    step: float = Field(default=0.25, gt=0.0, le=2.0)
+    creep: float = Field(default=0.4, gt=0.0, le=4.0)
+    agility: float = Field(default=0.4, gt=0.0, le=4.0)
+    inertia_slack: float = Field(default=1.5, ge=1.0, le=3.0)
+    gain: float = Field(default=6.0, gt=0.0)
+    sharper: float = Field(default=0.8, gt=0.0, lt=1.0)
+    watch: float = Field(default=30.0, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the gate is told about an estimate.
+
+    Attributes:
+        parameters: the estimate.
+        quality: of the newest window.
+        excited: whether the newest window revealed anything.
+        thrust_ratio: thrust by this estimate over measured specific force times mass, newest window.
+        agreeing: windows without a common sample, newest first, that agree with it, up to the first that does not.
+        disagreement: what differs in that one, or empty.
+        held_out: gain over the set in force (or the first guess) in each window that neither had seen.
+        in_force: the set in force.
+        baseline: the set from which creeping is measured.
+        approval: auto or manual, now.
+    """
+
+    parameters: ParameterSet
+    quality: Quality
+    excited: bool
+    thrust_ratio: float
+    agreeing: int
+    disagreement: str
+    held_out: tuple[float, ...]
+    in_force: OnlineSet | None
+    baseline: OnlineSet | None
+    approval: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Outcome: the state the set gets, the check that decided, and why."""
+
+    state: SetState
+    check: str
+    reason: str
+
+
+Check = Callable[[Case, GateSettings], str | None]
+
+
+def decide(case: Case, settings: GateSettings) -> Decision:
+    """Runs the checks in order; the first that objects decides."""
+    for name, check in CHECKS:
+        reason = check(case, settings)
+        if reason is None:
+            continue
+        if name == "step_limit" and _step(case, _doubled(settings)) is None:
+            return Decision(SetState.PENDING, name, f"{reason}: a person must approve it")
+        return Decision(SetState.REJECTED, name, reason)
+    story = f"{case.agreeing} windows agree; {_gain_text(case)}"
+    if case.approval != "auto":
+        return Decision(SetState.PENDING, "approval", f"waits for approval: {story}")
+    return Decision(SetState.ACCEPTED, "approval", story)
+
+
+def _doubled(settings: GateSettings) -> GateSettings:
+    """Limits up to which a person may approve a step."""
+    wide = {name: 2.0 * getattr(settings, name) for name in ("step", "creep", "agility")}
+    return settings.model_copy(update=wide)
+
+
+def _quality(case: Case, settings: GateSettings) -> str | None:
+    return case.quality.fault or None
+
+
+def _flying(case: Case, settings: GateSettings) -> str | None:
+    return case.quality.grounded or None
+
+
+def _excitation(case: Case, settings: GateSettings) -> str | None:
+    return None if case.excited else "the newest window does not reveal roll and pitch dynamics: move the sticks more"
+
+
+def _bounds(case: Case, settings: GateSettings) -> str | None:
+    for p in case.parameters:
+        if not math.isfinite(p.value) or not math.isfinite(p.sigma):
+            return f"{p.name} = {p.value:g} {p.unit} with standard deviation {p.sigma:g} is not a number"
+        if p.name in NOMINAL_NAMES and not p.value > 0.0:
+            return f"{p.name} = {p.value:g} {p.unit} is not positive"
+        low, high = p.bounds
+        slack = 1e-9 * abs(p.value)
+        if not low + slack < p.value < high - slack and p.status is not Status.PRIOR_DOMINATED:
+            return f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]"
+    why = impossible_inertia([case.parameters[n].value for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack)
+    if why:
+        return f"impossible inertia: {why}"
+    if not 0.8 < case.thrust_ratio < 1.25:
+        return f"b would give {case.thrust_ratio:.2f} times the thrust that the accelerometer felt"
+    return None
+
+
+def _width(case: Case, settings: GateSettings) -> str | None:
+    for p in case.parameters:
+        half = Z95 * p.sigma / max(abs(p.value), 1e-300)
+        if p.name in MUST_BE_KNOWN:
+            if p.status is Status.PRIOR_DOMINATED or half > settings.width:
+                return f"{p.name} is known to {half:.1%} only, wanted {settings.width:.1%}: keep flying"
+        elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
+            return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
+    return None
+
+
+def _agreement(case: Case, settings: GateSettings) -> str | None:
+    if case.disagreement:
+        return f"windows disagree: {case.disagreement}"
+    if case.agreeing < settings.windows:
+        return f"{case.agreeing} of {settings.windows} windows without a common sample agree so far: keep flying"
+    return None
+
+
+def _held_out(case: Case, settings: GateSettings) -> str | None:
+    fresh = case.in_force is None or case.in_force.state is SetState.STALE
+    if fresh and not case.held_out:
+        return "no window yet that the estimate has not seen"
+    if not all(math.isfinite(g) for g in case.held_out):
+        return "the estimate cannot be scored on data it has not seen"
+    total, n = sum(case.held_out), len(case.held_out)
+    if total < -settings.gain * n:
+        return f"predicts unseen data worse than the set in force: deviance {-total:.1f} more in {n} windows"
+    if fresh or (n and total > settings.gain * n) or _is_sharper(case, settings):
+        return None
+    return "no news: the set in force predicts as well and its intervals are about as narrow"
+
+
+def _is_sharper(case: Case, settings: GateSettings) -> bool:
+    assert case.in_force is not None
+    old = case.in_force.parameters
+    return any(
+        p.sigma < settings.sharper * old[p.name].sigma and p.status is not Status.PRIOR_DOMINATED
+        for p in case.parameters
+        if p.name in old.names
+    )
+
+
+def _step(case: Case, settings: GateSettings) -> str | None:
+    for reference, limit, what in (
+        (case.in_force, settings.step, "the set in force"),
+        (case.baseline, settings.creep, "the approved baseline"),
+    ):
+        if reference is None:
+            continue
+        for p in case.parameters:
+            if p.name not in reference.parameters.names:
+                continue
+            old = reference.parameters[p.name]
+            known = Status.PRIOR_DOMINATED not in (p.status, old.status)
+            change = p.value / old.value - 1.0 if p.name in NOMINAL_NAMES and old.value > 0.0 else 0.0
+            # What was only guessed before may be learned: its own interval says how far it may move.
+            room = limit + (2.0 * old.sigma / old.value if known and old.value > 0.0 else math.inf)
+            if abs(math.log1p(change)) > math.log1p(room):
+                return f"{p.name} would change by {change:+.0%} from {what}, allowed {limit:.0%}"
+    return _agility(case, settings)
+
+
+def _agility(case: Case, settings: GateSettings) -> str | None:
+    if case.in_force is None:
+        return None
+    old = case.in_force.parameters
+    for name in ("J_xx", "J_yy"):
+        ratio = (case.parameters["b"].value / case.parameters[name].value) / (old["b"].value / old[name].value)
+        if abs(math.log(ratio)) > math.log1p(settings.agility):
+            return f"torque over inertia ({name}) would change by {ratio - 1.0:+.0%}, a controller may not bear that"
+    return None
+
+
+def _gain_text(case: Case) -> str:
+    total, n = float(np.sum(case.held_out)), len(case.held_out)
+    if n == 0:
+        return "narrower intervals than before"
+    return f"deviance on {n} unseen windows {total:+.1f} better than before"
+
+
+CHECKS: tuple[tuple[str, Check], ...] = (
+    ("data_quality", _quality),
+    ("flying", _flying),
+    ("excitation", _excitation),
+    ("physical_bounds", _bounds),
+    ("interval_width", _width),
+    ("agreement", _agreement),
+    ("held_out_gain", _held_out),
+    ("step_limit", _step),
+)
+"""Name and function of every check, in the order in which they are asked."""

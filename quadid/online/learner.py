@@ -1,0 +1,239 @@
+"""The estimate of one vehicle while it flies: requests fits, fuses their replies, and states the case for the gate."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from quadid.identify.noise import NoiseModel
+from quadid.identify.shooting import Free
+from quadid.identify.uncertainty import Uncertainty, parameter_set
+from quadid.model.layout import Layout
+from quadid.online.fitting import FitReply, FitRequest, prior_of, scaled, unscaled
+from quadid.online.fusion import Fused, Fusion, WindowEstimate
+from quadid.online.gate import Case
+from quadid.online.quality import Quality
+from quadid.online.records import OnlineSet
+from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+AGREEMENT_PROBABILITY = 1e-3
+"""A window disagrees with the fused estimate when a distance like its own is less probable than this."""
+HELD_OUT_WINDOWS = 4
+"""Newest windows without a common sample in which sets are compared."""
+NOISE_EVERY = 5
+"""Every so many windows the sensor noise is measured anew, and pooled."""
+NOISE_POOL = 24
+"""Windows whose noise is pooled, newest counting fully."""
+
+
+class Learner:
+    """Estimate of one vehicle.
+
+    Attributes:
+        fusion: the fused windows.
+        theta: full parameter vector, the best at hand.
+        learned: whether `theta` rests on data.
+        excitation: of the newest window, shape (6,); NaN before.
+        start: first time of the data learned from [s]; NaN before.
+        rows: grid rows learned from.
+        input_hash: SHA-256 over seed and windows learned from.
+    """
+
+    def __init__(self, vehicle: Vehicle, memory: float, seed: int) -> None:
+        """Starts from the vehicle file."""
+        self._vehicle, self._seed = vehicle, seed
+        self._layout = Layout(vehicle)
+        self._initial = self._layout.initial(vehicle)
+        self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
+        prior = prior_of(vehicle)
+        self._prior_sigma = prior.sigma
+        self.fusion = Fusion(np.log(prior.mean), prior.sigma, memory)
+        self._noise: NoiseModel | None = None
+        self._pool = 0
+        self.theta = self._initial
+        self.learned = False
+        self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
+        self.start = math.nan
+        self.rows = 0
+        self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
+        self._search = True
+        self._asked: tuple[Window, ...] = ()
+
+    @property
+    def input_hash(self) -> str:
+        """SHA-256 (hex) over vehicle, seed and all windows learned from."""
+        return self._hash.hex()
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        """Pooled sensor noise; None before the first fit."""
+        return self._noise
+
+    @property
+    def z_sigma(self) -> FloatArray:
+        """Standard deviations of the nominal six, log scale; the prior's before anything was learned."""
+        fused = self.fusion.estimate()
+        return self._prior_sigma if fused is None else fused.sigma
+
+    def value(self, name: str) -> float:
+        """A nominal parameter, the best at hand."""
+        return float(self.theta[NOMINAL_NAMES.index(name)])
+
+    def start_from(self, known: OnlineSet) -> None:
+        """Starts the search from a restored set instead of the vehicle file's guess."""
+        for p in known.parameters:
+            if p.name in NOMINAL_NAMES:
+                self.theta = self.theta.copy()
+                self.theta[self._layout.entry(p.name).index] = min(max(p.value, p.bounds[0]), p.bounds[1])
+
+    def forget(self) -> None:
+        """The vehicle has changed: what was learned no longer holds; the next fit searches globally."""
+        self.fusion.forget()
+        self.start, self.rows, self._search, self.learned = math.nan, 0, True, False
+
+    def request(self, number: int, windows: tuple[Window, ...], start: float, stop: float) -> FitRequest:
+        """The fit of a window."""
+        self._asked = windows
+        measure = len(self.fusion.windows) % NOISE_EVERY == 0
+        return FitRequest(
+            number, self._vehicle, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure
+        )  # fmt: skip
+
+    def take(self, reply: FitReply, trusted: bool) -> None:
+        """Fuses a reply; one that is not trusted (it disagrees) leaves the estimate as it was."""
+        if reply.excitation is not None:
+            self.excitation = reply.excitation
+        if reply.estimate is None or reply.theta is None or not trusted:
+            return
+        self._pool_noise(reply)
+        for window in self._asked:
+            self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
+            self.start = window.t0 if math.isnan(self.start) else self.start
+        dt = self._asked[0].dt if self._asked else 0.0
+        if dt:
+            new = reply.estimate.stop - max(self.fusion.counted, reply.estimate.start)
+            self.rows += round(max(new, 0.0) / dt)
+        self.fusion.add(reply.estimate)
+        self._search = False
+        fused = self.fusion.estimate()
+        assert fused is not None
+        self.theta, self.learned = unscaled(self._free, self._initial, fused.z), True
+
+    def _pool_noise(self, reply: FitReply) -> None:
+        if reply.noise is None:
+            return
+        if self._noise is None or self._search:
+            self._noise, self._pool = reply.noise, 1
+            return
+        if reply.measured is None:
+            return
+        self._pool = min(self._pool + 1, NOISE_POOL)
+        share = 1.0 / self._pool
+        white, slow = (
+            np.sqrt((1.0 - share) * old**2 + share * new**2)
+            for old, new in ((self._noise.white, reply.measured.white), (self._noise.slow, reply.measured.slow))
+        )
+        self._noise = NoiseModel(white, slow, self._noise.slow_time)
+
+    def parameters(self) -> ParameterSet | None:
+        """The fused estimate with intervals and status; None before data."""
+        fused = self.fusion.estimate()
+        if fused is None:
+            return None
+        theta = unscaled(self._free, self._initial, fused.z)
+        unc = Uncertainty(fused.covariance, np.ones(len(fused.z)), self._prior_sigma)
+        return parameter_set(self._free, theta, self._initial, unc)
+
+    def deviance(self, window: WindowEstimate, known: OnlineSet | None) -> float:
+        """Deviance of a set, or of the first guess, in a window."""
+        return window.deviance(self._z(known))
+
+    def _z(self, known: OnlineSet | None) -> FloatArray:
+        theta = self._initial.copy()
+        for p in known.parameters if known is not None else ():
+            if p.name in NOMINAL_NAMES:
+                theta[self._layout.entry(p.name).index] = p.value
+        return scaled(self._free, theta)
+
+    def case(
+        self, parameters: ParameterSet, quality: Quality, reply: FitReply, in_force: OnlineSet | None,
+        baseline: OnlineSet | None, approval: str, most: int, seen: float,
+    ) -> Case:  # fmt: skip
+        """What the gate needs to know about the present estimate.
+
+        Args:
+            parameters: the estimate.
+            quality: of the newest window.
+            reply: its fit.
+            in_force: as in `Case`.
+            baseline: as in `Case`.
+            approval: as in `Case`.
+            most: windows whose agreement is asked for.
+            seen: end of the data that the set in force rests on [s]; minus infinity for none of this flight.
+        """
+        fused = self.fusion.estimate()
+        assert fused is not None
+        agreeing, disagreement = self._agreement(fused, max(most, 3))
+        gains = self._held_out(in_force, seen)
+        ratio = self._thrust_ratio(float(parameters["b"].value))
+        return Case(
+            parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval
+        )  # fmt: skip
+
+    def scores(self) -> tuple[float, float]:
+        """Mean squared residual of the newest window: fitted, and under an estimate that had not seen it, or NaN."""
+        if not self.fusion.windows:
+            return math.nan, math.nan
+        newest = self.fusion.windows[-1]
+        earlier = self.fusion.before(newest.start)
+        if earlier is None:
+            return newest.mse, math.nan
+        return newest.mse, newest.mse + newest.deviance(earlier) / newest.scale / max(newest.rows, 1.0)
+
+    def _agreement(self, fused: Fused, most: int) -> tuple[int, str]:
+        limit = float(chi2.isf(AGREEMENT_PROBABILITY, len(fused.z)))
+        agreeing = 0
+        for window in self.fusion.disjoint(most):
+            if self.fusion.distance(window, fused.z) > limit:
+                return agreeing, self._worst(window, fused)
+            agreeing += 1
+        return agreeing, ""
+
+    def _worst(self, window: WindowEstimate, fused: Fused) -> str:
+        spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + 4e-4)
+        j = int(np.argmax(np.abs(window.z - fused.z) / spread))
+        return f"{NOMINAL_NAMES[j]} differs by {np.expm1(window.z[j] - fused.z[j]):+.1%} in one of them"
+
+    def _held_out(self, in_force: OnlineSet | None, seen: float) -> tuple[float, ...]:
+        """Gain over the set in force in disjoint windows after `seen` [s], by estimates that had not seen them."""
+        reference, out = self._z(in_force), []
+        for window in self.fusion.disjoint(HELD_OUT_WINDOWS):
+            earlier = self.fusion.before(window.start)
+            if earlier is not None and window.start >= seen - 1e-6:
+                out.append(window.deviance(reference) - window.deviance(earlier))
+        return tuple(out)
+
+    def _thrust_ratio(self, b: float) -> float:
+        """Thrust by `b` over what the accelerometer felt, newest window; 1 where the model has other thrust terms."""
+        if set(self._vehicle.effects) & {"thrust_curve", "axial_inflow", "battery_sag", "thrust_drop", "mass_change"}:
+            return 1.0
+        lift = [-w.accel[:, 2] for w in self._asked if w.accel is not None]
+        felt = float(np.nanmean(np.concatenate(lift))) if lift else GRAVITY
+        total = float(np.mean(np.concatenate([np.sum(w.rotor_speed**2, axis=1) for w in self._asked])))
+        return b * total / (self._vehicle.mass * max(felt, 1e-3))
+
+
+def _bytes(window: Window) -> bytes:
+    parts = [np.array([window.t0, window.dt]).tobytes()]
+    for name in ("rotor_speed", "gyro", "attitude", "accel", "velocity", "position"):
+        values = getattr(window, name)
+        parts.append(name.encode() if values is None else values.tobytes())
+    return b"".join(parts)

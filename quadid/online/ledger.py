@@ -1,0 +1,139 @@
+"""Which set is in force: numbering, approval, watching a new set against its predecessor, rollback."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from quadid.online.records import Event, OnlineSet, Publish, SetState
+
+Action = Publish | Event
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answer to a command: whether it did something, and a sentence."""
+
+    done: bool
+    text: str
+    actions: tuple[Action, ...] = ()
+
+
+class Ledger:
+    """Accepted sets of one vehicle.
+
+    Attributes:
+        in_force: the set that the parameter topic holds; None before the first.
+        pending: the set that waits for approval.
+        baseline: set from which creeping is measured: the last one a person approved, else the first.
+        approval: auto or manual; a rollback by a person makes it manual.
+        seen: end of the data that the set in force rests on [s, session time]; minus infinity for none of this flight.
+    """
+
+    def __init__(self, approval: str, restored: OnlineSet | None = None, next_sequence: int = 1) -> None:
+        """Starts empty, or from the last accepted set of an earlier run, which is stale until revalidated."""
+        self.approval = approval
+        self.pending: OnlineSet | None = None
+        self.in_force: OnlineSet | None = None
+        self._earlier: list[OnlineSet] = []
+        self._next = max(next_sequence, restored.sequence + 1 if restored else 1)
+        if restored is not None:
+            reason = f"from an earlier run ({restored.reason}): not yet confirmed by this flight"
+            self.in_force = replace(restored, state=SetState.STALE, reason=reason)
+        self.baseline = self.in_force
+        self.seen = -math.inf
+        self._pending_stop = -math.inf
+        self._watched, self._watch_from = 0.0, math.inf
+
+    @property
+    def predecessor(self) -> OnlineSet | None:
+        """The set a rollback would return to."""
+        return self._earlier[-1] if self._earlier else None
+
+    def accept(self, item: OnlineSet, by: str, t: float, stop: float) -> list[Action]:
+        """Puts a set in force.
+
+        Args:
+            item: the set.
+            by: who approved it.
+            t: now, as a stamp [s].
+            stop: end of the data it rests on [s, session time].
+        """
+        accepted = replace(item, sequence=self._number(), state=SetState.ACCEPTED, approved_by=by)
+        if self.in_force is not None and self.in_force.state is not SetState.STALE:
+            self._earlier.append(self.in_force)
+            del self._earlier[:-20]
+        self.in_force, self.pending = accepted, None
+        if self.baseline is None or by != "auto":
+            self.baseline = accepted
+        self._watched, self._watch_from, self.seen = 0.0, stop, stop
+        return [
+            Publish("parameters", accepted),
+            Event(t, "info", "accepted", f"set {accepted.sequence} in force: {accepted.reason}"),
+        ]
+
+    def hold(self, item: OnlineSet, stop: float) -> OnlineSet:
+        """Keeps a set for approval and numbers it; a newer one takes the place of an older; `stop` as in `accept`."""
+        self._pending_stop = stop
+        number = self.pending.sequence if self.pending is not None else self._number()
+        self.pending = replace(item, sequence=number, state=SetState.PENDING)
+        return self.pending
+
+    def drop_pending(self) -> None:
+        """Forgets the set that waits for approval."""
+        self.pending = None
+
+    def approve(self, t: float, by: str, sequence: int | None = None) -> Answer:
+        """A person approves the waiting set; a second approval, or one of another number, does nothing."""
+        if self.pending is None:
+            return Answer(False, "nothing waits for approval")
+        if sequence is not None and sequence != self.pending.sequence:
+            return Answer(False, f"set {sequence} is not the one that waits ({self.pending.sequence})")
+        number = self.pending.sequence
+        item = replace(self.pending, reason=f"approved by {by}: {self.pending.reason}")
+        actions = self.accept(item, by, t, self._pending_stop)
+        assert self.in_force is not None
+        return Answer(True, f"set {number} approved, in force as set {self.in_force.sequence}", tuple(actions))
+
+    def roll_back(self, t: float, by: str, why: str = "") -> Answer:
+        """Returns to the set before the one in force, under a new number."""
+        if not self._earlier:
+            return Answer(False, "there is no earlier set to return to")
+        assert self.in_force is not None
+        bad, good = self.in_force, self._earlier.pop()
+        reason = f"set {good.sequence} again, in place of set {bad.sequence}: {why or 'asked for by ' + by}"
+        self.in_force = replace(
+            good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by
+        )
+        self.pending = None
+        self._watch_from = math.inf
+        if by != "auto":
+            self.approval, self.baseline = "manual", self.in_force
+        event = Event(t, "warning", "rollback", reason)
+        return Answer(True, reason, (Publish("parameters", self.in_force), event))
+
+    def watch(self, start: float, stop: float, loss: float) -> bool:
+        """Adds what the set in force lost to its predecessor in a window it had not seen.
+
+        Args:
+            start: of the window [s, session time]; windows count once, and only after the set was made.
+            stop: its end [s].
+            loss: deviance of the set in force above that of its predecessor.
+
+        Returns:
+            The window was counted.
+        """
+        if start < self._watch_from - 1e-6:
+            return False
+        self._watch_from = stop
+        self._watched = max(self._watched + loss, 0.0)
+        return True
+
+    @property
+    def watched(self) -> float:
+        """Deviance lost to the predecessor so far; gains do not pile up."""
+        return self._watched
+
+    def _number(self) -> int:
+        self._next += 1
+        return self._next - 1

@@ -1,0 +1,173 @@
+"""Is this window fit to be learned from?  Stuck, saturated or mis-scaled sensors, and whether the vehicle flies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+STUCK_SECONDS = 1.0
+"""A sensor that repeats itself to the bit for longer than this [s] is stuck."""
+SATURATED_SHARE = 0.02
+"""More than this share of samples at exactly the largest value: the sensor is at its limit."""
+DEGREES = 180.0 / np.pi
+THRUST_KNOWN = (0.5, 2.0)
+"""Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
+THRUST_GUESSED = (0.2, 5.0)
+"""... and while it is only the vehicle file's guess."""
+TUMBLED = 0.0
+"""Cosine of the tilt [1] below which the vehicle has tumbled or lies on its side."""
+IMPACT = 8.0 * GRAVITY
+"""Specific force [m/s^2] that only a crash brings."""
+FLOOR_SLOPE = 0.2
+"""Specific force must follow thrust at least with this slope [1]; on the ground it does not follow at all."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Verdict on one window: `fault` names a broken sensor, `grounded` why it is not flight; both empty when good."""
+
+    fault: str = ""
+    grounded: str = ""
+
+
+def judge(windows: Sequence[Window], vehicle: Vehicle, b: float, known: bool) -> Quality:
+    """Judges the windows of one fit.
+
+    Args:
+        windows: stretches on the grid.
+        vehicle: the vehicle.
+        b: thrust coefficient [N s^2/rad^2], the best estimate at hand.
+        known: whether `b` was identified or is a guess.
+    """
+    # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
+    for window in windows:
+        grounded = _unloaded(_weight_share(window, vehicle, b), window.dt, known)
+        if grounded:
+            return Quality(grounded=grounded)
+        fault = _broken(window) or _units(window)
+        if fault:
+            return Quality(fault=fault)
+    return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, b))), ""))
+
+
+def _broken(window: Window) -> str:
+    still = round(STUCK_SECONDS / window.dt)
+    for name in ("gyro", "accel", "attitude", "rotor_speed"):
+        values = getattr(window, name)
+        if values is None:
+            continue
+        rows = values[np.isfinite(values).all(axis=1)]
+        if len(rows) > still and _longest_repeat(rows) > still:
+            return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
+        if name in ("gyro", "accel") and len(rows) and (axis := _saturated(rows)) is not None:
+            top = float(np.max(np.abs(rows[:, axis])))
+            return f"{name} axis {'xyz'[axis]} is saturated at {top:.4g}: widen its range"
+    return ""
+
+
+def _longest_repeat(rows: FloatArray) -> int:
+    same = np.concatenate([[False], np.all(rows[1:] == rows[:-1], axis=1), [False]])
+    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
+    return int(np.max(edges[1::2] - edges[::2], initial=0))
+
+
+def _saturated(rows: FloatArray) -> int | None:
+    size = np.abs(rows)
+    top = size.max(axis=0)
+    share = np.mean(size >= top * (1.0 - 1e-9), axis=0)
+    bad = np.flatnonzero((share > SATURATED_SHARE) & (top > 0.0) & (len(rows) * share > 5))
+    return int(bad[0]) if len(bad) else None
+
+
+def _units(window: Window) -> str:
+    """Names a wrong unit or frame that would otherwise be fitted into the parameters."""
+    if window.accel is not None and np.isfinite(window.accel).any():
+        mean = np.nanmean(window.accel, axis=0)
+        size = float(np.linalg.norm(mean))
+        if 0.7 < size < 1.3:
+            return f"accelerometer reads {size:.2f} on average: it looks like g, wanted m/s^2"
+        if mean[2] > 0.5 * GRAVITY and size > 0.7 * GRAVITY:
+            return f"accelerometer reads {mean[2]:+.1f} m/s^2 along z: it looks like z up (FLU), wanted z down (FRD)"
+    ratio = _rate_ratio(window)
+    if ratio is not None and 0.5 * DEGREES < ratio < 2.0 * DEGREES:
+        return f"gyro is {ratio:.0f} times what the attitude turns: it looks like deg/s, wanted rad/s"
+    return ""
+
+
+def _rate_ratio(window: Window) -> float | None:
+    """Size of the gyro over that of the attitude's own turning rate; None where the attitude hardly turns."""
+    if window.attitude is None or window.gyro is None:
+        return None
+    q = window.attitude
+    step = np.abs(np.einsum("ij,ij->i", q[1:], q[:-1]))
+    rate = 2.0 * np.arccos(np.clip(step, 0.0, 1.0)) / window.dt
+    size = np.linalg.norm(window.gyro[:-1], axis=1)
+    good = np.isfinite(rate) & np.isfinite(size)
+    if np.count_nonzero(good) < 50 or np.median(rate[good]) < 0.05:
+        return None
+    return float(np.sqrt(np.mean(size[good] ** 2)) / max(np.sqrt(np.mean(rate[good] ** 2)), 1e-9))
+
+
+def _weight_share(window: Window, vehicle: Vehicle, b: float) -> FloatArray:
+    """Thrust over weight, shape (n,)."""
+    return np.asarray(b * np.sum(window.rotor_speed**2, axis=1) / (vehicle.mass * GRAVITY))
+
+
+def _unloaded(share: FloatArray, dt: float, known: bool) -> str:
+    """Says that the rotors do not carry the vehicle; judged second by second, back from the end."""
+    low, high = THRUST_KNOWN if known else THRUST_GUESSED
+    second = max(round(1.0 / dt), 1)
+    first = len(share) % second or second
+    means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
+    if not min(means) > low:
+        return f"rotors carry {min(means):.0%} of the weight: on the ground"
+    if not max(means) < high:
+        return f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying"
+    return ""
+
+
+def _not_flying(window: Window, vehicle: Vehicle, b: float) -> str:
+    """Says why a window with turning rotors is not flight, or returns an empty string.
+
+    A flying vehicle is upright, and its specific force follows its thrust; on the ground the floor carries the rest and
+    the accelerometer reads gravity whatever the rotors do.
+    """
+    if window.attitude is not None and np.isfinite(window.attitude).any():
+        x, y = window.attitude[:, 1], window.attitude[:, 2]
+        if float(np.nanmin(1.0 - 2.0 * (x * x + y * y))) < TUMBLED:
+            return "tumbled, or lying on its side"
+    if window.accel is None or not np.isfinite(window.accel).any():
+        return ""
+    if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:
+        return f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
+    return _floor(window, _weight_share(window, vehicle, b))
+
+
+def _floor(window: Window, thrust: FloatArray) -> str:
+    """The accelerometer must follow the thrust where the thrust varies enough to tell."""
+    assert window.accel is not None
+    width = max(round(0.1 / window.dt), 1)
+    rows = len(thrust) // width * width
+    force = -window.accel[:rows, 2].reshape(-1, width) / GRAVITY
+    given = thrust[:rows].reshape(-1, width)
+    both = np.isfinite(force).all(axis=1)
+    x, y = given[both].mean(axis=1), force[both].mean(axis=1)
+    if len(x) < 10:
+        return ""
+    x, y = x - x.mean(), y - y.mean()
+    power = float(x @ x)
+    if power == 0.0:
+        return ""
+    slope = float(x @ y) / power
+    error = float(np.sqrt(np.sum((y - slope * x) ** 2) / max(len(x) - 2, 1) / power))
+    if slope + 3.0 * error < FLOOR_SLOPE and error < 0.2:
+        return f"specific force follows thrust with slope {slope:.2f} only: something carries the vehicle"
+    return ""

@@ -1,0 +1,146 @@
+"""What a session hands out: parameter sets with their story, findings, and events worth a line in the history."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from quadid.parameters import ParameterSet
+
+
+class Phase(StrEnum):
+    """What a session is doing; the values read as sentences."""
+
+    WAITING = "waiting for data"
+    COLLECTING = "collecting the first window"
+    BLOCKED = "an input is missing or inconsistent"
+    NOT_FLYING = "not flying: nothing is learned"
+    NOT_EXCITED = "the motion does not reveal the parameters"
+    FITTING = "a fit is running"
+    FAILED = "the last fit failed"
+    CANDIDATE = "an estimate exists, the gate holds it back"
+    PENDING = "an estimate passed the gate and waits for approval"
+    ACCEPTED = "a parameter set is in force"
+
+
+class SetState(StrEnum):
+    """State of one parameter set."""
+
+    REJECTED = "rejected"
+    PENDING = "pending"
+    ACCEPTED = "accepted"
+    ROLLED_BACK = "rolled_back"
+    STALE = "stale"
+
+
+@dataclass(frozen=True)
+class OnlineSet:
+    """A parameter set and where it comes from.
+
+    Attributes:
+        sequence: counts the sets of a vehicle from 1; 0: never numbered (a candidate that was refused).
+        state: what became of it; reason: why, one sentence.
+        parameters: values, covariance, status.
+        start, stop: first and last time of the data it rests on [s], the session's time.
+        samples: grid rows in them.
+        mse: mean squared residual over noise variance in the newest window; mse_held_out: the same of an estimate that
+            had not seen that window; NaN: none.
+        input_hash: SHA-256 of the windows and the seed that led here.
+        approved_by: ``auto``, a person, or empty.
+        check: the gate's check that decided.
+    """
+
+    sequence: int
+    state: SetState
+    reason: str
+    parameters: ParameterSet
+    start: float
+    stop: float
+    samples: int
+    mse: float = float("nan")
+    mse_held_out: float = float("nan")
+    input_hash: str = ""
+    approved_by: str = ""
+    check: str = ""
+
+
+@dataclass(frozen=True)
+class Publish:
+    """Action: publish a set.
+
+    Attributes:
+        topic: ``parameters`` (in force, latched) or ``candidate`` (every fit with its reason).
+        item: the set.
+    """
+
+    topic: str
+    item: OnlineSet
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A look-alike that was fitted against a finding, and the cost left with it (1: noise)."""
+
+    effect: str
+    mse_after: float
+
+
+@dataclass(frozen=True)
+class OnlineFinding:
+    """One cause of a sudden change.
+
+    Attributes:
+        effect: name in the catalogue.
+        values, sigma: its numbers by name, SI; units: their units.
+        mse_before, mse_after: mean squared residual over noise variance around the change without and with it.
+        p_value: of its absence, corrected for what was tried.
+        alternatives: look-alikes.
+        evidence: one sentence.
+        confident: whether it beats its look-alikes.
+    """
+
+    effect: str
+    values: Mapping[str, float]
+    sigma: Mapping[str, float]
+    units: Mapping[str, str]
+    mse_before: float
+    mse_after: float
+    p_value: float
+    alternatives: tuple[Alternative, ...]
+    evidence: str
+    confident: bool = True
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """Action: publish findings.
+
+    Attributes:
+        t: when they were known [s]; start, stop: the data they rest on [s].
+        findings: most important first; empty: a change whose cause is unknown.
+        verdict: ``explained`` or ``unknown``.
+    """
+
+    t: float
+    start: float
+    stop: float
+    findings: tuple[OnlineFinding, ...]
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Event:
+    """Action: a line for the history and, from `level` warning on, for people.
+
+    Attributes:
+        t: session time [s].
+        level: ``info``, ``warning`` or ``error``.
+        kind: short fixed word, for machines.
+        text: sentence for people.
+    """
+
+    t: float
+    level: str
+    kind: str
+    text: str

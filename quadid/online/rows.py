@@ -1,0 +1,163 @@
+"""The last seconds of grid rows, and windows cut from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.online.buffer import Rows
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+SHORTEST = 2.0
+"""A stretch without gaps shorter than this [s] is left out of a window."""
+COMPLETE = 0.8
+"""A window needs this share of its time in usable stretches."""
+LONGEST_GYRO_GAP = 3
+"""More missing gyro rows in a row than this end a stretch."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What a window time holds.
+
+    Attributes:
+        windows: stretches without gaps, in order.
+        seconds: time in them [s].
+        gaps: number of places where the rows were cut.
+        reason: what is wrong with them, empty when they are complete.
+        blocked: whether that will not pass by itself.
+    """
+
+    windows: tuple[Window, ...]
+    seconds: float
+    gaps: int
+    reason: str = ""
+    blocked: bool = False
+
+
+class RowStore:
+    """Rows of the last `seconds`, one array a channel."""
+
+    def __init__(self, rate: float, seconds: float) -> None:
+        """Keeps `seconds` of rows of a grid of `rate` [Hz]."""
+        self._step = 1.0 / rate
+        self._most = round(seconds * rate)
+        self._blocks: list[Rows] = []
+
+    def add(self, rows: Rows) -> None:
+        """Appends a block of rows and forgets the oldest."""
+        self._blocks.append(rows)
+        total = sum(len(b.t) for b in self._blocks)
+        while total - len(self._blocks[0].t) >= self._most:
+            total -= len(self._blocks.pop(0).t)
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        self._blocks.clear()
+
+    def span(self, start: float, stop: float) -> Rows | None:
+        """Rows with start <= t < stop, whatever they hold; None when there are none."""
+        blocks = [b for b in self._blocks if b.t[-1] >= start and b.t[0] < stop]
+        if not blocks:
+            return None
+        t = np.concatenate([b.t for b in blocks])
+        inside = (t >= start) & (t < stop)
+        if not inside.any():
+            return None
+        names = list(dict.fromkeys(n for b in blocks for n in b.columns))
+        columns = {name: _stack(blocks, name)[inside] for name in names}
+        last = blocks[-1]
+        return Rows(t[inside], columns, last.sampling, last.source, blocks[0].fresh, last.problem)
+
+    def onset(self, near: float) -> float:
+        """Moment of a step in specific force per squared rotor speed within 1 s of `near` [s], to a row."""
+        rows = self.span(near - 1.5, near + 1.5)
+        if rows is None or "accel" not in rows.columns:
+            return near
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = -rows.columns["accel"][:, 2] / np.sum(rows.columns["rotor_speed"] ** 2, axis=1)
+        good = np.isfinite(ratio)
+        t, y = rows.t[good], ratio[good]
+        if len(t) < 20:
+            return near
+        n = np.arange(1, len(t))
+        total, squares = np.cumsum(y), np.cumsum(y * y)
+        left = squares[:-1] - total[:-1] ** 2 / n
+        right = squares[-1] - squares[:-1] - (total[-1] - total[:-1]) ** 2 / (len(t) - n)
+        inside = np.abs(t[1:] - near) <= 1.0
+        return float(t[1:][inside][np.argmin((left + right)[inside])]) if inside.any() else near
+
+    def cut(self, start: float, stop: float) -> Cut:
+        """Windows of the rows with start <= t < stop."""
+        blocks = [b for b in self._blocks if b.t[-1] >= start and b.t[0] < stop]
+        problem = next((b.problem for b in reversed(blocks) if b.problem), "")
+        pieces: list[list[Rows]] = []
+        for block in blocks:
+            if not pieces or block.fresh or not _joins(pieces[-1][-1], block):
+                pieces.append([])
+            pieces[-1].append(block)
+        windows: list[Window] = []
+        for piece in pieces:
+            windows.extend(self._windows(piece, start, stop))
+        seconds = sum(len(w) for w in windows) * self._step
+        gaps = max(len(windows) - 1, 0)
+        reason, blocked = self._incomplete(seconds, stop - start, problem, blocks)
+        return Cut(tuple(windows), seconds, gaps, reason, blocked)
+
+    def _incomplete(self, seconds: float, wanted: float, problem: str, blocks: list[Rows]) -> tuple[str, bool]:
+        if seconds >= COMPLETE * wanted - 0.5 * self._step:
+            return "", False
+        if problem:
+            return problem, True
+        if blocks and all("gyro" not in b.columns or np.isnan(b.columns["gyro"]).all() for b in blocks):
+            return "no gyro in the data; allowed: angular rates [rad/s] at 20 Hz or more; fix: connect the IMU", True
+        return f"{seconds:.1f} s of usable data in the last {wanted:.3g} s", False
+
+    def _windows(self, piece: list[Rows], start: float, stop: float) -> list[Window]:
+        t = np.concatenate([b.t for b in piece])
+        names = list(dict.fromkeys(n for b in piece for n in b.columns))
+        columns = {name: _stack(piece, name) for name in names}
+        if "gyro" not in columns:
+            return []
+        good: NDArray[np.bool_] = np.isfinite(columns["rotor_speed"]).all(axis=1) & (t >= start) & (t < stop)
+        good &= _bridged(np.asarray(np.isfinite(columns["gyro"]).all(axis=1)))
+        out = []
+        for a, b in _runs(good):
+            if (b - a) * self._step < SHORTEST - 0.5 * self._step:
+                continue
+            cut: dict[str, Any] = {
+                n: v[a:b] for n, v in columns.items() if n == "rotor_speed" or np.isfinite(v[a:b]).any()
+            }
+            out.append(Window(float(t[a]), self._step, **cut, sampling=piece[0].sampling, name="live"))
+        return out
+
+
+def _joins(before: Rows, after: Rows) -> bool:
+    return before.sampling == after.sampling and before.source == after.source
+
+
+def _stack(blocks: list[Rows], name: str) -> FloatArray:
+    width = next(b.columns[name].shape[1] for b in blocks if name in b.columns)
+    parts = [b.columns.get(name, np.full((len(b.t), width), math.nan)) for b in blocks]
+    return np.concatenate(parts)
+
+
+def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Short holes count as good: the model simply has no measurement there."""
+    out = good.copy()
+    for a, b in _runs(~good):
+        if b - a <= LONGEST_GYRO_GAP and a > 0 and b < len(good):
+            out[a:b] = True
+    return out
+
+
+def _runs(good: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and end (exclusive) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

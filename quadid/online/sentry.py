@@ -1,0 +1,104 @@
+"""From a step in the numbers to a question for the fit: the watch for sudden changes on the walk of a session."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.learner import Learner
+from quadid.online.monitor import CHUNK, Change, Monitor
+from quadid.online.quality import Quality, judge
+from quadid.online.records import OnlineFinding
+from quadid.online.rows import RowStore
+from quadid.vehicle import Vehicle
+
+AFTER_CHANGE = 3.0
+"""Data that a change is explained from [s]."""
+ASK_FLYING = 2.2
+"""Flight judged before a change is looked for [s]."""
+_EPS = 1e-6
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A change that was seen: the step, and when it began, to a row [s]."""
+
+    change: Change
+    at: float
+
+
+class Sentry:
+    """Watches one vehicle for sudden changes.
+
+    Attributes:
+        seen: the change that is being looked into, or None.
+    """
+
+    def __init__(self, vehicle: Vehicle, store: RowStore) -> None:
+        """Watches the rows of `store`, which are of `vehicle`."""
+        self._vehicle, self._store = vehicle, store
+        self._monitor = Monitor(vehicle)
+        self.seen: Seen | None = None
+
+    def restart(self) -> None:
+        """Begins anew: the stream was interrupted, or a change was dealt with."""
+        self._monitor.restart()
+        self.seen = None
+
+    def look(self, tick: float, length: float, learner: Learner) -> Seen | None:
+        """Takes in the last `length` [s] of rows before `tick` [s]; returns a change seen for the first time."""
+        for i in reversed(range(round(length / CHUNK))):
+            self._monitor.add(self._store.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
+        if self.seen is not None:
+            return None
+        recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
+        b = learner.value("b")
+        if recent.reason or judge(recent.windows, self._vehicle, b, learner.learned) != Quality():
+            self._monitor.restart()
+            return None
+        change = self._monitor.look(b, np.array([learner.value(n) for n in ("J_xx", "J_yy", "J_zz")]))
+        if change is None:
+            return None
+        self.seen = Seen(change, self._store.onset(change.time) if change.channel == "thrust" else change.time)
+        return self.seen
+
+    def ask(self, number: int, tick: float, learner: Learner, stamp: float) -> ChangeRequest | None:
+        """The question what a change was, once there is enough data after it.
+
+        Args:
+            number: of the request.
+            tick: now [s].
+            learner: what was known before.
+            stamp: time of the change as a stamp [s].
+        """
+        if self.seen is None or tick < self.seen.at + AFTER_CHANGE - _EPS:
+            return None
+        cut = self._store.cut(self.seen.at + 0.1, tick - _EPS)
+        return ChangeRequest(
+            number, self._vehicle, cut.windows, self.seen.at, tick, learner.theta, learner.z_sigma, learner.noise,
+            self.seen.change, stamp,
+        )  # fmt: skip
+
+    @staticmethod
+    def answer_without_fit(request: ChangeRequest, learner: Learner) -> ChangeReply | None:
+        """The answer where a fit could say nothing: no data, or nothing known before."""
+        if not request.windows:
+            return ChangeReply(request.number, problem="too little data after the change")
+        if not learner.learned:
+            return ChangeReply(request.number, _unlearned(request.change, request.time))
+        return None
+
+
+def _unlearned(change: Change, time: float) -> OnlineFinding | None:
+    """What a step of thrust means before anything was learned: mass or thrust, not to be told apart."""
+    if change.channel != "thrust":
+        return None
+    fraction = float(np.expm1(-change.size))
+    return OnlineFinding(
+        "mass_change", {"time": time, "fraction": fraction}, {"time": 0.5, "fraction": abs(fraction / change.errors)},
+        {"time": "s", "fraction": ""}, math.nan, math.nan, math.nan, (),
+        f"thrust per weight stepped by {change.size:+.1%} before the vehicle was known: mass or thrust changed", False,
+    )  # fmt: skip

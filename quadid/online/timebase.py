@@ -1,0 +1,72 @@
+"""Time of a live stream: one rising session time out of stamps that may start over, jump, or be garbage."""
+
+from __future__ import annotations
+
+import math
+
+STEP_BACK = 1.0
+"""A stamp this far [s] before the newest one means a reboot or a clock step."""
+STEP_AHEAD = 30.0
+"""A stamp this far [s] after the newest one is suspect until others confirm it."""
+CONFIRMATIONS = 3
+"""Further stamps that must agree before a new time base is believed: a single wild stamp moves nothing."""
+PAUSE = 1.0
+"""Session time [s] between the last sample before a step and the first one after it."""
+DAY = 86400.0
+LARGEST = 1e11
+"""Stamps beyond this [s] are no times."""
+
+
+class TimeBase:
+    """Maps stamps [s] to session time [s], which counts from midnight of the first stamp and never runs back.
+
+    Attributes:
+        newest: newest session time seen; minus infinity before the first sample.
+        steps: times at which a new time base began (reboot, clock step).
+        wild: stamps refused because nothing confirmed them.
+    """
+
+    def __init__(self) -> None:
+        self.newest = -math.inf
+        self.steps: list[float] = []
+        self.wild = 0
+        self._shift = 0.0
+        self._suspects: list[float] = []
+
+    def stamp(self, t: float) -> float:
+        """The stamp that belongs to session time `t` in the present time base."""
+        return t - self._shift
+
+    def time(self, stamp: float) -> float | None:
+        """Session time of a stamp; None for one that is refused or waits for confirmation."""
+        if not abs(stamp) <= LARGEST:
+            self.wild += 1
+            return None
+        if self.newest == -math.inf:
+            self._shift = -math.floor(stamp / DAY) * DAY
+            self.newest = stamp + self._shift
+            return self.newest
+        t = stamp + self._shift
+        if self.newest - STEP_BACK < t < self.newest + STEP_AHEAD:
+            if self._suspects:
+                self.wild += len(self._suspects)
+                self._suspects.clear()
+            if t > self.newest:
+                self.newest = t
+            return t
+        return self._suspect(stamp)
+
+    def _suspect(self, stamp: float) -> float | None:
+        """Collects stamps of a possible new time base and moves to it when enough agree."""
+        if self._suspects and abs(stamp - self._suspects[-1]) > STEP_BACK:
+            self.wild += len(self._suspects)
+            self._suspects.clear()
+        self._suspects.append(stamp)
+        if len(self._suspects) <= CONFIRMATIONS:
+            return None
+        start = self.newest + PAUSE
+        self._shift = start - min(self._suspects)
+        self.steps.append(start)
+        self.newest = stamp + self._shift
+        self._suspects.clear()
+        return self.newest

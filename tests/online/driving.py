@@ -1,0 +1,76 @@
+"""Drives a session from a flight, as the services and the replay do: samples in time order, fits inline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+from quadid.flight import Flight, fly
+from quadid.online import FitRequest, Session, fit_window
+from quadid.online.changes import ChangeRequest, explain_change
+from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+from quadid.online.voice import Action
+from quadid.vehicle import Vehicle
+from quadid.window import Recording, Sample
+
+EPOCH = 1_700_000_000.0
+
+
+@lru_cache(maxsize=16)
+def flight(
+    seconds: float, seed: int = 1, profile: str = "excited", effects: tuple[tuple[str, str, float], ...] = ()
+) -> Flight:
+    """A Pelican flight; effects as (effect, parameter, value)."""
+    named: dict[str, dict[str, float]] = {}
+    for effect, parameter, value in effects:
+        named.setdefault(effect, {})[parameter] = value
+    return fly(Vehicle.shipped("pelican"), seconds=seconds, seed=seed, profile=profile, effects=named)
+
+
+def samples(recording: Recording, shift: float = 0.0) -> list[Sample]:
+    """All samples of a recording in time order."""
+    out = [
+        Sample(shift + t, name, tuple(row))
+        for name, channel in recording.channels.items()
+        for t, row in zip(channel.t.tolist(), channel.values.tolist(), strict=True)
+    ]
+    return sorted(out, key=lambda s: s.t)
+
+
+def answer(session: Session) -> list[Action]:
+    """Polls until the session needs more samples, doing every fit at once."""
+    out: list[Action] = []
+    while True:
+        out.extend(session.poll())
+        request = session.running
+        if isinstance(request, ChangeRequest):
+            session.deliver(explain_change(request))
+        elif isinstance(request, FitRequest):
+            session.deliver(fit_window(request))
+        else:
+            return out
+
+
+def drive(session: Session, stream: Sequence[Sample], chunk: int = 40) -> list[Action]:
+    """Pushes all samples, polling after every `chunk` of them."""
+    out: list[Action] = []
+    for start in range(0, len(stream), chunk):
+        for sample in stream[start : start + chunk]:
+            session.push(sample)
+        out.extend(answer(session))
+    return out
+
+
+def published(actions: Iterable[Action], topic: str = "parameters") -> list[OnlineSet]:
+    """The sets published on a topic."""
+    return [a.item for a in actions if isinstance(a, Publish) and a.topic == topic]
+
+
+def diagnosed(actions: Iterable[Action]) -> list[Diagnosed]:
+    """The diagnoses."""
+    return [a for a in actions if isinstance(a, Diagnosed)]
+
+
+def events(actions: Iterable[Action], kind: str = "") -> list[Event]:
+    """The events, of one kind."""
+    return [a for a in actions if isinstance(a, Event) and kind in ("", a.kind)]

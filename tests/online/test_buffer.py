@@ -1,0 +1,168 @@
+"""The buffer: a log on the grid passes bit for bit, order of arrival changes nothing, faults are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quadid.flight import fly
+from quadid.grid import to_windows
+from quadid.online.buffer import BLOCK, SETTLE, Buffer, Rows
+from quadid.online.rows import RowStore
+from quadid.vehicle import Vehicle
+from quadid.window import Sample
+from tests.online.driving import EPOCH, flight, samples
+
+PELICAN = Vehicle.shipped("pelican")
+
+
+def run(stream: Sequence[Sample], buffer: Buffer | None = None) -> tuple[list[Rows], Buffer]:
+    buffer = buffer or Buffer(PELICAN)
+    rows = []
+    for sample in stream:
+        buffer.push(sample)
+        while (block := buffer.next_rows()) is not None:
+            rows.append(block)
+    return rows, buffer
+
+
+def stacked(rows: Sequence[Rows], name: str) -> np.ndarray:
+    return np.concatenate([r.columns[name] for r in rows])
+
+
+def same(a: Sequence[Rows], b: Sequence[Rows]) -> bool:
+    return len(a) == len(b) and all(
+        x.t.tobytes() == y.t.tobytes()
+        and x.columns.keys() == y.columns.keys()
+        and all(x.columns[n].tobytes() == y.columns[n].tobytes() for n in x.columns)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.mark.parametrize("epoch", [0.0, EPOCH])
+def test_a_log_on_the_grid_passes_bit_for_bit(epoch: float) -> None:
+    window = flight(8.0).window
+    rows, buffer = run(samples(flight(8.0).recording, epoch))
+    assert not buffer.faults
+    assert len(rows) >= (8.0 - SETTLE) * 50 / BLOCK - 1
+    for name in ("gyro", "accel", "attitude", "rotor_speed"):
+        got = stacked(rows, name)
+        assert got.tobytes() == getattr(window, name)[: len(got)].tobytes()
+
+
+def test_a_fast_log_comes_out_as_it_does_offline() -> None:
+    fast = fly(PELICAN, seconds=6.0, seed=2, log_rate=500.0, command_rate=500.0)
+    (offline,) = to_windows(fast.recording, PELICAN)
+    rows, _ = run(samples(fast.recording))
+    at = np.concatenate([r.t for r in rows])
+    assert {r.sampling for r in rows} == {"instant"}
+    first = round((offline.t0 - at[0]) / 0.02)
+    for name in ("gyro", "accel", "rotor_speed"):
+        online = stacked(rows, name)[first:]
+        assert np.abs(online - getattr(offline, name)[: len(online)]).max() < 1e-6 * np.abs(online).max()
+
+
+@settings(max_examples=8)
+@given(seed=st.integers(0, 2**32 - 1), delay=st.floats(0.0, 0.35))
+def test_order_of_arrival_changes_nothing(seed: int, delay: float) -> None:
+    stream = samples(flight(4.0).recording, EPOCH)
+    rng = np.random.default_rng(seed)
+    late = {name: rng.uniform(0.0, delay) for name in ("gyro", "accel", "attitude", "rotor_speed")}
+    shuffled = sorted(stream, key=lambda s: s.t + late.get(s.channel, 0.0))
+    plain, _ = run(stream)
+    other, buffer = run(shuffled)
+    assert same(plain[: len(other)], other)
+    assert not buffer.faults
+
+
+def test_duplicates_are_dropped_and_counted() -> None:
+    stream = samples(flight(4.0).recording)
+    doubled = [s for sample in stream for s in (sample, sample)]
+    plain, _ = run(stream)
+    rows, buffer = run(doubled)
+    assert same(plain, rows)
+    assert buffer.faults["gyro: duplicate"] > 100
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+def test_values_that_are_no_numbers_never_reach_a_row(bad: float) -> None:
+    stream = samples(flight(4.0).recording)
+    broken = [
+        Sample(s.t, s.channel, (bad, *s.values[1:])) if s.channel == "accel" and i % 7 == 0 else s
+        for i, s in enumerate(stream)
+    ]
+    rows, buffer = run(broken)
+    assert buffer.faults["accel: not finite"] > 0
+    assert np.isfinite(stacked(rows, "gyro")).all()
+    assert not np.isinf(stacked(rows, "accel")).any()
+
+
+def test_wrong_width_unknown_channel_and_zero_quaternion_are_counted() -> None:
+    buffer = Buffer(PELICAN)
+    buffer.push(Sample(0.0, "gyro", (1.0, 2.0)))
+    buffer.push(Sample(0.0, "altitude", (1.0,)))
+    buffer.push(Sample(0.0, "attitude", (0.0, 0.0, 0.0, 0.0)))
+    assert sum(buffer.faults.values()) == 3
+
+
+def test_a_gap_is_not_bridged() -> None:
+    stream = [s for s in samples(flight(12.0).recording) if not 5.0 < s.t < 6.0]
+    rows, _ = run(stream)
+    store = RowStore(50.0, 30.0)
+    for block in rows:
+        store.add(block)
+    cut = store.cut(0.0, 11.0)
+    assert len(cut.windows) == 2
+    assert cut.windows[0].t[-1] <= 5.0 + 1e-9
+    assert cut.windows[1].t0 >= 6.0 - 1e-9
+
+
+def test_a_third_of_lost_packets_leaves_usable_rows() -> None:
+    dense = fly(PELICAN, seconds=6.0, seed=3, log_rate=250.0, command_rate=250.0)
+    rng = np.random.default_rng(0)
+    rows, _ = run([s for s in samples(dense.recording) if rng.random() > 0.3])
+    gyro = stacked(rows, "gyro")
+    truth = dense.truth.rates
+    at = np.concatenate([r.t for r in rows])
+    good = np.isfinite(gyro).all(axis=1)
+    assert good.mean() > 0.9
+    error = gyro[good] - np.column_stack([np.interp(at[good], dense.truth.t, c) for c in truth.T])
+    assert np.sqrt(np.mean(error**2)) < 0.05
+
+
+def test_a_reboot_begins_a_new_stretch() -> None:
+    stream = samples(flight(6.0).recording)
+    rows, buffer = run([*[Sample(s.t + 300.0, s.channel, s.values) for s in stream], *stream])
+    assert [r.fresh for r in rows].count(True) == 2
+    assert len(buffer.time.steps) == 1
+    assert all(np.diff(r.t).min() > 0.0 for r in rows)
+
+
+def test_too_many_rotors_are_told_as_a_fault() -> None:
+    stream = [
+        Sample(s.t, s.channel, (*s.values, 1.0)) if s.channel == "rotor_speed" else s
+        for s in samples(flight(4.0).recording)
+    ]
+    rows, buffer = run(stream)
+    assert any("5 values instead of 4" in reason for reason in buffer.faults)
+    assert "no rotor speeds" in rows[-1].problem
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(
+        st.builds(
+            Sample,
+            st.floats(),
+            st.sampled_from(["gyro", "accel", "attitude", "rotor_speed", "motor_command", "position", "?"]),
+            st.lists(st.floats(), max_size=5).map(tuple),
+        ),
+        max_size=60,
+    )
+)
+def test_anything_may_be_pushed(stream: list[Sample]) -> None:
+    run(stream)

@@ -1,0 +1,112 @@
+"""Sudden changes: seen within two seconds, explained, and never invented."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadid.identify.noise import NoiseModel
+from quadid.model.layout import Layout
+from quadid.online.buffer import Rows
+from quadid.online.changes import ChangeRequest, explain_change
+from quadid.online.monitor import Change, Monitor
+from quadid.vehicle import Vehicle
+from tests.online.driving import flight
+
+PELICAN = Vehicle.shipped("pelican")
+AT = 40.3
+NOISE = NoiseModel(np.repeat([0.021, 0.003, 0.21], 3), np.repeat([0.0, 0.003, 0.0], 3))
+Effects = tuple[tuple[str, str, float], ...]
+
+
+def watched(seconds: float, seed: int, profile: str, effects: Effects = ()) -> list[tuple[float, Change]]:
+    made = flight(seconds, seed, profile, effects)
+    window, truth, monitor, seen = made.window, made.truth.parameters, Monitor(PELICAN), []
+    inertia = 1.1 * np.array([truth.J_xx, truth.J_yy, truth.J_zz])  # known to 10 % only
+    for k in range(0, len(window) - 25, 25):
+        columns = {n: getattr(window, n)[k : k + 25] for n in ("rotor_speed", "gyro", "accel")}
+        monitor.add(Rows(window.t[k : k + 25], columns, "held", ""))
+        change = monitor.look(0.95 * truth.b, inertia)
+        if change is not None:
+            seen.append((float(window.t[k + 24]), change))
+            monitor.restart()
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("profile", "effect", "fraction", "step"),
+    [
+        ("excited", "mass_change", 0.15, -0.13),
+        ("gentle", "mass_change", -0.1, 0.1),
+        ("hover", "mass_change", 0.15, -0.13),
+        ("excited", "thrust_drop", 0.08, -0.08),
+    ],
+)
+def test_a_step_is_seen_within_two_seconds(profile: str, effect: str, fraction: float, step: float) -> None:
+    seen = watched(60.0, 4, profile, ((effect, "time", AT), (effect, "fraction", fraction)))
+    assert len(seen) == 1
+    when, change = seen[0]
+    assert AT < when < AT + 2.3
+    assert change.channel == "thrust"
+    assert abs(change.time - AT) < 0.6
+    assert change.size == pytest.approx(step, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("profile", "effects"),
+    [
+        ("excited", ()),
+        ("gentle", ()),
+        ("excited", (("rotor_drag", "k_x", 0.3), ("rotor_drag", "k_y", 0.3), ("axial_inflow", "k_z", 0.3))),
+        ("excited", (("motor_lag", "tau", 0.05),)),
+        ("gentle", (("battery_sag", "fraction", 0.12),)),
+    ],
+)
+def test_what_is_no_step_is_not_seen_as_one(profile: str, effects: Effects) -> None:
+    assert watched(120.0, 20, profile, effects) == []
+
+
+def timed(effect: str, fraction: float) -> Effects:
+    return ((effect, "time", AT), (effect, "fraction", fraction))
+
+
+def explained(profile: str, effects: Effects, change: Change) -> ChangeRequest:
+    made = flight(50.0, 5, profile, effects)
+    truth, theta = made.truth.parameters, Layout(PELICAN).initial(PELICAN)
+    theta[:6] = [truth.b, truth.d, truth.J_xx, truth.J_yy, truth.J_zz, truth.J_r]
+    window = made.window.slice(2020, 2165)
+    sigma = np.array([0.001, 0.006, 0.002, 0.002, 0.006, 0.02])
+    return ChangeRequest(1, PELICAN, (window,), window.t0, 43.3, theta, sigma, NOISE, change, AT)
+
+
+@pytest.mark.parametrize(
+    ("effects", "seen", "name", "number"),
+    [
+        (timed("mass_change", 0.15), ("thrust", -0.13), "mass_change", "fraction"),
+        (timed("thrust_drop", 0.12), ("thrust", -0.12), "thrust_drop", "fraction"),
+        ((("weak_rotor", "rotor", 3.0), ("weak_rotor", "loss", 0.1)), ("roll moment", 0.1), "weak_rotor", "loss"),
+        ((("cg_offset", "x", 0.01),), ("pitch moment", 0.1), "cg_offset", "x"),
+    ],
+)
+def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, float], name: str, number: str) -> None:
+    reply = explain_change(explained("excited", effects, Change(40.0, *seen, 30.0)))
+    assert reply.finding is not None, reply.problem
+    assert reply.finding.effect == name
+    assert reply.finding.confident or name == "thrust_drop", "mass taken up with its inertia looks much like it"
+    assert reply.finding.values[number] == pytest.approx({p: v for _, p, v in effects}[number], rel=0.1)
+    others = {"mass_change", "thrust_drop", "cg_offset", "weak_rotor"} - {name}
+    assert {a.effect for a in reply.finding.alternatives} == others
+
+
+def test_in_hover_mass_and_thrust_are_not_told_apart_with_confidence() -> None:
+    drop = (("thrust_drop", "time", AT), ("thrust_drop", "fraction", 0.12))
+    reply = explain_change(explained("hover", drop, Change(40.0, "thrust", -0.12, 30.0)))
+    assert reply.finding is not None
+    assert not reply.finding.confident
+    assert {reply.finding.effect} | {a.effect for a in reply.finding.alternatives} >= {"mass_change", "thrust_drop"}
+
+
+def test_no_cause_is_invented() -> None:
+    reply = explain_change(explained("excited", (), Change(40.0, "pitch moment", 0.05, 8.0)))
+    assert reply.finding is None
+    assert "no known cause" in reply.problem

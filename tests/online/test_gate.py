@@ -1,0 +1,164 @@
+"""The gate: what it accepts is physical, known, agreed upon, predictive and near what was approved."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quadid.online.gate import CHECKS, Z95, Case, GateSettings, decide
+from quadid.online.quality import Quality
+from quadid.online.records import OnlineSet, SetState
+from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.vehicle import Vehicle
+
+PELICAN = Vehicle.shipped("pelican")
+TRUE = dict(zip(NOMINAL_NAMES, (2.33e-5, 4.96e-7, 0.010, 0.0136, 0.0226, 5e-5), strict=True))
+
+
+def parameter_set(values: dict[str, float], sigma: float = 0.005, **status: Status) -> ParameterSet:
+    parameters = tuple(
+        Parameter(
+            name, NOMINAL_UNITS[name], values[name], abs(values[name]) * sigma,
+            bounds=PELICAN.parameters[name].limits, status=status.get(name, Status.IDENTIFIED),
+        )
+        for name in NOMINAL_NAMES
+    )  # fmt: skip
+    return ParameterSet(parameters, np.diag(np.square([p.sigma for p in parameters])))
+
+
+def online_set(values: dict[str, float], state: SetState = SetState.ACCEPTED, sigma: float = 0.005) -> OnlineSet:
+    return OnlineSet(1, state, "", parameter_set(values, sigma), 0.0, 30.0, 1500)
+
+
+def good(**changes: Any) -> Case:
+    case = Case(parameter_set(TRUE), Quality(), True, 1.0, 3, "", (50.0, 60.0), None, None, "auto")
+    return replace(case, **changes)
+
+
+def scaled(**factors: float) -> dict[str, float]:
+    return {name: value * factors.get(name, 1.0) for name, value in TRUE.items()}
+
+
+def test_a_good_estimate_is_accepted_or_waits_for_a_person() -> None:
+    assert decide(good(), GateSettings()).state is SetState.ACCEPTED
+    assert decide(good(approval="manual"), GateSettings()).state is SetState.PENDING
+
+
+@pytest.mark.parametrize(
+    ("changes", "check", "word"),
+    [
+        ({"quality": Quality(fault="gyro is stuck")}, "data_quality", "stuck"),
+        ({"quality": Quality(grounded="on the ground")}, "flying", "ground"),
+        ({"excited": False}, "excitation", "sticks"),
+        ({"parameters": parameter_set(scaled(b=-1.0))}, "physical_bounds", "not positive"),
+        ({"parameters": parameter_set(scaled(J_zz=1.8))}, "physical_bounds", "triangle"),
+        ({"parameters": parameter_set(scaled(b=math.nan))}, "physical_bounds", "not a number"),
+        ({"parameters": parameter_set({**TRUE, "b": PELICAN.parameters["b"].limits[1]})}, "physical_bounds", "bound"),
+        ({"thrust_ratio": 2.0}, "physical_bounds", "accelerometer"),
+        ({"parameters": parameter_set(TRUE, sigma=0.04)}, "interval_width", "keep flying"),
+        ({"parameters": parameter_set(TRUE, J_xx=Status.PRIOR_DOMINATED)}, "interval_width", "J_xx"),
+        ({"agreeing": 2}, "agreement", "2 of 3"),
+        ({"disagreement": "J_xx differs"}, "agreement", "J_xx differs"),
+        ({"held_out": ()}, "held_out_gain", "no window"),
+        ({"held_out": (-100.0,)}, "held_out_gain", "worse"),
+        ({"held_out": (math.nan,)}, "held_out_gain", "scored"),
+        ({"in_force": online_set(TRUE), "held_out": (1.0,)}, "held_out_gain", "no news"),
+        ({"in_force": online_set(scaled(b=1.3)), "baseline": None}, "step_limit", "b would change"),
+        ({"baseline": online_set(scaled(J_yy=1.7))}, "step_limit", "baseline"),
+    ],
+)
+def test_each_check_objects_with_its_reason(changes: dict[str, Any], check: str, word: str) -> None:
+    decision = decide(good(**changes), GateSettings())
+    assert decision.check == check
+    assert word in decision.reason
+    assert decision.state is not SetState.ACCEPTED
+
+
+@pytest.mark.parametrize("factors", [{"J_xx": 4.0, "J_yy": 4.0, "J_zz": 4.0}, {"b": 2.0}, {"b": -1.0}, {"J_xx": 0.25}])
+def test_a_set_that_would_destabilise_a_controller_is_refused(factors: dict[str, float]) -> None:
+    case = good(parameters=parameter_set(scaled(**factors)), in_force=online_set(TRUE), baseline=online_set(TRUE))
+    assert decide(case, GateSettings()).state is SetState.REJECTED
+
+
+def test_a_moderate_step_waits_for_a_person_even_in_auto() -> None:
+    case = good(parameters=parameter_set(scaled(b=0.7, J_xx=0.7, J_yy=0.7)), in_force=online_set(TRUE))
+    decision = decide(case, GateSettings())
+    assert (decision.state, decision.check) == (SetState.PENDING, "step_limit")
+    assert "person" in decision.reason
+
+
+@pytest.mark.parametrize("name", ["b", "J_xx", "J_yy"])
+def test_small_steps_do_not_creep_past_the_baseline(name: str) -> None:
+    settings, baseline = GateSettings(), online_set(TRUE)
+    force = baseline
+    factor = 1.0
+    for _ in range(40):
+        factor *= 1.02
+        case = good(parameters=parameter_set(scaled(**{name: factor})), in_force=force, baseline=baseline)
+        if decide(case, settings).state is not SetState.ACCEPTED:
+            break
+        force = online_set(scaled(**{name: factor}))
+    assert 1.3 < factor < 1.0 + settings.creep + 0.05
+
+
+def test_a_sharper_set_is_news() -> None:
+    case = good(in_force=online_set(TRUE, sigma=0.01), held_out=())
+    assert decide(case, GateSettings()).state is SetState.ACCEPTED
+
+
+def test_a_stale_set_is_confirmed_without_news() -> None:
+    case = good(in_force=online_set(TRUE, SetState.STALE), baseline=online_set(TRUE), held_out=(0.5,))
+    assert decide(case, GateSettings()).state is SetState.ACCEPTED
+
+
+numbers = st.floats(-1e6, 1e6) | st.sampled_from([math.nan, math.inf, -math.inf])
+
+
+@given(
+    factors=st.lists(st.floats(0.05, 8.0) | numbers, min_size=6, max_size=6),
+    sigma=st.floats(0.0, 0.2),
+    statuses=st.lists(st.sampled_from(list(Status)), min_size=6, max_size=6),
+    excited=st.booleans(),
+    ratio=st.floats(0.5, 2.0) | numbers,
+    agreeing=st.integers(0, 6),
+    held_out=st.lists(st.floats(-50.0, 100.0) | numbers, max_size=4),
+    force=st.none() | st.lists(st.floats(0.7, 1.4), min_size=6, max_size=6),
+    fault=st.sampled_from(["", "stuck"]),
+    approval=st.sampled_from(["auto", "manual"]),
+)
+def test_nothing_is_accepted_that_breaks_a_promise(
+    factors: list[float], sigma: float, statuses: list[Status], excited: bool, ratio: float, agreeing: int,
+    held_out: list[float], force: list[float] | None, fault: str, approval: str,
+) -> None:  # fmt: skip
+    values = {n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, factors, strict=True)}
+    named = dict(zip(NOMINAL_NAMES, statuses, strict=True))
+    before = None if force is None else online_set({n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, force, strict=True)})
+    settings = GateSettings()
+    case = Case(
+        parameter_set(values, sigma, **named), Quality(fault=fault), excited, ratio, agreeing, "", tuple(held_out),
+        before, before, approval,
+    )  # fmt: skip
+    decision = decide(case, settings)
+    assert decision.reason
+    assert decision.check in {name for name, _ in CHECKS} | {"approval"}
+    if decision.state is SetState.REJECTED:
+        return
+    assert not fault
+    assert excited
+    assert agreeing >= settings.windows
+    assert all(math.isfinite(v) and v > 0.0 for v in values.values())
+    assert impossible_inertia([values[n] for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack) is None
+    assert all(Z95 * sigma <= settings.width for n in ("b", "J_xx", "J_yy") if named[n] is not Status.PRIOR_DOMINATED)
+    assert sum(held_out) >= -settings.gain * len(held_out)
+    if decision.state is SetState.ACCEPTED:
+        assert approval == "auto"
+        if before is not None:
+            for name in ("b", "J_xx", "J_yy"):
+                change = abs(math.log(values[name] / before.parameters[name].value))
+                assert change <= math.log1p(settings.step + 0.02)

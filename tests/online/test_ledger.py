@@ -1,0 +1,100 @@
+"""The ledger: numbers rise, approvals and rollbacks are idempotent, nothing unapproved is ever in force."""
+
+from __future__ import annotations
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from quadid.online.ledger import Ledger
+from quadid.online.records import Publish, SetState
+from tests.online.test_gate import TRUE, online_set
+
+
+def test_approving_twice_and_an_old_number_do_nothing() -> None:
+    ledger = Ledger("manual")
+    held = ledger.hold(online_set(TRUE), 30.0)
+    assert not ledger.approve(1.0, "ann", sequence=held.sequence + 5).done
+    assert ledger.approve(1.0, "ann", sequence=held.sequence).done
+    in_force = ledger.in_force
+    assert not ledger.approve(1.0, "ann").done
+    assert ledger.in_force is in_force
+    assert in_force is not None
+    assert in_force.approved_by == "ann"
+
+
+def test_rollback_returns_the_earlier_values_under_a_new_number() -> None:
+    ledger = Ledger("auto")
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
+    answer = ledger.roll_back(61.0, "bob")
+    assert answer.done
+    assert ledger.in_force is not None
+    assert ledger.in_force.parameters["b"].value == TRUE["b"]
+    assert (ledger.in_force.state, ledger.in_force.sequence) == (SetState.ROLLED_BACK, 3)
+    assert ledger.approval == "manual"
+    assert not ledger.roll_back(62.0, "bob").done
+
+
+def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
+    ledger = Ledger("auto", restored=online_set(TRUE), next_sequence=9)
+    assert ledger.in_force is not None
+    assert ledger.in_force.state is SetState.STALE
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    assert ledger.in_force.sequence == 9
+    assert not ledger.roll_back(31.0, "bob").done, "a stale set is nothing to return to"
+
+
+class Machine(RuleBasedStateMachine):
+    """Any order of commands."""
+
+    @initialize(approval=st.sampled_from(["auto", "manual"]))
+    def start(self, approval: str) -> None:
+        self.ledger = Ledger(approval)
+        self.numbers: list[int] = []
+        self.t = 0.0
+
+    def publish(self, actions: tuple[object, ...] | list[object]) -> None:
+        for action in actions:
+            if isinstance(action, Publish):
+                assert action.item.approved_by
+                assert action.item.state in (SetState.ACCEPTED, SetState.ROLLED_BACK)
+                self.numbers.append(action.item.sequence)
+
+    @rule()
+    def estimate(self) -> None:
+        self.t += 1.0
+        if self.ledger.approval == "auto":
+            self.publish(list(self.ledger.accept(online_set(TRUE), "auto", self.t, self.t)))
+        else:
+            self.ledger.hold(online_set(TRUE), self.t)
+
+    @rule(number=st.none() | st.integers(0, 30))
+    def approve(self, number: int | None) -> None:
+        waiting = self.ledger.pending
+        answer = self.ledger.approve(self.t, "ann", number)
+        assert answer.done == (waiting is not None and number in (None, waiting.sequence))
+        self.publish(answer.actions)
+
+    @rule(by=st.sampled_from(["auto", "bob"]))
+    def roll_back(self, by: str) -> None:
+        had = self.ledger.predecessor
+        answer = self.ledger.roll_back(self.t, by)
+        assert answer.done == (had is not None)
+        self.publish(answer.actions)
+
+    @rule(loss=st.floats(-100.0, 100.0))
+    def watch(self, loss: float) -> None:
+        self.ledger.watch(self.t, self.t + 10.0, loss)
+        assert self.ledger.watched >= 0.0
+
+    @invariant()
+    def numbers_rise(self) -> None:
+        if hasattr(self, "numbers"):
+            assert self.numbers == sorted(set(self.numbers))
+            force = self.ledger.in_force
+            assert (force.sequence if force else 0) == (self.numbers[-1] if self.numbers else 0)
+
+
+Machine.TestCase.settings = settings(max_examples=60, stateful_step_count=30)
+TestMachine = Machine.TestCase

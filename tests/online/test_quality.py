@@ -1,0 +1,93 @@
+"""Quality: flights of every kind pass; broken sensors, wrong units and anything but flight are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.online.quality import Quality, judge
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Window
+from tests.online.driving import flight
+
+PELICAN = Vehicle.shipped("pelican")
+B = 2.33e-5
+
+
+def verdict(window: Window, known: bool = True) -> Quality:
+    return judge([window], PELICAN, B, known)
+
+
+def changed(window: Window, name: str, values: np.ndarray) -> Window:
+    return replace(window, **{name: values})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("profile", ["excited", "gentle", "hover", "one_axis", "roll_pitch"])
+@pytest.mark.parametrize("known", [True, False])
+def test_flight_passes(profile: str, known: bool) -> None:
+    window = flight(30.0, 3, profile).window
+    for start in range(0, 1000, 250):
+        assert verdict(window.slice(start, start + 500), known) == Quality()
+
+
+def on_the_floor(speed: np.ndarray, shake: float = 0.2) -> Window:
+    rng = np.random.default_rng(0)
+    rows = len(speed)
+    attitude = np.column_stack([np.ones(rows), 1e-3 * rng.normal(size=(rows, 3))])
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    accel = shake * rng.normal(size=(rows, 3)) - [0.0, 0.0, GRAVITY]
+    return Window(0.0, 0.02, np.repeat(speed[:, None], 4, axis=1), 0.02 * rng.normal(size=(rows, 3)), attitude, accel)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_idling_and_taxiing_are_not_flight(known: bool) -> None:
+    hover = PELICAN.hover_speed(B)
+    assert "ground" in verdict(on_the_floor(np.full(500, 0.2 * hover)), known).grounded
+    spool = hover * (0.75 + 0.2 * np.sin(np.arange(500) * 0.05))
+    assert verdict(on_the_floor(spool), known).grounded
+
+
+def test_carried_by_hand_is_not_flight() -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    off = changed(window, "rotor_speed", np.zeros_like(window.rotor_speed))
+    assert "ground" in verdict(off).grounded
+    idle = changed(window, "rotor_speed", 0.25 * window.rotor_speed)
+    assert verdict(idle).grounded
+
+
+def test_a_crash_is_named() -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    assert window.accel is not None
+    knock = window.accel.copy()
+    knock[300] = [90.0, 10.0, 60.0]
+    assert "knock" in verdict(changed(window, "accel", knock)).grounded
+
+
+@pytest.mark.parametrize("name", ["gyro", "accel", "attitude", "rotor_speed"])
+def test_a_stuck_sensor_is_named(name: str) -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    values = getattr(window, name).copy()
+    values[200:280] = values[200]
+    assert f"{name} is stuck" in verdict(changed(window, name, values)).fault
+
+
+def test_a_saturated_gyro_is_named() -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    assert window.gyro is not None
+    top = 0.6 * np.abs(window.gyro[:, 1]).max()
+    assert "is saturated" in verdict(changed(window, "gyro", np.clip(window.gyro, -top, top))).fault
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "word"),
+    [
+        ("accel", np.full(3, 1.0 / GRAVITY), "looks like g"),
+        ("accel", np.array([1.0, -1.0, -1.0]), "FLU"),
+        ("gyro", np.full(3, 180.0 / np.pi), "deg/s"),
+    ],
+)
+def test_wrong_units_and_frames_are_named(name: str, factor: np.ndarray, word: str) -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    assert word in verdict(changed(window, name, getattr(window, name) * factor)).fault

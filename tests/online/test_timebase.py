@@ -1,0 +1,41 @@
+"""Stamps become one rising session time, whatever they do."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quadid.online.timebase import CONFIRMATIONS, TimeBase
+
+
+def test_a_single_wild_stamp_moves_nothing() -> None:
+    clock = TimeBase()
+    assert clock.time(1.7e9) == 1.7e9 % 86400
+    assert clock.time(9e12) is None
+    assert clock.time(1.7e9 + 0.01) is not None
+    assert (clock.wild, clock.steps) == (1, [])
+
+
+def test_a_reboot_begins_a_new_stretch_after_the_old_one() -> None:
+    clock = TimeBase()
+    clock.time(500.0)
+    times = [clock.time(0.1 * k) for k in range(10)]
+    assert times[:CONFIRMATIONS] == [None] * CONFIRMATIONS
+    later = [t for t in times if t is not None]
+    assert len(clock.steps) == 1
+    assert min(later) > 500.0
+    assert all(math.isclose(b - a, 0.1, abs_tol=1e-9) for a, b in zip(later[:-1], later[1:], strict=True))
+    last = later[-1]
+    assert math.isclose(clock.stamp(last), 0.9, abs_tol=1e-9)
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
+def test_any_stamps_give_finite_times_and_a_newest_that_never_falls(stamps: list[float]) -> None:
+    clock, newest = TimeBase(), -math.inf
+    for stamp in stamps:
+        t = clock.time(stamp)
+        assert t is None or math.isfinite(t)
+        assert clock.newest >= newest
+        newest = clock.newest
