@@ -18,6 +18,7 @@ from quadid_cli.options import (
     Seed,
     Start,
     Stop,
+    Unchecked,
     Validate,
     VehicleName,
 )
@@ -58,6 +59,7 @@ def diagnose(
     start: Start = None,
     stop: Stop = None,
     preset: Preset = "auto",
+    unchecked: Unchecked = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -69,8 +71,8 @@ def diagnose(
     described = loading.load_vehicle(vehicle)
     folder = output.out_folder(out)
     hertz = GRID if rate is None else rate
-    train = loading.load_logs(logs, described, hertz, start, stop, preset)
-    held = loading.load_logs(validate or [], described, hertz, start, stop, preset)
+    train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
+    held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
     with terminal.progress() as advance:
         done = run(described, train, held, seed, folder, vehicle, advance)
     if report is not None:

@@ -21,6 +21,7 @@ from quadid_cli.options import (
     Seed,
     Start,
     Stop,
+    Unchecked,
     Validate,
     VehicleName,
 )
@@ -67,6 +68,7 @@ def identify(
     start: Start = None,
     stop: Stop = None,
     preset: Preset = "auto",
+    unchecked: Unchecked = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -79,8 +81,8 @@ def identify(
     described = loading.load_vehicle(vehicle)
     target = fitted_path(output.out_folder(out), described, vehicle)
     hertz = GRID if rate is None else rate
-    train = loading.load_logs(logs, described, hertz, start, stop, preset)
-    held = loading.load_logs(validate or [], described, hertz, start, stop, preset)
+    train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
+    held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
     with terminal.progress() as advance:
         done = run(described, train, held, optimizer, seed, target, advance)
     if report is not None:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
+_FATAL = ("gravity", "gyro_attitude", "velocity_attitude")
+"""Checks of units and frames; what fails them would give numbers that look fine and mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +40,19 @@ class Log:
         recording: as read, each channel at its own rate.
         windows: on one grid, without gaps.
         grid: how the windows were made.
+        doubts: what looks wrong about units, frames, motors or clock, each with what to do.
     """
 
     path: Path
     recording: Recording
     windows: list[Window]
     grid: GridReport
+    doubts: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> list[str]:
         """What was wrong with the log and its gridding, each with the log's name."""
-        return [f"{self.path.name}: {text}" for text in (*self.recording.warnings, *self.grid.notes)]
+        return [f"{self.path.name}: {text}" for text in (*self.recording.warnings, *self.doubts, *self.grid.notes)]
 
 
 def load_vehicle(name: str) -> Vehicle:
@@ -101,7 +105,7 @@ def parse_cut(text: str, start: float | None = None, stop: float | None = None) 
 
 def load_log(
     text: str, vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
-    preset: str = "auto",
+    preset: str = "auto", unchecked: bool = False,
 ) -> Log:  # fmt: skip
     """Opens a log and brings it onto the grid.
 
@@ -112,9 +116,10 @@ def load_log(
         start: first time to use [s], after the log's first IMU sample.
         stop: last time to use [s], likewise.
         preset: topic names of ROS logs.
+        unchecked: use the log even when its units or frames look wrong.
 
     Raises:
-        LogError: not readable, or nothing left of it.
+        LogError: not readable, in wrong units or frames, or nothing left of it.
         NotIdentifiableError: no rotor signal that means anything.
     """
     from quadid_replay import open_log
@@ -123,18 +128,40 @@ def load_log(
 
     cut = parse_cut(text, start, stop)
     recording = open_log(cut.path, preset)
+    doubts = () if unchecked else check_conventions(recording, vehicle)
     zero = first_imu_time(recording)
     limits = [None if limit is None else zero + limit for limit in (cut.start, cut.stop)]
     windows, report = grid_recording(recording, vehicle, rate, limits[0], limits[1])
-    return Log(cut.path.resolve(), recording, windows, report)
+    return Log(cut.path.resolve(), recording, windows, report, doubts)
 
 
 def load_logs(
     texts: Sequence[str], vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
-    preset: str = "auto",
+    preset: str = "auto", unchecked: bool = False,
 ) -> list[Log]:  # fmt: skip
     """Opens several logs, see `load_log`."""
-    return [load_log(text, vehicle, rate, start, stop, preset) for text in texts]
+    return [load_log(text, vehicle, rate, start, stop, preset, unchecked) for text in texts]
+
+
+def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]:
+    """Checks that a log means what its reader believes, before anything is fitted to it.
+
+    Returns:
+        What looks wrong but need not be.
+
+    Raises:
+        LogError: units or frames that cannot be right; names the fix.
+    """
+    from quadid.inspection import Verdict, inspect
+
+    doubts = []
+    for check in inspect(recording, vehicle).checks:
+        if check.verdict is Verdict.ERROR and check.name in _FATAL:
+            fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
+            raise LogError(f"{recording.name}: {check.message}", fix=fix)
+        if check.verdict in (Verdict.ERROR, Verdict.WARNING):
+            doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
+    return tuple(doubts)
 
 
 def first_imu_time(recording: Recording) -> float:

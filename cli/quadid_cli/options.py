@@ -47,6 +47,7 @@ Preset = Annotated[
         "--preset", metavar="NAME", help="Topic names of ROS logs: auto, canonical, mavros, px4, ardupilot, rotors."
     ),
 ]
+Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
 ]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from quadid_cli.options import JsonTarget, Logs, OutFolder, OwnRate, Preset, Start, Stop, VehicleName
+from quadid_cli.options import JsonTarget, Logs, OutFolder, OwnRate, Preset, Start, Stop, Unchecked, VehicleName
 
 
 def score(
@@ -20,6 +20,7 @@ def score(
     start: Start = None,
     stop: Stop = None,
     preset: Preset = "auto",
+    unchecked: Unchecked = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -32,7 +33,7 @@ def score(
     output.check_file(json, "--json")
     wanted = parse_horizons(horizons)
     described = loading.load_vehicle(vehicle)
-    opened = loading.load_logs(logs, described, rate, start, stop, preset)
+    opened = loading.load_logs(logs, described, rate, start, stop, preset, unchecked)
     theta = Layout(described).initial(described)
     pooled, each = horizon_scores([log.windows for log in opened], described, theta, wanted)
     files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]

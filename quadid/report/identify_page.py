@@ -10,7 +10,7 @@ from quadid.identify.noise import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure
-from quadid.report.verdict import identify_verdict, percent, reason, relative_halfwidth
+from quadid.report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth
 
 JsonDict = Mapping[str, Any]
 FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
@@ -34,7 +34,7 @@ def identify_page(
         "title": f"Identification of {result['vehicle']}",
         "subtitle": _subtitle(result),
         "verdict": asdict(identify_verdict(result)),
-        "parameters": [parameter_row(p, truth) for p in result["parameters"]],
+        "parameters": [parameter_row(p, truth, at_bounds(result)) for p in result["parameters"]],
         "parameter_figure": parameter_figure(result["parameters"], truth),
         "fit_names": [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in result["sets"])],
         "sets": set_sections(result["sets"], sets),
@@ -52,13 +52,15 @@ def _subtitle(result: JsonDict) -> str:
     return f"{text}; search {result['optimizer']}, {result['seconds']:.1f} s"
 
 
-def parameter_row(parameter: JsonDict, truth: Mapping[str, float] | None = None) -> dict[str, Any]:
+def parameter_row(
+    parameter: JsonDict, truth: Mapping[str, float] | None = None, stuck: Sequence[str] = ()
+) -> dict[str, Any]:
     """A parameter with its margin, its reason, and the truth where known."""
     row = {
         "relative_to": None,
         **parameter,
         "margin": percent(relative_halfwidth(parameter)).replace(" ", "\u00a0"),
-        "reason": reason(parameter),
+        "reason": reason(parameter, stuck),
     }
     if truth:
         row["truth"] = truth.get(parameter["name"])

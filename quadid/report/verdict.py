@@ -49,7 +49,8 @@ def identify_verdict(result: JsonDict) -> Verdict:
         result: a dictionary of the form ``quadid.identify/1``.
     """
     parameters, sets = result["parameters"], result["sets"]
-    known = [p for p in parameters if p["status"] == "identified"]
+    stuck = at_bounds(result)
+    known = [p for p in parameters if p["status"] == "identified" and p["name"] not in stuck]
     open_ones = [p for p in parameters if p["status"] != "identified"]
     judged = [s for s in sets if s["role"] == "validate"] or sets
     ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
@@ -57,10 +58,15 @@ def identify_verdict(result: JsonDict) -> Verdict:
     level, match = _match(ratio, where)
     if not known:
         level = "poor"
-    elif open_ones and level == "good":
+    elif (open_ones or stuck) and level == "good":
         level = "fair"
     headline = f"{_count(len(known), len(parameters))} identified; {match}."
-    return Verdict(level, headline, _details(known, judged), _next_steps(result, open_ones, ratio))
+    details = _details(known, judged)
+    if not ratio <= ROUGH:
+        headline = f"Not to be used yet: {match}."
+        found = f"{_count(len(known), len(parameters))} came out sharply, but they carry what the model lacks."
+        details = (found, *details[1:]) if known else details
+    return Verdict(level, headline, details, _next_steps(result, open_ones, stuck, ratio))
 
 
 def _match(ratio: float, where: str) -> tuple[Level, str]:
@@ -98,8 +104,20 @@ def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str
     return tuple(out)
 
 
-def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], ratio: float) -> tuple[str, ...]:
+def at_bounds(result: JsonDict) -> list[str]:
+    """Names of the parameters that a fit left on a bound, as its warnings tell."""
+    names = [p["name"] for p in result["parameters"]]
+    return [n for n in names if any(w.startswith(f"{n} = ") and "rests on its bound" in w for w in result["warnings"])]
+
+
+def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
     out = []
+    solid = [n for n in stuck if n not in {p["name"] for p in open_ones}]
+    if solid:
+        out.append(
+            f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(solid)} "
+            f"rest{'s' * (len(solid) == 1)} on a bound."
+        )
     for p in open_ones:
         if p["status"] == "prior_dominated":
             out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} does not show in these data.")
@@ -116,14 +134,16 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], ratio: float) -
     return tuple(dict.fromkeys(out))
 
 
-def reason(parameter: JsonDict) -> str:
-    """Says in one sentence what the data say about a parameter."""
+def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
+    """Says in one sentence what the data say about a parameter; `stuck` as of `at_bounds`."""
     name, status = parameter["name"], parameter["status"]
     if status == "prior_dominated":
         needs = MOTION.get(name)
         return "The data say nothing about it; the value is the guess." + (f" It needs {needs}." if needs else "")
     if status == "ratio_only":
         return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
+    if name in stuck:
+        return "Rests on a bound of the vehicle file: the data want a value outside."
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan
     if not math.isfinite(change):
         return f"Known to {percent(relative_halfwidth(parameter))}."
@@ -146,6 +166,8 @@ def percent(share: float) -> str:
     if not math.isfinite(share):
         return "an unknown margin"
     value = 100.0 * share
+    if value > 200.0:
+        return "over 200 %"
     return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
 
 
