@@ -28,7 +28,7 @@ ERRORS = 2.0
 """A gain on unseen blocks must exceed this many of its standard errors."""
 LEAST_GAIN = 15.0
 """… and this much deviance …"""
-LEAST_SHARE = 0.0012
+LEAST_SHARE = 0.004
 """… and this share of the noise that no model can remove: less is of no use to anybody, and within what the time
 step of a simulation or of an autopilot's own filter can imitate."""
 RELATIVE_GAIN = 1e-4

@@ -20,7 +20,6 @@ from quadid.identify.linearised import Linearised as Linearised
 from quadid.identify.linearised import join, log_determinant_beyond
 from quadid.identify.noise import NoiseModel
 from quadid.model import layout as ix
-from quadid.model.kernel import LANES
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
