@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.resample import COINCIDENT, sample_period
-from quadid.rotor_signal import rotor_signal
+from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import REQUIRED, Plan, make_plan, on_grid, reach
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
 
 FloatArray = NDArray[np.float64]
+Span = tuple[float, float]
 
 SHORTEST = 1.0
 """Windows shorter than this [s] are dropped where a rate was asked for."""
@@ -110,56 +111,71 @@ def grid_recording(
     low, high = -math.inf if start is None else start, math.inf if stop is None else stop
     if shortest is None:
         shortest = SHORTEST if rate is not None else 0.0
-    windows: list[Window] = []
-    lost = 0.0
     log_span = _log_span(recording)
+    windows: list[Window] = []
+    dropped: list[float] = []
     for span in spans:
         a, b = _inside(plan, span)
         at = _grid_times(plan, max(a, low), min(b, high))
         if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
             windows.append(_window(plan, at, recording.name, log_span))
-        else:
-            lost += max(0.0, min(span[1], high) - max(span[0], low))
+        elif max(span[0], low) < min(span[1], high):
+            dropped.append(min(span[1], high) - max(span[0], low))
     if not windows:
         longest = max((b - a for a, b in spans), default=0.0)
         raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), start, stop)
-    report = GridReport(
+    return Gridded(windows, _report(plan, rotor, windows, len(spans) - 1, dropped, log_span))
+
+
+def _report(
+    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
+) -> GridReport:
+    return GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
         seconds_used=sum((len(w) - 1) * w.dt for w in windows),
         seconds_log=log_span[1] - log_span[0],
-        gaps=len(spans) - 1,
-        dropped=sum(max(a, low) < min(b, high) for a, b in spans) - len(windows),
-        seconds_dropped=lost,
+        gaps=gaps,
+        dropped=len(dropped),
+        seconds_dropped=sum(dropped),
         rotor_source=rotor.source,
         rotor_rate=1.0 / sample_period(rotor.t),
         filtered=plan.filtered,
         notes=(*rotor.notes, *_notes(plan, rotor.t)),
     )
-    return Gridded(windows, report)
 
 
-def _spans(plan: Plan) -> list[tuple[float, float]]:
+def _spans(plan: Plan) -> list[Span]:
     """Returns the times [s] during which every required channel is there, cut at gaps and breaks."""
-    spans: list[tuple[float, float]] = [(-math.inf, math.inf)]
+    spans: list[Span] = [(-math.inf, math.inf)]
     for name in REQUIRED:
-        if name not in plan.tracks:
-            continue
-        track = plan.tracks[name]
-        own = [(float(track.t[cut][0]), float(track.t[cut][-1])) for cut in track.stretches]
-        spans = [(max(a, c), min(b, d)) for a, b in spans for c, d in own if max(a, c) <= min(b, d)]
+        if name in plan.tracks:
+            track = plan.tracks[name]
+            spans = _common(spans, list(zip(track.begins.tolist(), track.ends.tolist(), strict=True)))
     return spans
 
 
-def _inside(plan: Plan, span: tuple[float, float]) -> tuple[float, float]:
+def _common(one: list[Span], other: list[Span]) -> list[Span]:
+    """Intersects two rising lists of spans."""
+    out, i, j = [], 0, 0
+    while i < len(one) and j < len(other):
+        a, b = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])
+        if a <= b:
+            out.append((a, b))
+        if one[i][1] < other[j][1]:
+            i += 1
+        else:
+            j += 1
+    return out
+
+
+def _inside(plan: Plan, span: Span) -> Span:
     """Shrinks a span to where the low-pass, if there is one, has samples on both sides in every required channel."""
     a, b = span
     for name in REQUIRED:
-        for cut in plan.tracks[name].stretches if name in plan.tracks else ():
-            t = plan.tracks[name].t[cut]
-            if t[0] <= span[1] and t[-1] >= span[0]:
-                c, d = reach(plan.tracks[name], cut, plan)
-                a, b = max(a, c), min(b, d)
+        for cut in plan.tracks[name].stretches_within(*span) if name in plan.tracks else ():
+            c, d = reach(plan.tracks[name], cut, plan)
+            a, b = max(a, c), min(b, d)
     return a, b
 
 
@@ -173,7 +189,7 @@ def _grid_times(plan: Plan, a: float, b: float) -> FloatArray:
     return np.asarray(t[first] + plan.step * np.arange(math.floor((b - t[first] + tolerance) / plan.step) + 1))
 
 
-def _window(plan: Plan, at: FloatArray, name: str, log_span: tuple[float, float]) -> Window:
+def _window(plan: Plan, at: FloatArray, name: str, log_span: Span) -> Window:
     columns = {}
     for channel, track in plan.tracks.items():
         values = on_grid(channel, track, at, plan)
@@ -182,7 +198,7 @@ def _window(plan: Plan, at: FloatArray, name: str, log_span: tuple[float, float]
     return Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, name=name, log_span=log_span)
 
 
-def _log_span(recording: Recording) -> tuple[float, float]:
+def _log_span(recording: Recording) -> Span:
     ends = [(float(c.t[0]), float(c.t[-1])) for c in recording.channels.values() if len(c.t)]
     return min(a for a, _ in ends), max(b for _, b in ends)
 

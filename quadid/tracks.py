@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,21 @@ class Track:
     period: float
     stretches: tuple[slice, ...]
     held: bool = False
+
+    @cached_property
+    def begins(self) -> FloatArray:
+        """Time [s] of the first sample of each stretch."""
+        return self.t[[cut.start for cut in self.stretches]]
+
+    @cached_property
+    def ends(self) -> FloatArray:
+        """Time [s] of the last sample of each stretch."""
+        return self.t[[cut.stop - 1 for cut in self.stretches]]
+
+    def stretches_within(self, first: float, last: float) -> tuple[slice, ...]:
+        """Returns the stretches that have a sample in [first, last] [s] or span it."""
+        begin, end = np.searchsorted(self.ends, first, "left"), np.searchsorted(self.begins, last, "right")
+        return self.stretches[int(begin) : int(end)]
 
 
 class Plan(NamedTuple):
@@ -103,7 +119,7 @@ def on_grid(name: str, track: Track, at: FloatArray, plan: Plan) -> FloatArray:
     """Reads one channel at the grid times; NaN where it says nothing."""
     out = np.full((len(at), track.values.shape[1]), np.nan)
     tolerance = COINCIDENT * plan.step
-    for cut in track.stretches:
+    for cut in track.stretches_within(at[0] - tolerance, at[-1] + tolerance):
         a, b = reach(track, cut, plan)
         rows = np.flatnonzero((at >= a - tolerance) & (at <= b + tolerance))
         if len(rows):

@@ -115,7 +115,7 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
 def gyro_check(recording: Recording) -> Check:
     """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
     gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
-    if gyro is None or attitude is None:
+    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
         return Check("gyro_attitude", Verdict.UNKNOWN, "needs gyro and attitude")
     best: tuple[str, AxisMap] | None = None
     stride = max(1, round(_STEP / sample_period(attitude.t)))
@@ -168,7 +168,7 @@ def velocity_check(recording: Recording) -> Check:
     """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity."""
     channels = recording.channels
     accel, attitude, velocity = (channels.get(n) for n in ("accel", "attitude", "velocity"))
-    if accel is None or attitude is None or velocity is None:
+    if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
         return Check("velocity_attitude", Verdict.UNKNOWN, "needs accelerometer, attitude and velocity")
     gained, derived = _velocity_gains(accel, attitude, velocity)
     if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
@@ -232,9 +232,8 @@ def _usable_steps(t: FloatArray, other: FloatArray) -> NDArray[np.bool_]:
     steps = np.diff(t)
     longest = GAP * sample_period(other)
     holes = np.flatnonzero(np.diff(other) > longest)
-    spoiled = np.zeros(len(steps), dtype=np.bool_)
-    for hole in holes:
-        spoiled |= (t[:-1] < other[hole + 1]) & (t[1:] > other[hole])
+    following = np.searchsorted(other[holes + 1], t[:-1], "right")
+    spoiled = np.append(other[holes], np.inf)[following] < t[1:]
     inside = (t[:-1] >= other[0]) & (t[1:] <= other[-1])
     return np.asarray(inside & ~spoiled & (steps < GAP * np.median(steps)))
 

@@ -65,7 +65,8 @@ class DataflashIndex:
         scale = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][1]
         code = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][0]
         raw = self._bytes(name, place, struct.calcsize("<" + code))
-        values = np.asarray(raw.view(kind)[:, 0], dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
+            values = np.asarray(raw.view(kind)[:, 0], dtype=np.float64)
         return values if scale is None else values * scale
 
     def text(self, name: str, column: str) -> list[str]:
@@ -133,6 +134,9 @@ def index_dataflash(path: Path) -> DataflashIndex:
 def _note_format(index: DataflashIndex, body: bytes, names: dict[int, str], lengths: list[int]) -> None:
     kind, length, raw_name, raw_format, raw_columns = struct.unpack("<BB4s16s64s", body)
     if kind == _FMT_TYPE:
+        return
+    if not set(raw_format.split(b"\x00")[0].decode("latin-1")) <= set(FORMAT_TO_STRUCT):
+        index.damaged.append(f"type {kind}")  # pymavlink would print this
         return
     try:
         name = null_term(raw_name.decode("ascii"))

@@ -98,7 +98,7 @@ class McapFile:
         """Says in sentences what could not be read."""
         notes = []
         if self.bad_chunks:
-            notes.append(f"{self.bad_chunks} damaged chunks refused ({self.lost_seconds:.2f} s of log)")
+            notes.append(f"{self.bad_chunks} damaged chunks or definitions refused ({self.lost_seconds:.2f} s of log)")
         if self.lost_bytes:
             share = self.lost_bytes / self._size
             notes.append(f"the file is cut or damaged: its last {self.lost_bytes} bytes ({share:.1%}) are not readable")
@@ -158,16 +158,16 @@ class McapFile:
             if end > self._size or not (0 < opcode <= Opcode.DATA_END or opcode >= 0x80):
                 self.lost_bytes = self._size - offset
                 return
-            if opcode == Opcode.CHUNK:
-                try:
+            try:
+                if opcode == Opcode.CHUNK:
                     yield from self._chunk_messages(self._inflate(file.read(length)), wanted)
-                except _DamagedError:
-                    self.bad_chunks += 1
-            elif opcode == Opcode.MESSAGE:
-                yield from _one_message(file.read(length), wanted)
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._note_safely(opcode, file.read(length))
-            elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                elif opcode == Opcode.MESSAGE:
+                    yield from _one_message(file.read(length), wanted)
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._note_safely(opcode, file.read(length))
+            except _DamagedError:
+                self.bad_chunks += 1
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 return
             offset = end
         self.lost_bytes = self._size - offset

@@ -63,7 +63,7 @@ def px4_rotor_count(parameters: Mapping[str, float]) -> int:
 def active_outputs(pulses: FloatArray) -> list[int]:
     """Returns the leading outputs that look like motors: pulses [us] in range that vary; shape (n, outputs)."""
     columns = 0
-    for column in pulses.T:
+    for column in pulses.T if len(pulses) else ():
         plausible = (column > _LOWEST_PULSE) & (column < _HIGHEST_PULSE)
         if plausible.mean() < 0.9 or np.ptp(column[plausible]) < 20.0:
             break

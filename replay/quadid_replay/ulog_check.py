@@ -1,20 +1,27 @@
-"""Walks through the records of a PX4 ULog before pyulog does: damage it would not report, and bombs it would inflate.
+"""Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted.
 
-pyulog says a file is not corrupt when it simply ends inside a record, and it expands nested message formats without
-limit.
+pyulog says a file is not corrupt when it simply ends inside a record, loops for ever on some damaged definitions, and
+expands nested message formats without limit.
 """
 
 from __future__ import annotations
 
 import mmap
+import struct
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 from quadid.errors import LogError
 
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
+_DEFINITIONS = frozenset(b"FP")
 _SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 _HEADER = 16
+_NEAR = 65536
+"""How far behind a damaged place records are looked for byte by byte; further on only sync marks are."""
+_CHAIN = 3
+"""So many plausible records in a row are believed to be records."""
 MOST_FIELDS = 5000
 """Most numbers one message may hold once its nested types are expanded."""
 _BASIC = frozenset(f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)) | {
@@ -22,45 +29,110 @@ _BASIC = frozenset(f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16
 }  # fmt: skip
 
 
-class UlogDamage(NamedTuple):
-    """Bytes that belong to no record, and whether the file ends inside one."""
+@dataclass
+class UlogRecords:
+    """What a walk found.
 
-    skipped: int
-    cut: bool
+    Attributes:
+        clean: header and whole records of definitions, parameters, and data of the wanted topics.
+        skipped: bytes that belong to no record.
+        cut: whether the file ends inside a record.
+    """
+
+    clean: BytesIO
+    skipped: int = 0
+    cut: bool = False
+    formats: dict[str, list[tuple[str, int]]] = field(default_factory=dict)
+    wanted: set[int] = field(default_factory=set)
+    lengths: dict[int, int] = field(default_factory=dict)
+    boundaries: list[int] = field(default_factory=list)
 
 
-def check_ulog(path: Path) -> UlogDamage:
-    """Walks through all records.
+def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
+    """Walks through all records and keeps those that matter for `topics`.
 
     Raises:
-        LogError: a message format that expands beyond `MOST_FIELDS`, or a file without any record.
+        LogError: a format that expands beyond `MOST_FIELDS`, an encrypted or future log, or a file without any record.
     """
+    if path.stat().st_size <= _HEADER:
+        raise LogError(f"{path.name}: holds a header and nothing else", "a complete ULog", "copy it again")
     with path.open("rb") as file:
-        if path.stat().st_size <= _HEADER:
-            raise LogError(f"{path.name}: holds a header and nothing else", "a complete ULog", "copy it again")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    formats: dict[str, list[tuple[str, int]]] = {}
-    skipped, offset, size = 0, _HEADER, len(data)
+    found = UlogRecords(BytesIO())
+    found.clean.write(data[:_HEADER])
+    offset, size = _HEADER, len(data)
     while offset + 3 <= size:
         length, kind = data[offset] | data[offset + 1] << 8, data[offset + 2]
-        if kind not in _KNOWN or length == 0:
-            following = data.find(_SYNC, offset + 1)
-            following = size if following < 0 else following + len(_SYNC)
-            skipped += following - offset
+        end = offset + 3 + length
+        appended = next((b for b in found.boundaries if offset < b < end), None)
+        if appended is not None:  # the logger stopped here and went on at the boundary
+            offset = appended
+        elif kind not in _KNOWN or length == 0 or (end > size and found.skipped):
+            following = _next_record(data, offset + 1, found)
+            found.skipped += following - offset
             offset = following
-            continue
-        if offset + 3 + length > size:
-            return UlogDamage(skipped, True)
-        if kind == ord("F"):
-            _note_format(data[offset + 3 : offset + 3 + length], formats)
+        elif end > size:
+            found.cut = True
+            break
+        else:
+            _take(found, path.name, kind, data[offset + 3 : end], topics)
+            offset = end
+    found.cut |= not found.cut and offset < size
+    _check_sizes(found, path.name)
+    found.clean.seek(0)
+    return found
+
+
+def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozenset[str]) -> None:
+    if kind == ord("B"):
+        _note_flags(found, name, body)
+        return
+    if kind == ord("F"):
+        _note_format(body, found.formats)
+    elif kind == ord("A"):
+        if body[3:].decode("utf-8", "replace") not in topics or len(body) < 4:
+            return
+        found.wanted.add(body[1] | body[2] << 8)
+    elif kind == ord("D") and len(body) > 2:
+        number = body[0] | body[1] << 8
+        found.lengths.setdefault(number, len(body))
+        if number not in found.wanted:
+            return
+    elif kind not in _DEFINITIONS:
+        return
+    found.clean.write(struct.pack("<HB", len(body), kind) + body)
+
+
+def _next_record(data: mmap.mmap, offset: int, found: UlogRecords) -> int:
+    """Returns where records go on: after the next sync mark, or nearby where several plausible ones follow."""
+    sync = data.find(_SYNC, offset)
+    after = len(data) if sync < 0 else sync + len(_SYNC)
+    for place in range(offset, min(offset + _NEAR, after)):
+        if data[place + 2 : place + 3] == b"D" and _plausible(data, place, found):
+            return place
+    return after
+
+
+def _plausible(data: mmap.mmap, offset: int, found: UlogRecords) -> bool:
+    for _ in range(_CHAIN):
+        if offset + 5 > len(data):
+            return False
+        length, kind = data[offset] | data[offset + 1] << 8, data[offset + 2]
+        if kind not in _KNOWN or not 0 < length <= 10000:
+            return False
+        if kind == ord("D") and found.lengths.get(data[offset + 3] | data[offset + 4] << 8) != length:
+            return False
         offset += 3 + length
-    for name in formats:
-        if _expanded(name, formats, {}, 0) > MOST_FIELDS:
-            raise LogError(
-                f"{path.name}: message '{name}' expands to more than {MOST_FIELDS} numbers",
-                "messages as PX4 writes them", "this file is damaged or was made to harm: do not trust it",
-            )  # fmt: skip
-    return UlogDamage(skipped, offset < size)
+    return True
+
+
+def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
+    if len(body) < 40:
+        return
+    if body[8] & ~1 or any(body[9:16]):
+        raise LogError(f"{name}: written in a way this program does not know", "ULog version 1", "update quadid")
+    if body[8] & 1:
+        found.boundaries = [b for b in struct.unpack("<3Q", body[16:40]) if b]
 
 
 def _note_format(body: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
@@ -72,6 +144,15 @@ def _note_format(body: bytes, formats: dict[str, list[tuple[str, int]]]) -> None
             digits = count.rstrip("]")
             parsed.append((kind, int(digits) if bracket and digits.isdecimal() else 1))
     formats[name] = parsed
+
+
+def _check_sizes(found: UlogRecords, path: str) -> None:
+    for name in found.formats:
+        if _expanded(name, found.formats, {}, 0) > MOST_FIELDS:
+            raise LogError(
+                f"{path}: message '{name[:40]}' expands to more than {MOST_FIELDS} numbers",
+                "messages as PX4 writes them", "this file is damaged or was made to harm: do not trust it",
+            )  # fmt: skip
 
 
 def _expanded(name: str, formats: dict[str, list[tuple[str, int]]], known: dict[str, int], depth: int) -> int:

@@ -22,15 +22,15 @@ from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
-from quadid_replay.ulog_check import UlogDamage, check_ulog
+from quadid_replay.ulog_check import UlogRecords, collect_records
 
 FloatArray = NDArray[np.float64]
 
-_TOPICS = [
+_TOPICS = frozenset((
     "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",
     "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
     "esc_status",
-]  # fmt: skip
+))  # fmt: skip
 _XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
 
 
@@ -48,8 +48,8 @@ def read_ulog(path: Path, sha256: str = "") -> Recording:
     Raises:
         LogError: nothing usable in it, or a file made to exhaust memory.
     """
-    damage = check_ulog(path)
-    log = _load(path)
+    records = collect_records(path, _TOPICS)
+    log = _load(path, records)
     raw = [
         *fastest_first(_gyro(log), 2.0),
         *fastest_first(_accel(log), 2.0),
@@ -61,22 +61,22 @@ def read_ulog(path: Path, sha256: str = "") -> Recording:
         *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
         *_esc(log),
     ]
-    return assemble(path.name, "ulog", raw, log.clock, _notes(damage, path.stat().st_size), sha256)
+    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), sha256)
 
 
-def _notes(damage: UlogDamage, size: int) -> list[str]:
+def _notes(records: UlogRecords, size: int) -> list[str]:
     notes = []
-    if damage.skipped:
-        notes.append(f"{damage.skipped} of {size} bytes are damaged and were skipped")
-    if damage.cut:
+    if records.skipped:
+        notes.append(f"{records.skipped} of {size} bytes are damaged and were skipped")
+    if records.cut:
         notes.append("the file ends inside a record: it was cut; everything before is used")
     return notes
 
 
-def _load(path: Path) -> _Log:
+def _load(path: Path, records: UlogRecords) -> _Log:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints
-            ulog = ULog(str(path), message_name_filter_list=_TOPICS)
+            ulog = ULog(records.clean)
     except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, OSError) as error:
         raise LogError(
             f"{path.name}: its definitions are damaged ({type(error).__name__}: {str(error)[:80]})",
@@ -106,7 +106,8 @@ def _raw(
 
 
 def _stack(data: dict[str, NDArray[Any]], columns: tuple[str, ...]) -> FloatArray:
-    return np.column_stack([data[c].astype(np.float64) for c in columns])
+    with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
+        return np.column_stack([data[c].astype(np.float64) for c in columns])
 
 
 def _has(log: _Log, key: tuple[str, int], *columns: str) -> bool:

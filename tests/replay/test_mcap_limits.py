@@ -65,7 +65,7 @@ def test_one_damaged_chunk_costs_only_itself(small_chunks: Path) -> None:
     data[chunk.chunk_start_offset + chunk.chunk_length - 40] ^= 1
     small_chunks.write_bytes(bytes(data))
     recording = open_log(small_chunks)
-    assert any("1 damaged chunks refused" in w for w in recording.warnings)
+    assert any("1 damaged chunks or definitions refused" in w for w in recording.warnings)
     share = len(recording.channels["gyro"].t) / 400
     assert 1 - 2 / len(summary.chunk_indexes) < share < 1
 

@@ -10,7 +10,7 @@ import pytest
 from pyulog import ULog
 from quadid_replay import open_log
 from quadid_replay.motors import RPM
-from quadid_replay.ulog_check import check_ulog
+from quadid_replay.ulog_check import collect_records
 
 from quadid.errors import LogError
 
@@ -144,9 +144,41 @@ def test_formats_made_to_explode_are_refused(tmp_path: Path) -> None:
     endless.format("a", "b x;")
     endless.format("b", "a x;")
     with pytest.raises(LogError, match="expands"):
-        check_ulog(opened(tmp_path, bytes(endless.data)))
+        collect_records(opened(tmp_path, bytes(endless.data)), frozenset())
 
 
 def test_a_header_alone_is_no_log(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="header and nothing else"):
         open_log(opened(tmp_path, bytes(Ulog().data)))
+
+
+def test_records_are_found_again_without_a_sync_mark(tmp_path: Path) -> None:
+    data = bytearray(flight().data)
+    del data[15000:15007]
+    recording = open_log(opened(tmp_path, bytes(data)))
+    assert len(recording.channels["gyro"].t) >= 397
+
+
+def test_definitions_that_run_past_the_end_do_not_loop(tmp_path: Path) -> None:
+    """pyulog 1.3 seeks back further than it read and never ends."""
+    log = flight(count=0)
+    head = bytes(log.data[: log.data.find(b"A\x00") - 2])
+    with pytest.raises(LogError):
+        open_log(opened(tmp_path, head + struct.pack("<HB", 60000, ord("Z")) + bytes(100)))
+
+
+def test_data_appended_after_a_crash_is_read(tmp_path: Path) -> None:
+    log = flight()
+    body = bytes(log.data)
+    flags = struct.pack("<8s8s3Q", bytes(8), b"\x01" + bytes(7), len(body) + 43 - 20, 0, 0)
+    tail = Ulog()
+    tail.ids = log.ids
+    tail.add("sensor_combined", "Q3fIi3fI", 7_100_000, 0.1, 0.2, 0.3, 4000, 500, 0.0, 0.0, -9.8, 4000)
+    data = body[:16] + struct.pack("<HB", 40, ord("B")) + flags + body[16:-20] + bytes(tail.data[16:])
+    recording = open_log(opened(tmp_path, data))
+    assert recording.channels["gyro"].t[-1] == pytest.approx(7.098)
+    assert recording.warnings == ()
+    future = bytearray(data)
+    future[19 + 9] = 1
+    with pytest.raises(LogError, match="does not know"):
+        open_log(opened(tmp_path, bytes(future)))
