@@ -138,7 +138,7 @@ def parse_effects(
         name, _, rest = text.partition(":")
         values = _numbers(text, rest)
         if name in OUTSIDE:
-            outside[name] = {**draw_outside(name, seed), **values}
+            outside[name] = {**draw_outside(name, seed, 1.0, vehicle), **values}
         elif name not in EFFECTS:
             raise ParameterError(f"unknown effect '{name}'", fix=nearest(name, [*EFFECTS, *OUTSIDE]))
         elif values:

@@ -49,14 +49,21 @@ COMPANION = {"rotor_drag_moment": "rotor_drag", "wind": "rotor_drag"}
 """Effects that cannot be seen alone: without drag there is no in-plane force and no feeling of wind."""
 
 
-def _scales(vehicle: Vehicle | None) -> dict[str, float]:
-    """Factors from a Pelican's sizes to this vehicle's: length, inertia over mass, inertia, rotor inertia and speed."""
+def vehicle_scales(vehicle: Vehicle | None) -> dict[str, float]:
+    """Factors from a Pelican's sizes to this vehicle's, None being a Pelican.
+
+    Keys: length; lever (inertia over mass: a force at a lever turns as much); balance (lever over length: one rotor's
+    thrust turns as much); inertia; rotor (inertia); speed (of the rotors).
+    """
     if vehicle is None:
-        return {"length": 1.0, "lever": 1.0, "inertia": 1.0, "rotor": 1.0, "speed": 1.0}
+        return dict.fromkeys(("length", "lever", "balance", "inertia", "rotor", "speed"), 1.0)
     arm = float(np.mean(np.linalg.norm(vehicle.rotor_positions[:, :2], axis=1)))
+    length = arm / 0.21
+    lever = min(1.0, vehicle.parameters["J_xx"].initial / vehicle.mass / (8.0e-3 / 1.30))
     return {
-        "length": arm / 0.21,
-        "lever": min(1.0, vehicle.parameters["J_xx"].initial / vehicle.mass / (8.0e-3 / 1.30)),
+        "length": length,
+        "lever": lever,
+        "balance": min(1.0, lever / length),
         "inertia": min(1.0, vehicle.parameters["J_xx"].initial / 8.0e-3),
         "rotor": vehicle.parameters["J_r"].initial / 3.0e-5,
         "speed": vehicle.hover_speed() / 370.0,
@@ -77,7 +84,7 @@ SCALED_BY = {
 def _one(
     name: str, rng: np.random.Generator, scale: float, vehicle: Vehicle | None, seconds: float
 ) -> dict[str, float]:
-    factor = _scales(vehicle)[SCALED_BY[name]] if name in SCALED_BY else 1.0
+    factor = vehicle_scales(vehicle)[SCALED_BY[name]] if name in SCALED_BY else 1.0
     values: dict[str, float] = {}
     for key, (low, high) in SIZES[name].items():
         value = float(rng.uniform(low, high)) * factor

@@ -1,4 +1,4 @@
-"""The closed loop: sensors, pilot, stabiliser, rotors and airframe, marched through a flight at 1 kHz.
+"""Clock, sensors and events of the closed loop: what `march` calls on its way through a flight.
 
 Within one step the order is that of a real autopilot: sensors are read, the stabiliser computes, the command leaves.
 Whatever is logged at an instant is therefore the value just before the command of that instant acts.
@@ -204,7 +204,6 @@ def power_at(t: float, after_drop: bool, events: Events) -> float:
 @kernel
 def apply_due(
     now: float,
-    plan: Plan,
     head: int,
     issued: int,
     ramp_end: float,
@@ -227,7 +226,7 @@ def apply_due(
         before = 0.0
         for i in range(omega.shape[0]):
             before += body.spins[i] * omega[i]
-        load_input(drive, track.command[head], level, slope, memory, plan.dt)
+        load_input(drive, track.command[head], level, slope, memory)
         if drive.ramp > 0.0:
             ramp_end = arrival[head] + drive.ramp
         elif drive.tau == 0.0 and drive.slew == 0.0:

@@ -147,7 +147,7 @@ def march(
         push = pushes[min(n, pushes.shape[0] - 1)]
         while end - left > EPSILON:
             head, ramp_end = apply_due(
-                left, plan, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive
+                left, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive
             )
             if changed == 0 and events.mass_time <= left + EPSILON:
                 changed, mass_factor = 1, 1.0 + events.mass_fraction

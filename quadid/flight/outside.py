@@ -14,20 +14,30 @@ from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, nearest
 from quadid.flight import outside_flight, outside_log
+from quadid.flight.draw import vehicle_scales
 from quadid.flight.outside_flight import Arrange, Scene
 from quadid.flight.outside_log import Distort, LogRows
+from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Size:
-    """Realistic range of one number; `scales`: whether it grows with the effect (a frequency does not)."""
+    """Realistic range of one number on a Pelican.
+
+    Attributes:
+        low, high: range.
+        unit: SI unit, or what it is relative to.
+        scales: whether it grows with the effect (a frequency does not).
+        by: key of `draw.vehicle_scales`, for numbers that depend on the vehicle's size.
+    """
 
     low: float
     high: float
     unit: str
     scales: bool = True
+    by: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,15 +68,15 @@ def _effects() -> tuple[OutsideEffect, ...]:
         make(
             "suspended_load", "structure", "A load swings below the vehicle.",
             {"share": s(0.05, 0.12, ""), "length": s(0.5, 1.5, "m", fixed), "damping": s(0.04, 0.08, "", fixed),
-             "depth": s(0.02, 0.05, "m", fixed)}, f.suspended_load),
+             "depth": s(0.02, 0.05, "m", fixed, "lever")}, f.suspended_load),
         make(
             "flexible_arm", "structure", "Torque reaches the body through arms that resonate.",
             {"share": s(0.25, 0.5, ""), "frequency": s(6.0, 11.0, "Hz", fixed), "damping": s(0.05, 0.12, "", fixed)},
             f.flexible_arm),
         make(
             "slosh", "structure", "Fluid moves in a tank.",
-            {"share": s(0.08, 0.2, ""), "frequency": s(0.8, 1.5, "Hz", fixed), "damping": s(0.05, 0.1, "", fixed),
-             "depth": s(0.05, 0.1, "m", fixed)}, f.slosh),
+            {"share": s(0.05, 0.12, ""), "frequency": s(1.2, 2.2, "Hz", fixed), "damping": s(0.08, 0.15, "", fixed),
+             "depth": s(0.04, 0.08, "m", fixed, "lever")}, f.slosh),
         make(
             "gimbal_torque", "structure", "An unbalanced gimbal turns steadily.",
             {"roll": s(0.5, 1.5, "rad/s^2"), "pitch": s(0.5, 1.5, "rad/s^2"),
@@ -78,14 +88,15 @@ def _effects() -> tuple[OutsideEffect, ...]:
             "esc_slew", "propulsion", "Rotor speed changes at a limited rate (smaller is stronger).",
             {"rate": s(1.4, 2.2, "hover speeds per s", fixed)}, f.esc_slew),
         make(
-            "esc_ceiling", "propulsion", "Rotors saturate below what is commanded.",
-            {"ceiling": s(1.18, 1.24, "hover speeds", fixed)}, f.esc_ceiling),
+            "weak_supply", "propulsion", "Above a knee the rotors follow a share of the command (smaller: stronger).",
+            {"knee": s(0.98, 1.04, "hover speeds", fixed), "share": s(0.4, 0.7, "", fixed)}, f.weak_supply),
         make(
             "esc_grain", "propulsion", "Rotor speed comes in coarse steps.",
             {"grain": s(0.03, 0.06, "hover speeds")}, f.esc_grain),
         make(
             "rotor_dropout", "propulsion", "One rotor loses thrust now and then.",
-            {"share": s(0.08, 0.2, ""), "every": s(5.0, 12.0, "s", fixed), "lasts": s(0.6, 2.0, "s", fixed)},
+            {"share": s(0.08, 0.2, "", True, "balance"), "every": s(5.0, 12.0, "s", fixed),
+             "lasts": s(0.6, 2.0, "s", fixed)},
             f.rotor_dropout),
         make(
             "gusts", "environment", "Turbulence pushes and turns (Dryden-like).",
@@ -143,22 +154,23 @@ def _stream(name: str, seed: int) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def draw_outside(name: str, seed: int, scale: float = 1.0) -> dict[str, float]:
+def draw_outside(name: str, seed: int, scale: float = 1.0, vehicle: Vehicle | None = None) -> dict[str, float]:
     """Draws the numbers of one outside effect at realistic size.
 
     Args:
         name: key of `OUTSIDE`.
         seed: decides the draw.
         scale: multiplies those numbers that grow with the effect.
+        vehicle: scales levers from a Pelican's; default a Pelican.
 
     Raises:
         ParameterError: unknown name.
     """
     if name not in OUTSIDE:
         raise ParameterError(f"unknown outside effect '{name}'", fix=nearest(name, OUTSIDE))
-    rng = _stream(name, seed)
+    rng, factors = _stream(name, seed), vehicle_scales(vehicle)
     return {
-        key: float(rng.uniform(size.low, size.high) * (scale if size.scales else 1.0))
+        key: float(rng.uniform(size.low, size.high) * (scale if size.scales else 1.0) * factors.get(size.by, 1.0))
         for key, size in OUTSIDE[name].sizes.items()
     }
 

@@ -90,9 +90,9 @@ def esc_slew(scene: Scene, v: Values, rng: np.random.Generator) -> None:
     scene.setup.drive = scene.setup.drive._replace(slew=v["rate"] * scene.hover_speed)
 
 
-def esc_ceiling(scene: Scene, v: Values, rng: np.random.Generator) -> None:
-    """Limits rotor speed."""
-    scene.setup.drive = scene.setup.drive._replace(ceiling=v["ceiling"] * scene.hover_speed)
+def weak_supply(scene: Scene, v: Values, rng: np.random.Generator) -> None:
+    """The supply gives way: above a knee every rotor only follows a share of the command."""
+    scene.setup.drive = scene.setup.drive._replace(knee=v["knee"] * scene.hover_speed, above_knee=v["share"])
 
 
 def esc_grain(scene: Scene, v: Values, rng: np.random.Generator) -> None:

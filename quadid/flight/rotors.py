@@ -24,7 +24,8 @@ class Drive(NamedTuple):
         tau: first-order lag [s]; 0 for none.
         ramp: time in which the input moves to a new command [s]; 0 steps (held commands).
         slew: largest rate of rotor speed [rad/s^2]; 0 for no limit.
-        ceiling: rotor speed that cannot be exceeded [rad/s]; 0 for none.
+        knee: speed above which the rotors only follow a share of the command [rad/s]; 0 for none.
+        above_knee: that share.
         grain: commands are rounded to multiples of this [rad/s]; 0 for none.
         hysteresis: thrust is (1 +- hysteresis) after the last change was up or down.
     """
@@ -32,7 +33,8 @@ class Drive(NamedTuple):
     tau: float
     ramp: float
     slew: float = 0.0
-    ceiling: float = 0.0
+    knee: float = 0.0
+    above_knee: float = 1.0
     grain: float = 0.0
     hysteresis: float = 0.0
 
@@ -66,9 +68,7 @@ def rotor_speed(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: fl
 
 
 @kernel
-def load_input(
-    drive: Drive, goal: FloatArray, level: FloatArray, slope: FloatArray, memory: FloatArray, dt: float
-) -> None:
+def load_input(drive: Drive, goal: FloatArray, level: FloatArray, slope: FloatArray, memory: FloatArray) -> None:
     """Starts a new piece of input towards a command that has just reached the rotors.
 
     Args:
@@ -77,14 +77,13 @@ def load_input(
         level: present input on entry, input at the start of the piece on return [rad/s].
         slope: rate of the input [rad/s^2]; written.
         memory: +1 or -1, direction of the last change, shape (n,); written.
-        dt: step [s] (unused without ramp).
     """
     for i in range(goal.shape[0]):
         target = goal[i]
         if drive.grain > 0.0:
             target = np.rint(target / drive.grain) * drive.grain
-        if drive.ceiling > 0.0:
-            target = min(target, drive.ceiling)
+        if drive.knee > 0.0 and target > drive.knee:
+            target = drive.knee + drive.above_knee * (target - drive.knee)
         if target != level[i]:
             memory[i] = 1.0 if target > level[i] else -1.0
         if drive.ramp > 0.0:
