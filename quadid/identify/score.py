@@ -35,7 +35,7 @@ class ChannelScore:
     Attributes:
         name: p q r phi theta psi a_x a_y a_z v_n v_e v_d x y z.
         unit: SI unit.
-        mse: squared residuals over those of a perfect model; NaN when never measured.
+        mse: squared residuals over those of a perfect model; NaN when never measured or of unknown noise.
         rmse: root mean squared error of the simulation, in `unit`.
         fit_percent: 100 (1 - |y - y_sim| / |y - mean y|); 100 is perfect, 0 no better than the mean.
         samples: measured samples.
@@ -89,7 +89,8 @@ def mse_score(
         windows: data on one grid.
         vehicle: geometry and mass.
         theta: full parameter vector, shape (size,).
-        noise: sensor noise, from the fit; typical MEMS noise by default.  Channels it does not know get the typical.
+        noise: sensor noise, from the fit; typical MEMS noise by default.  Channels it does not know are simulated and
+            compared, but do not count in `mse`.
 
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
@@ -104,7 +105,8 @@ def mse_score(
     lin = settle_states(shooting, theta)
     expected = expected_squares(shooting, theta)
     series = _series(shooting, lin)
-    return SetScore(*_compare(lin, expected, series), series)
+    known = shooting.channels if noise is None else len(noise.white)
+    return SetScore(*_compare(lin, expected, series, known), series)
 
 
 def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:
@@ -184,13 +186,16 @@ def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
     return np.concatenate(parts)
 
 
-def _compare(lin: Linearised, expected: FloatArray, series: Series) -> tuple[float, tuple[ChannelScore, ...]]:
+def _compare(
+    lin: Linearised, expected: FloatArray, series: Series, known: int
+) -> tuple[float, tuple[ChannelScore, ...]]:
+    """Total and per-channel scores; channels from `known` on have no noise to be measured by."""
     used = lin.weights > 0.0
     squares = np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1))
     samples = np.count_nonzero(used, axis=(0, 1))
     total = expected.sum(axis=0)
     # A channel whose samples are so few that the initial states take them all says nothing about the model.
-    told = total > 1e-9 * np.maximum(squares, 1e-300)
+    told = (total > 1e-9 * np.maximum(squares, 1e-300)) & (np.arange(len(total)) < known)
     ratio = np.where(told, squares / np.where(told, total, 1.0), np.nan)
     channels = []
     for c, name in enumerate(CHANNEL_NAMES[: len(samples)]):

@@ -1,0 +1,187 @@
+"""Whatever is wrong with the input: one line that says what and how to mend it, exit code 2 or 3, no traceback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from quadid.vehicle import Vehicle
+from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+
+
+def _pelican(**changes: object) -> str:
+    data = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())
+    return str(yaml.safe_dump({**data, **changes}))
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (None, "no file"),
+        (b"", "empty file"),
+        (b"\x00\x01\x02\x03" * 100, "unknown format"),
+        (b"#ROSBAG V2.0\n" + b"\x00" * 100, "ROS 1 bag"),
+        (b"\x1f\x8b\x08" + b"\x00" * 100, "gunzip"),
+        (b"t,p,q\n0,1,2\n", "lacks column r"),
+        (b"t,speed\n0,1\n", "none of the columns"),
+        (b"t,p,q,r,w1,w2,w3,w4\n", "no usable row"),
+        (b"t,p,q,r,w1,w2,w3,w4\nx,x,x,x,x,x,x,x\n", "no usable row"),
+        (b"t,p,q,r,w1,w3,w4\n0,0,0,0,1,1,1\n", "without a hole"),
+    ],
+)
+def test_files_that_are_no_logs(inside: Cli, tmp_path: Path, content: bytes | None, expected: str) -> None:
+    log = tmp_path / "log.csv"
+    if content is not None:
+        log.write_bytes(content)
+    assert expected in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 2)
+
+
+def test_a_directory_as_log(quadid: Cli, tmp_path: Path) -> None:
+    assert "quadid fleet" in one_line(quadid("score", tmp_path, "--vehicle", "pelican"), 2)
+
+
+def test_a_truncated_log_is_used_as_far_as_it_goes(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    whole = flights.unseen.read_bytes()
+    cut = tmp_path / "cut.csv"
+    cut.write_bytes(whole[: len(whole) // 2])
+    run = inside("score", cut, "--vehicle", "pelican", "--json", "-")
+    assert run.code == 0
+    assert 650 < run.data["samples"] < 750
+    assert "cut.csv" in run.err
+
+
+@pytest.mark.parametrize("kept", [60, 2000, 100_000])
+def test_a_truncated_log_with_nothing_left(inside: Cli, flights: Flights, tmp_path: Path, kept: int) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flights.train.read_bytes()[:kept])
+    one_line(inside("score", cut, "--vehicle", "pelican"), 2)
+
+
+def test_a_corrupted_log(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    data = bytearray(flights.train.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 64] = bytes(64)
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(data)
+    run = inside("score", broken, "--vehicle", "pelican")
+    assert "Traceback" not in run.err
+    assert run.code in (0, 2, 3)
+    assert "broken.mcap" in run.err
+
+
+def _without(names: list[str], rows: np.ndarray, drop: str) -> tuple[list[str], np.ndarray]:
+    keep = [i for i, n in enumerate(names) if n not in drop.split()]
+    return [names[i] for i in keep], rows[:, keep]
+
+
+@pytest.mark.parametrize(
+    ("drop", "expected"), [("w1 w2 w3 w4", "no rotor speeds and no motor commands"), ("p q r", "no gyro")]
+)
+def test_a_missing_signal_is_exit_3(inside: Cli, flights: Flights, tmp_path: Path, drop: str, expected: str) -> None:
+    log = write_table(tmp_path / "log.csv", *_without(*table(flights.unseen), drop))
+    assert expected in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 3)
+
+
+def test_degrees_for_radians(quadid: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    gyro = [names.index(n) for n in "pqr"]
+    rows[:, gyro] = np.rad2deg(rows[:, gyro])
+    log = write_table(tmp_path / "degrees.csv", names, rows)
+    line = one_line(quadid("identify", log, "--vehicle", "pelican", "--out", tmp_path), 2)
+    assert "deg/s" in line
+    assert "convert to radians" in line
+
+
+def test_flu_for_frd(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    rows[:, [names.index(n) for n in ("q", "r", "ay", "az")]] *= -1.0
+    log = write_table(tmp_path / "flu.csv", names, rows)
+    assert "FLU" in one_line(inside("score", log, "--vehicle", "pelican"), 2)
+
+
+def test_nan_in_a_log_is_left_out(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    rows[100:110, names.index("p")] = np.nan
+    log = write_table(tmp_path / "holes.csv", names, rows)
+    run = inside("score", log, "--vehicle", "pelican", "--json", "-")
+    assert run.code == 0
+    assert run.data["gaps"] >= 1
+    assert "not finite" in run.err
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (_pelican(mass=-1.0), "mass"),
+        (_pelican(masss=1.0), "did you mean 'mass'?"),
+        (_pelican(parameters={"b": 2e-5, "d": 4e-7, "J_xx": -8e-3, "J_yy": 8e-3, "J_zz": 1e-2, "J_r": 3e-5}), "J_xx"),
+        (
+            _pelican(parameters={"b": 2e-5, "d": 4e-7, "J_xx": 1e-3, "J_yy": 1e-3, "J_zz": 1e-1, "J_r": 3e-5}),
+            "triangle",
+        ),
+        (_pelican(effects={"motor_lga": {"tau": 0.1}}), "did you mean 'motor_lag'?"),
+        (_pelican(rotors=[]), "rotors"),
+        ("[1, 2", "not YAML"),
+        ("just text", "mapping"),
+        ("", "mapping"),
+    ],
+)
+def test_impossible_vehicle_files(inside: Cli, flights: Flights, tmp_path: Path, text: str, expected: str) -> None:
+    file = tmp_path / "vehicle.yaml"
+    file.write_text(text, encoding="utf-8")
+    assert expected in one_line(inside("identify", flights.train, "--vehicle", file, "--out", tmp_path), 2)
+
+
+def test_vehicles_that_are_not_there(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    assert "pelican" in one_line(inside("score", flights.train, "--vehicle", "pelicn"), 2)
+    assert "no vehicle file" in one_line(inside("score", flights.train, "--vehicle", tmp_path / "none.yaml"), 2)
+    assert "not text" in one_line(inside("score", flights.train, "--vehicle", flights.train), 2)
+    assert "4 rotor columns" in one_line(inside("score", flights.train, "--vehicle", "hexacopter"), 2)
+
+
+def test_places_that_cannot_be_written(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("", encoding="utf-8")
+    common = ("identify", flights.train, "--vehicle", "pelican")
+    assert "file" in one_line(inside(*common, "--out", file), 2)
+    assert "no folder" in one_line(inside(*common, "--json", tmp_path / "none" / "r.json"), 2)
+    assert "directory" in one_line(inside(*common, "--report", tmp_path), 2)
+
+
+def test_the_vehicle_file_read_is_never_overwritten(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    file = tmp_path / "pelican.fitted.yaml"
+    file.write_text(Vehicle.shipped("pelican").to_yaml(), encoding="utf-8")
+    line = one_line(inside("identify", flights.train, "--vehicle", file, "--out", tmp_path), 2)
+    assert "overwrite" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--optimizer", "psoo"), "did you mean 'pso'?"),
+        (("--rate", "0"), "grid rate"),
+        (("--rate", "nan"), "grid rate"),
+        (("--start", "9", "--stop", "3"), "start before stop"),
+    ],
+)
+def test_impossible_options(
+    inside: Cli, flights: Flights, tmp_path: Path, arguments: tuple[str, ...], expected: str
+) -> None:
+    run = inside("identify", flights.train, "--vehicle", "pelican", "--out", tmp_path, *arguments)
+    assert expected in one_line(run, 2)
+
+
+def test_impossible_horizons(inside: Cli, flights: Flights) -> None:
+    for horizons in ("0", "1,x", "", "99999"):
+        one_line(inside("score", flights.train, "--vehicle", "pelican", "--horizons", horizons), 2)
+    line = one_line(inside("score", flights.train, "--vehicle", "pelican", "--horizons", "1900"), 3)
+    assert "no run of 1900 samples fits" in line
+
+
+def test_control_characters_in_names_do_not_reach_the_terminal(inside: Cli, tmp_path: Path) -> None:
+    run = inside("score", str(tmp_path / "evil\x1b[31m\nname.csv"), "--vehicle", "pelican")
+    assert "\x1b" not in run.err
+    one_line(run, 2)

@@ -1,0 +1,143 @@
+"""`quadid export`: what other programs would make of the files is the vehicle's own physics."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadid.report.programs import FORMATS, export
+from quadid.vehicle import GRAVITY, Command, ParameterPrior, Vehicle
+from tests.cli.conftest import Cli, one_line
+
+SPEED = 900.0
+
+
+@pytest.fixture
+def vehicle() -> Vehicle:
+    """A lopsided Pelican with effects and a known full rotor speed; b came from data."""
+    pelican = Vehicle.shipped("pelican")
+    return pelican.model_copy(
+        update={
+            "command": Command(kind="normalized", max_speed=SPEED),
+            "parameters": {**pelican.parameters, "b": ParameterPrior(initial=2.3e-5, sigma=1e-7)},
+            "effects": {
+                "motor_lag": {"tau": 0.03},
+                "cg_offset": {"x": 0.01, "y": -0.005},
+                "product_of_inertia": {"J_xy": 1e-3, "J_xz": 2e-4, "J_yz": -3e-4},
+                "rotor_drag": {"k_x": 0.3, "k_y": 0.3},
+                "gyro_scale": {"x": 0.01, "y": 0.0, "z": 0.0},
+            },
+        }
+    )
+
+
+def _wrench(vehicle: Vehicle, speeds: np.ndarray) -> tuple[float, np.ndarray]:
+    """Thrust and moment about the CG, FRD, from the vehicle file's own conventions."""
+    arms = vehicle.rotor_positions - np.array([0.01, -0.005, 0.0])
+    b, d = vehicle.parameters["b"].initial, vehicle.parameters["d"].initial
+    forces = np.zeros((len(arms), 3))
+    forces[:, 2] = -b * speeds**2
+    moment = np.cross(arms, forces).sum(axis=0) + np.array([0.0, 0.0, float(np.sum(vehicle.spins * d * speeds**2))])
+    return float(-forces[:, 2].sum()), moment
+
+
+def test_rotorpy_module_gives_the_same_wrench(vehicle: Vehicle) -> None:
+    space: dict[str, Any] = {}
+    exec(export(vehicle, "rotorpy", "x")["_params.py"], space)
+    q = space["quad_params"]
+    speeds = np.array([400.0, 420.0, 380.0, 450.0])
+    arms = np.array([q["rotor_pos"][f"r{i}"] for i in range(1, 5)])
+    forces = np.zeros((4, 3))
+    forces[:, 2] = q["k_eta"] * speeds**2
+    moment = np.cross(arms, forces).sum(axis=0)
+    moment[2] += np.sum(q["rotor_directions"] * q["k_m"] * speeds**2)
+    thrust, expected = _wrench(vehicle, speeds)
+    assert forces[:, 2].sum() == pytest.approx(thrust)
+    np.testing.assert_allclose(moment * [1.0, -1.0, -1.0], expected, rtol=1e-6)
+    assert (q["tau_m"], q["rotor_speed_max"], q["mass"]) == (0.03, SPEED, 1.3)
+    # FRD tensor entries are the negatives of the products; turning y and z over flips xy and xz once, yz twice.
+    assert (q["Ixy"], q["Ixz"], q["Iyz"]) == (1e-3, 2e-4, 3e-4)
+    hover = np.full(4, vehicle.hover_speed())
+    assert q["k_d"] * hover.sum() == pytest.approx(0.3 * 1.3)
+
+
+def test_gazebo_links_add_up_to_the_vehicle(vehicle: Vehicle) -> None:
+    model = ET.fromstring(export(vehicle, "gazebo", "x")[".sdf"]).find("model")
+    assert model is not None
+    total, inertia = 0.0, np.zeros((3, 3))
+    for link in model.findall("link"):
+        mass = float(link.findtext("inertial/mass", "nan"))
+        entry = {
+            k: float(link.findtext(f"inertial/inertia/{k}", "nan")) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        }
+        own = np.array(
+            [
+                [entry["ixx"], entry["ixy"], entry["ixz"]],
+                [entry["ixy"], entry["iyy"], entry["iyz"]],
+                [entry["ixz"], entry["iyz"], entry["izz"]],
+            ]
+        )
+        at = np.array([float(v) for v in link.findtext("pose", "0 0 0 0 0 0").split()[:3]])
+        total += mass
+        inertia += own + mass * (at @ at * np.eye(3) - np.outer(at, at))
+    assert total == pytest.approx(1.3)
+    np.testing.assert_allclose(np.diag(inertia), [8e-3, 8e-3, 1.5e-2], rtol=1e-5)
+    assert inertia[0, 1] == pytest.approx(1e-3, rel=1e-5)
+    plugins = model.findall("plugin")
+    assert [p.findtext("turningDirection") for p in plugins] == ["cw", "ccw", "cw", "ccw"]
+    assert float(plugins[0].findtext("momentConstant", "nan")) == pytest.approx(4e-7 / 2.3e-5)
+
+
+def test_px4_geometry_and_hover(vehicle: Vehicle) -> None:
+    text = export(vehicle, "px4", "x")[".params"]
+    rows = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
+    values = {name: float(value) for _, _, name, value, _ in rows}
+    assert values["CA_ROTOR_COUNT"] == 4
+    assert values["CA_ROTOR2_PX"] == pytest.approx(0.21 - 0.01)
+    assert values["CA_ROTOR1_KM"] == pytest.approx(4e-7 / 2.3e-5)
+    assert values["CA_ROTOR0_KM"] < 0.0
+    assert values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY / (4 * 2.3e-5 * SPEED**2))
+    assert values["CA_ROTOR0_CT"] * 4 * values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY)
+    assert "gyro_scale" in text
+    assert "b = 2.3e-05 N s^2/rad^2: fitted, 95 % within 0.85 %" in text
+    assert "J_xx = 0.008 kg m^2: not from data" in text
+
+
+def test_ardupilot_frame_is_json_below_its_comments(vehicle: Vehicle) -> None:
+    texts = export(vehicle.model_copy(update={"name": "x{y}"}), "ardupilot", "a{b}.yaml")
+    frame = texts[".sitl.json"]
+    assert frame.index("{") == frame.index("\n{") + 1
+    data = json.loads(frame[frame.index("{") :])
+    assert data["moment_inertia"] == [8e-3, 8e-3, 1.5e-2]
+    assert data["hoverThrOut"] == pytest.approx(1.3 * GRAVITY / (4 * 2.3e-5 * SPEED**2), rel=1e-5)
+    assert "MOT_THST_HOVER," in texts[".param"]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_form_from_the_command_line(inside: Cli, tmp_path: Path, form: str) -> None:
+    result = inside("export", "--vehicle", "pelican", "--format", form, "--out", tmp_path, "--json", "-").data
+    assert list(result) == ["schema", "vehicle", "format", "files", "warnings"]
+    for file in result["files"]:
+        assert "pelican" in Path(file).read_text(encoding="utf-8")
+    assert "not from data" in result["warnings"][0]
+
+
+def test_unknown_form(inside: Cli, tmp_path: Path) -> None:
+    assert "did you mean 'px4'?" in one_line(
+        inside("export", "--vehicle", "pelican", "--format", "px5", "--out", tmp_path), 2
+    )
+
+
+def test_awkward_names_break_nothing(vehicle: Vehicle) -> None:
+    odd = vehicle.model_copy(update={"name": "a--b]]> <\"'&\n"})
+    for form in FORMATS:
+        for ending, text in export(odd, form, "--x--.yaml").items():
+            if ending == ".sdf":
+                ET.fromstring(text)
+            if ending == "_params.py":
+                compile(text, "x", "exec")

@@ -1,0 +1,83 @@
+"""`quadid score`: the JSON, gaps, files, and agreement with what can be computed without a simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from quadid.vehicle import Vehicle
+from tests.cli.conftest import Cli, Flights, table, write_table
+
+QUANTITIES = ["position", "velocity", "rotation", "rate"]
+
+
+def test_json_has_exactly_the_keys_of_the_contract(inside: Cli, flights: Flights) -> None:
+    result = inside("score", flights.train, flights.unseen, "--vehicle", "pelican", "--json", "-").data
+    assert list(result) == ["schema", "vehicle", "samples", "gaps", "horizons", "sum", "files"]
+    assert result["schema"] == "quadid.score/1"
+    assert list(result["horizons"]) == ["1", "10", "50"]
+    assert all(list(h) == QUANTITIES for h in result["horizons"].values())
+    assert list(result["sum"]) == ["to", *QUANTITIES]
+    assert result["sum"]["to"] == 50
+    assert result["samples"] == 2 * (1500 - 50)
+    first, second = result["files"]
+    assert [first["log"], second["log"]] == ["train.mcap", "unseen.csv"]
+    assert first["horizons"]["50"]["velocity"] is None
+    assert second["horizons"]["50"]["velocity"] > 0.0
+    pooled = 0.5 * (first["horizons"]["10"]["rate"] + second["horizons"]["10"]["rate"])
+    assert result["horizons"]["10"]["rate"] == pytest.approx(pooled)
+
+
+def test_runs_never_cross_a_gap(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    log = write_table(tmp_path / "gap.csv", names, np.delete(rows, slice(400, 430), axis=0))
+    whole = write_table(tmp_path / "whole.csv", names, rows)
+    result = inside("score", log, whole, "--vehicle", "pelican", "--json", "-").data
+    assert (result["gaps"], result["files"][0]["gaps"], result["files"][1]["gaps"]) == (1, 1, 0)
+    assert result["files"][0]["samples"] == (400 - 50) + (1070 - 50)
+
+
+def test_without_torque_the_rate_error_is_that_of_no_change(inside: Cli, data_dir: Path, tmp_path: Path) -> None:
+    """A vehicle too heavy to turn predicts the measured rate forever; real flight, own log rate, held speeds."""
+    vehicle = yaml.safe_load((data_dir / "nanodrone" / "vehicle.yaml").read_text(encoding="utf-8"))
+    stiff = {"initial": 1e3, "bounds": [1e2, 1e4]}
+    vehicle["parameters"] |= {"J_xx": stiff, "J_yy": stiff, "J_zz": stiff}
+    file = tmp_path / "stiff.yaml"
+    file.write_text(yaml.safe_dump(vehicle), encoding="utf-8")
+    log = data_dir / "nanodrone" / "square_run1.csv"
+    result = inside("score", log, "--vehicle", file, "--json", "-").data
+    names, rows = table(log)
+    rate = rows[:, [names.index(n) for n in "pqr"]]
+    starts = len(rate) - 50
+    naive = [np.linalg.norm(rate[h : h + starts] - rate[:starts], axis=1).mean() for h in range(1, 51)]
+    assert result["samples"] == starts
+    for horizon in (1, 10, 50):
+        assert result["horizons"][str(horizon)]["rate"] == pytest.approx(naive[horizon - 1], rel=1e-4)
+    assert result["sum"]["rate"] == pytest.approx(sum(naive), rel=1e-4)
+
+
+def test_rate_and_horizons_are_options(inside: Cli, flights: Flights) -> None:
+    result = inside(
+        "score", flights.unseen, "--vehicle", "pelican", "--rate", "25", "--horizons", "5,60", "--json", "-"
+    ).data
+    assert list(result["horizons"]) == ["5", "60"]
+    assert result["sum"]["to"] == 50
+    assert 600 < result["samples"] < 750 - 60
+
+
+def test_tables_name_units(inside: Cli, flights: Flights) -> None:
+    run = inside("score", flights.unseen, "--vehicle", "pelican")
+    assert run.code == 0
+    for expected in ("position [m]", "velocity [m/s]", "rotation [rad]", "rate [rad/s]", "sum 1..50"):
+        assert expected in run.out
+    assert "\x1b" not in run.out
+
+
+def test_shipped_vehicle_equals_its_file(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    file = tmp_path / "pelican.yaml"
+    file.write_text(Vehicle.shipped("pelican").to_yaml(), encoding="utf-8")
+    one = inside("score", flights.train, "--vehicle", "pelican", "--json", "-").data
+    assert inside("score", flights.train, "--vehicle", file, "--json", "-").data == one

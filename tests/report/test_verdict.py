@@ -1,0 +1,78 @@
+"""What a result means in plain words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from quadid.effects import EFFECTS
+from quadid.report.advice import ADVICE
+from quadid.report.verdict import MOTION, identify_verdict, percent, reason
+
+
+def _result(fitted: float | None = 1.0, status: str = "identified", role: str = "validate") -> dict[str, Any]:
+    parameters = [
+        {"name": n, "unit": "", "value": 1.1, "ci95": [1.09, 1.11], "initial": 1.0, "status": status} for n in MOTION
+    ]
+    entry = {"log": "a", "role": role, "mse": {"initial": 9.0, "fitted": fitted}, "fit_percent": {"p": 95.0, "q": None}}
+    return {"parameters": parameters, "sets": [entry], "warnings": []}
+
+
+def test_good_fair_and_poor() -> None:
+    good = identify_verdict(_result())
+    assert (good.level, good.headline[:3]) == ("good", "All")
+    assert "quadid export" in good.next_steps[0]
+    fair = identify_verdict(_result(fitted=2.0))
+    assert fair.level == "fair"
+    assert "quadid diagnose" in " ".join(fair.next_steps)
+    for bad in (50.0, None, float("inf")):
+        poor = identify_verdict(_result(fitted=bad))
+        assert poor.level == "poor"
+        assert poor.headline.startswith("Not to be used yet")
+
+
+def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
+    verdict = identify_verdict(_result(status="prior_dominated"))
+    assert verdict.level == "poor"
+    assert "None of 6 parameters" in verdict.headline
+    assert any("yaw turns" in step for step in verdict.next_steps)
+
+
+def test_no_validation_asks_for_one() -> None:
+    assert any("--validate" in step for step in identify_verdict(_result(role="train")).next_steps)
+
+
+def test_a_parameter_on_its_bound_is_not_called_identified() -> None:
+    result = _result()
+    result["warnings"] = ["J_xx = 1.1 kg m^2 rests on its bound [0.1, 1.1]"]
+    verdict = identify_verdict(result)
+    assert verdict.headline.startswith("5 of 6")
+    assert verdict.level == "fair"
+    assert any("J_xx rests on a bound" in step for step in verdict.next_steps)
+    assert "bound" in reason(result["parameters"][2], ["J_xx"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, "raised by 10 %"),
+        ({"value": 0.9, "ci95": [0.89, 0.91]}, "lowered by 10 %"),
+        ({"ci95": [0.9, 1.3]}, "the old value lies inside"),
+        ({"status": "ratio_only", "relative_to": "b"}, "Only its ratio to b"),
+        ({"status": "prior_dominated"}, "quick roll doublets"),
+        ({"initial": None}, "Known to 0.91 %"),
+        ({"ci95": [None, None]}, "unknown margin"),
+    ],
+)
+def test_reasons(changes: dict[str, Any], expected: str) -> None:
+    parameter = {"name": "J_xx", "value": 1.1, "ci95": [1.09, 1.11], "initial": 1.0, "status": "identified"}
+    assert expected in reason({**parameter, **changes})
+
+
+def test_percent_keeps_two_digits() -> None:
+    assert [percent(x) for x in (0.0123, 0.5, 0.00012, 9.0)] == ["1.2 %", "50 %", "0.012 %", "over 200 %"]
+
+
+def test_every_effect_has_advice() -> None:
+    assert set(ADVICE) == set(EFFECTS)
