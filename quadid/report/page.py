@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import math
 from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
@@ -30,7 +31,7 @@ def render(page: JsonDict) -> str:
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    environment.filters |= {"number": number, "code": code}
+    environment.filters |= {"number": number, "code": code, "fit": fit}
     scripts = {name: _script(name) for name in ("plotly", "page")}
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
     template = environment.from_string(_asset("page.html"))
@@ -62,13 +63,18 @@ def all_figures(page: JsonDict) -> dict[str, Any]:
 
 def number(value: float | None, digits: int = 4) -> str:
     """A number for people: `digits` that matter, a real minus, powers of ten written out; a dash for none."""
-    if value is None or value != value or value in (float("inf"), float("-inf")):
+    if value is None or not math.isfinite(value):
         return "–"
     text = f"{value:.{digits}g}"
     mantissa, _, exponent = text.partition("e")
     if exponent:
         text = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
     return text.replace("-", "−")
+
+
+def fit(value: float | None) -> str:
+    """A fit in per cent with one decimal; a dash for none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.1f} %".replace("-", "−")
 
 
 def code(text: str) -> Any:

@@ -1,0 +1,43 @@
+"""The commands that README shows, run as written."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from quadid.vehicle import Vehicle
+from tests.cli.conftest import Cli
+
+
+def _commands(repository: Path) -> list[list[str]]:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    use = text[text.index("## Use") : text.index("## With ROS 2")]
+    block = re.search(r"```\n(.*?)```", use, re.S)
+    assert block is not None
+    return [shlex.split(line, comments=True)[1:] for line in block[1].splitlines()]
+
+
+def test_commands_of_the_readme_work(
+    inside: Cli, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    commands = _commands(repository)
+    assert len(commands) == 7
+    for arguments in commands:
+        run = inside(*arguments)
+        assert run.code == 0, (arguments, run.err)
+    for file in ("report.html", "pelican.fitted.yaml", "pelican.params"):
+        assert (tmp_path / file).is_file()
+
+
+def test_vehicles_named_in_the_readme_are_shipped(repository: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    named = re.search(r"shipped name \(([^)]*)\)", text)
+    assert named is not None
+    names = re.findall(r"`(\w+)`", named[1])
+    assert sorted(names) == sorted(p.stem for p in (repository / "quadid" / "vehicles").glob("*.yaml"))
+    for name in names:
+        Vehicle.shipped(name)
