@@ -59,7 +59,7 @@ class Channel:
         t: times [s], shape (n,), non-decreasing.
         values: shape (n, columns).
         source: where it came from, for people (topic, message name, column names).
-        faults: number of samples the reader dropped, by reason: duplicate, backwards, not_finite, bad_stamp.
+        faults: number of samples the reader dropped, by reason, such as duplicate, not_finite.
     """
 
     name: str

@@ -74,9 +74,7 @@ def _felt(accel: Channel) -> FloatArray:
 def _vibrates(accel: Channel) -> NDArray[np.bool_]:
     """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
     length = np.linalg.norm(accel.values, axis=1)
-    kernel = np.ones(25) / 25.0
-    mean = np.convolve(length, kernel, mode="same")
-    square = np.convolve(length**2, kernel, mode="same")
+    mean, square = uniform_filter1d(length, 25, mode="nearest"), uniform_filter1d(length**2, 25, mode="nearest")
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
 
 

@@ -17,10 +17,13 @@ from quadid_replay.frames import continuous_sign, unit_quaternions
 
 FloatArray = NDArray[np.float64]
 
+_ABSURD = 1e9
+"""No channel holds a number of this size in SI units; damage does."""
 _REASONS = {
     "duplicate": "with a repeated stamp",
     "backwards": "running backwards in time",
     "not_finite": "not finite",
+    "absurd": "beyond any physical value",
     "bad_stamp": "with a wild stamp",
     "not_attitude": "that are no attitude (quaternion far from unit length)",
 }
@@ -80,13 +83,17 @@ class Columns:
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
-    Dropped: values or times that are not finite, repeated stamps, samples running backwards, quaternions that are none.
+    Dropped: values or times that are not finite or absurd, repeated stamps, samples running backwards, quaternions that
+    are none.
     Returns None when nothing remains.
     """
     t, values = raw.t, raw.values
     faults = {"bad_stamp": raw.refused}
     finite = np.isfinite(t) & np.isfinite(values).all(axis=1)
     faults["not_finite"] = int(np.count_nonzero(~finite))
+    absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
+    faults["absurd"] = int(np.count_nonzero(absurd))
+    finite &= ~absurd
     if raw.name == "attitude":
         values, good = unit_quaternions(values)
         faults["not_attitude"] = int(np.count_nonzero(finite & ~good))

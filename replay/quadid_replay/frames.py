@@ -71,7 +71,8 @@ def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
 
     Rows of length below 0.5 or above 2 (zeros, garbage) are no attitudes.
     """
-    norm = np.linalg.norm(q, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q, axis=1)
     good = (norm > 0.5) & (norm < 2.0)
     off = good & (np.abs(norm - 1.0) > 1e-3)
     if off.any():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -96,7 +98,8 @@ def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source
         if all(rank is None for rank in listed):
             continue
         try:
-            decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):  # it prints
+                decode = generate_dynamic(topic.type, topic.definition)[topic.type]
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
@@ -154,7 +157,9 @@ def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, _Sourc
             continue
         source = f"{topic.name} ({type_name(topic.type)})"
         rank += 5 if signal == "pose_attitude" else 0
-        ranked.setdefault(channel, []).append((rank, RawChannel(channel, t, convert(values), source, kept.refused)))
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers are dropped further on
+            converted = convert(values)
+        ranked.setdefault(channel, []).append((rank, RawChannel(channel, t, converted, source, kept.refused)))
     out = []
     for entries in ranked.values():
         ordered = [entry for _, entry in sorted(entries, key=lambda pair: pair[0])]

@@ -134,8 +134,10 @@ class McapFile:
         for index in sorted(self._chunks, key=lambda c: c.chunk_start_offset):
             if index.message_index_offsets and wanted.isdisjoint(index.message_index_offsets):
                 continue
-            file.seek(index.chunk_start_offset)
-            head = file.read(_RECORD.size)
+            head = b""
+            if index.chunk_start_offset < self._size:
+                file.seek(index.chunk_start_offset)
+                head = file.read(_RECORD.size)
             try:
                 if len(head) < _RECORD.size:
                     raise _DamagedError("chunk outside the file")

@@ -136,6 +136,9 @@ def test_samples_that_cannot_be_used_are_dropped_and_counted() -> None:
     np.testing.assert_array_equal(channel.t, [0.0, 0.1, 0.2, 0.4])
     assert dict(channel.faults) == {"bad_stamp": 2, "not_finite": 2, "duplicate": 1, "backwards": 1}
     assert clean_channel(RawChannel("gyro", t, values * np.nan, "x")) is None
+    absurd = clean_channel(RawChannel("position", np.array([0.0, 1.0]), np.array([[0.0, 1, 2], [1e200, 0, 0]]), "x"))
+    assert absurd is not None
+    assert (len(absurd.t), dict(absurd.faults)) == (1, {"absurd": 1})
 
 
 def test_columns_keep_doubles_and_refuse_other_widths() -> None:
