@@ -33,7 +33,8 @@ class GateSettings(BaseModel):
             has to bear.
         inertia_slack: how far the triangle inequality of the inertias may be broken.
         gain: deviance per held-out window that counts as a real gain over the set in force.
-        sharper: a set is also published when the interval of a parameter has shrunk to this share.
+        sharper: a set is also published when the interval of a parameter has shrunk to this share,
+        pause: but not sooner than this after the last one [s].
         watch: deviance by which a new set may lose to its predecessor before it is taken back.
     """
 
@@ -49,6 +50,7 @@ class GateSettings(BaseModel):
     inertia_slack: float = Field(default=1.5, ge=1.0, le=3.0)
     gain: float = Field(default=6.0, gt=0.0)
     sharper: float = Field(default=0.8, gt=0.0, lt=1.0)
+    pause: float = Field(default=10.0, ge=0.0)
     watch: float = Field(default=30.0, gt=0.0)
 
 
@@ -67,6 +69,7 @@ class Case:
         in_force: the set in force.
         baseline: the set from which creeping is measured.
         approval: auto or manual, now.
+        age: time since the data that the set in force rests on [s].
     """
 
     parameters: ParameterSet
@@ -79,6 +82,7 @@ class Case:
     in_force: OnlineSet | None
     baseline: OnlineSet | None
     approval: str
+    age: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,7 @@ def _held_out(case: Case, settings: GateSettings) -> str | None:
 def _is_sharper(case: Case, settings: GateSettings) -> bool:
     assert case.in_force is not None
     old = case.in_force.parameters
-    return any(
+    return case.age >= settings.pause and any(
         p.sigma < settings.sharper * old[p.name].sigma and p.status is not Status.PRIOR_DOMINATED
         for p in case.parameters
         if p.name in old.names

@@ -185,7 +185,8 @@ class Learner:
         gains = self._held_out(in_force, seen)
         ratio = self._thrust_ratio(float(parameters["b"].value))
         return Case(
-            parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval
+            parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval,
+            self.fusion.counted - seen,
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:

@@ -30,8 +30,18 @@ class Ledger:
         seen: end of the data that the set in force rests on [s, session time]; minus infinity for none of this flight.
     """
 
-    def __init__(self, approval: str, restored: OnlineSet | None = None, next_sequence: int = 1) -> None:
-        """Starts empty, or from the last accepted set of an earlier run, which is stale until revalidated."""
+    def __init__(
+        self, approval: str, restored: OnlineSet | None = None, next_sequence: int = 1,
+        baseline: OnlineSet | None = None,
+    ) -> None:  # fmt: skip
+        """Starts empty, or from the last accepted set of an earlier run, which is stale until revalidated.
+
+        Args:
+            approval: auto or manual.
+            restored: set in force when the earlier run ended.
+            next_sequence: first number not yet given.
+            baseline: what creeping is measured from; default `restored`.
+        """
         self.approval = approval
         self.pending: OnlineSet | None = None
         self.in_force: OnlineSet | None = None
@@ -40,7 +50,7 @@ class Ledger:
         if restored is not None:
             reason = f"from an earlier run ({restored.reason}): not yet confirmed by this flight"
             self.in_force = replace(restored, state=SetState.STALE, reason=reason)
-        self.baseline = self.in_force
+        self.baseline = baseline or self.in_force
         self.seen = -math.inf
         self._pending_stop = -math.inf
         self._watched, self._watch_from = 0.0, math.inf

@@ -48,7 +48,7 @@ class Session:
 
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings | None = None, restored: OnlineSet | None = None,
-        next_sequence: int = 1,
+        next_sequence: int = 1, baseline: OnlineSet | None = None,
     ) -> None:  # fmt: skip
         """Starts a session.
 
@@ -57,10 +57,11 @@ class Session:
             settings: default `SessionSettings()`.
             restored: last accepted set of an earlier run; in force, but stale, until this flight confirms it.
             next_sequence: first number not yet given to a set.
+            baseline: set from which creeping is measured; default `restored`.
         """
         self.settings = settings or SessionSettings()
         self.buffer = Buffer(vehicle, self.settings.rate)
-        self.ledger = Ledger(self.settings.gate.approval, restored, next_sequence)
+        self.ledger = Ledger(self.settings.gate.approval, restored, next_sequence, baseline)
         self._vehicle = vehicle
         self._voice = Voice(self.buffer.time.stamp)
         self._store = RowStore(self.settings.rate, self.settings.window + 10.0)

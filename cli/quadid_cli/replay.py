@@ -1,0 +1,200 @@
+"""`quadid replay`: drives the online session from a log, and writes what it would have published."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from quadid.errors import QuadidError
+from quadid_cli.options import JsonTarget, Preset, Seed, VehicleName
+
+if TYPE_CHECKING:
+    from quadid_node.messages import Clock
+    from quadid_node.service import Output, Service
+
+    from quadid.window import Recording
+    from quadid_cli.terminal import Advance
+
+BATCH = 200
+"""Samples between two looks at the session."""
+NOTHING = 3
+"""Exit code when the log was played but no set was published."""
+
+
+class ReplayError(QuadidError):
+    """A replay that was asked for wrongly."""
+
+
+def replay(
+    log: Annotated[str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV.")],
+    vehicle: VehicleName,
+    speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Times real time, or max.")] = "max",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
+    ] = None,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = 50.0,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
+    refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
+    approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
+    seed: Seed = 0,
+    preset: Preset = "auto",
+    json: JsonTarget = None,
+) -> None:
+    """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
+    from quadid_node.messages import Clock
+    from quadid_node.service import Service
+    from quadid_node.settings import session_settings
+    from quadid_node.worker import InlineWorker
+    from quadid_replay import open_log
+
+    from quadid_cli import output, terminal
+    from quadid_cli.loading import load_vehicle
+
+    output.check_file(json, "--json")
+    output.check_file(out, "--out")
+    pace = _pace(speed)
+    described = load_vehicle(vehicle)
+    settings = session_settings(rate=rate, window=window, refit=refit, approval=approval, seed=seed)
+    recording = open_log(log, preset)
+    service, clock = Service(described, settings, InlineWorker()), Clock()
+    with terminal.progress() as advance:
+        outputs = play(recording, service, clock, pace, advance)
+    result = summary(recording, service, outputs, clock)
+    if out is not None:
+        write_outputs(out, outputs, described.name, clock)
+        result["out"] = str(out.absolute())
+    output.write_json(result, json)
+    show(result, quiet=json == "-")
+    if not result["published"]:
+        raise typer.Exit(NOTHING)
+
+
+def _pace(speed: str) -> float:
+    if speed == "max":
+        return 0.0
+    try:
+        pace = float(speed)
+    except ValueError as error:
+        raise ReplayError(f"speed '{speed}'", "a factor of real time, or max", "for example --speed 1") from error
+    if not 0.0 < pace <= 1000.0:
+        raise ReplayError(f"speed {pace:g}", "more than 0, at most 1000, or max")
+    return pace
+
+
+def play(recording: Recording, service: Service, clock: Clock, pace: float, advance: Advance) -> list[Output]:
+    """Plays a recording into a service.
+
+    Args:
+        recording: the log.
+        service: with an inline worker.
+        clock: of the stamps.
+        pace: factor of real time; 0 for as fast as possible.
+        advance: told how far it is.
+
+    Returns:
+        Everything the service put out, in order.
+    """
+    from quadid_node.playback import stream
+
+    total = sum(len(c.t) for c in recording.channels.values())
+    outputs: list[Output] = []
+    begin = first = None
+    for count, sample in enumerate(stream(recording, clock)):
+        if pace > 0.0:
+            if begin is None or first is None:
+                begin, first = time.monotonic(), sample.t
+            time.sleep(max(begin + (sample.t - first) / pace - time.monotonic(), 0.0))
+        service.push(sample)
+        if count % BATCH == 0 or pace > 0.0:
+            outputs.extend(_work(service))
+            advance("replay", count / max(total, 1))
+    outputs.extend(_work(service))
+    advance("replay", 1.0)
+    return outputs
+
+
+def _work(service: Service) -> list[Output]:
+    """Steps until the session needs more samples."""
+    out = service.step()
+    while service.session.running is not None:
+        out.extend(service.step())
+    return out
+
+
+def summary(recording: Recording, service: Service, outputs: Sequence[Output], clock: Clock) -> dict[str, Any]:
+    """The replay as JSON, of the form ``quadid.replay/1``; times count from ``epoch`` [s, UNIX], 0 for boot time."""
+    from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
+
+    from quadid.online import Diagnosed, Event, Publish
+
+    sets = [o.item for o in outputs if isinstance(o, Publish) and o.topic == "parameters"]
+    refused: dict[str, int] = {}
+    for o in outputs:
+        if isinstance(o, Publish) and o.topic == "candidate" and o.item.state.value == "rejected":
+            refused[o.item.check] = refused.get(o.item.check, 0) + 1
+    return {
+        "schema": "quadid.replay/1",
+        "log": recording.name,
+        "epoch": (clock.base_ns or 0) // 10**9,
+        "vehicle": service.vehicle.name,
+        "published": [set_to_dict(s) for s in sets],
+        "refused": refused,
+        "diagnoses": [diagnosis_to_dict(o) for o in outputs if isinstance(o, Diagnosed)],
+        "events": [
+            {"t": o.t, "level": o.level, "kind": o.kind, "text": o.text} for o in outputs if isinstance(o, Event)
+        ],
+        "status": status_to_dict(service.session.status()),
+        "warnings": list(recording.warnings),
+    }
+
+
+def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str, clock: Clock) -> None:
+    """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
+    from quadid_replay import TopicWriter
+
+    from quadid.online import Diagnosed, Publish
+    from quadid_node import messages
+
+    with TopicWriter(path) as writer:
+        for item in outputs:
+            if isinstance(item, Publish):
+                kind, topic = messages.PARAMETER_SET, messages.TOPICS[item.topic]
+                message, t = messages.parameter_set(item.item, vehicle, clock), item.item.stop
+            elif isinstance(item, Diagnosed):
+                kind, topic = messages.DIAGNOSIS, messages.TOPICS["diagnosis"]
+                message, t = messages.diagnosis(item, vehicle, clock), item.t
+            else:
+                continue
+            writer.write(topic, kind, message, max(clock.nanoseconds(t), 0))
+
+
+def show(result: dict[str, Any], quiet: bool) -> None:
+    """Prints what was published, refused and found."""
+    from quadid_cli import terminal
+
+    console = terminal.console(quiet=quiet)
+    for event in result["events"]:
+        if event["level"] != "info" or event["kind"] == "accepted":
+            console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", markup=False, soft_wrap=True)
+    for check, count in result["refused"].items():
+        console.print(f"refused by {check}: {count} estimates", markup=False)
+    if not result["published"]:
+        status = result["status"]
+        console.print(f"nothing published: {status['phase']}: {status['reason']}", markup=False, soft_wrap=True)
+        return
+    from rich.table import Table
+
+    last = result["published"][-1]
+    table = Table(title=f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
+    for heading in ("parameter", "value", "95 % interval", "unit", "status"):
+        table.add_column(heading)
+    for p in last["parameters"]:
+        low, high = p["ci95"]
+        table.add_row(p["name"], f"{p['value']:.5g}", f"{low:.5g} .. {high:.5g}", p["unit"], p["status"])
+    console.print(table)
+    if "out" in result:
+        console.print(f"Written: {result['out']}", markup=False, soft_wrap=True)

@@ -1,0 +1,107 @@
+"""Sets, findings and events as plain dictionaries: for the history, for Zenoh, for JSON on the command line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SetState
+from quadid.online.status import SessionStatus
+from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
+
+Z95 = 1.959963984540054
+
+
+def number(value: float | None) -> float | None:
+    """A number that JSON can hold: NaN and infinities become null."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def parameters_to_dict(parameters: ParameterSet) -> list[dict[str, Any]]:
+    """Parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
+    out = []
+    for p in parameters:
+        entry = {
+            "name": p.name, "unit": p.unit, "value": number(p.value), "sigma": number(p.sigma),
+            "ci95": [number(p.ci95[0]), number(p.ci95[1])], "initial": number(p.initial),
+            "bounds": [number(p.bounds[0]), number(p.bounds[1])], "status": p.status.value,
+        }  # fmt: skip
+        if p.relative_to is not None:
+            entry["relative_to"] = p.relative_to
+        out.append(entry)
+    return out
+
+
+def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
+    """A set; times are stamps [s]."""
+    out: dict[str, Any] = {
+        "sequence": item.sequence, "state": item.state.value, "check": item.check, "reason": item.reason,
+        "approved_by": item.approved_by, "start": number(item.start), "stop": number(item.stop),
+        "samples": item.samples, "mse": number(item.mse), "mse_held_out": number(item.mse_held_out),
+        "input_hash": item.input_hash, "parameters": parameters_to_dict(item.parameters),
+    }  # fmt: skip
+    if covariance:
+        out["covariance"] = item.parameters.covariance.tolist()
+    return out
+
+
+def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
+    """The set of `set_to_dict`; raises KeyError, TypeError or ValueError for what is none."""
+    parameters = []
+    for p in data["parameters"]:
+        values = [_float(v) for v in (p["value"], p["sigma"], *p["ci95"], p["initial"], *p["bounds"])]
+        parameters.append(Parameter(
+            str(p["name"]), str(p["unit"]), values[0], values[1], values[4], (values[5], values[6]),
+            Status(p["status"]), p.get("relative_to"), (values[2], values[3]),
+        ))  # fmt: skip
+    covariance = np.array(data.get("covariance") or np.diag([p.sigma**2 for p in parameters]), dtype=np.float64)
+    found = ParameterSet(tuple(parameters), covariance)
+    return OnlineSet(
+        int(data["sequence"]), SetState(data["state"]), str(data["reason"]), found,
+        _float(data["start"]), _float(data["stop"]), int(data["samples"]), _float(data["mse"]),
+        _float(data["mse_held_out"]), str(data["input_hash"]), str(data["approved_by"]), str(data["check"]),
+    )  # fmt: skip
+
+
+def finding_to_dict(finding: OnlineFinding) -> dict[str, Any]:
+    """A finding as in `quadid diagnose`'s JSON."""
+    parameters = []
+    for name, value in finding.values.items():
+        half = Z95 * finding.sigma.get(name, math.nan)
+        parameters.append({
+            "name": name, "unit": finding.units.get(name, ""), "value": number(value),
+            "ci95": [number(value - half), number(value + half)],
+        })  # fmt: skip
+    return {
+        "effect": finding.effect, "confident": finding.confident, "parameters": parameters,
+        "gain": {"mse_before": number(finding.mse_before), "mse_after": number(finding.mse_after)},
+        "p_value": number(finding.p_value), "evidence": finding.evidence,
+        "alternatives": [{"effect": a.effect, "mse_after": number(a.mse_after)} for a in finding.alternatives],
+    }  # fmt: skip
+
+
+def diagnosis_to_dict(item: Diagnosed) -> dict[str, Any]:
+    """A diagnosis; times are stamps [s]."""
+    return {
+        "t": number(item.t), "start": number(item.start), "stop": number(item.stop), "verdict": item.verdict,
+        "findings": [finding_to_dict(f) for f in item.findings],
+    }  # fmt: skip
+
+
+def status_to_dict(status: SessionStatus) -> dict[str, Any]:
+    """What a session is doing."""
+    return {
+        "t": number(status.t), "phase": status.phase.name.lower(), "reason": status.reason,
+        "excitation": {n: number(float(v)) for n, v in zip(NOMINAL_NAMES, status.excitation, strict=True)},
+        "samples": status.samples, "window_seconds": status.window_seconds, "gaps": status.gaps,
+        "mse": number(status.mse), "fits": status.fits, "rejected": status.rejected, "in_force": status.in_force,
+        "pending": status.pending, "stale": status.stale, "approval": status.approval,
+        "faults": dict(status.faults), "backlog": number(status.backlog),
+    }  # fmt: skip
+
+
+def _float(value: float | None) -> float:
+    return math.nan if value is None else float(value)

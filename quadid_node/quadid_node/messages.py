@@ -1,0 +1,194 @@
+"""What the service publishes, as plain dictionaries with the fields of quadid_msgs: for ROS topics and for MCAP alike.
+
+Times inside are stamps in seconds; `stamp` turns them into the two integers of builtin_interfaces/Time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SetState
+from quadid.online.status import SessionStatus
+from quadid.parameters import NOMINAL_NAMES, Status
+from quadid_node.codec import Z95
+from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
+
+Message = dict[str, Any]
+
+PARAMETER_SET = "quadid_msgs/msg/ParameterSet"
+DIAGNOSIS = "quadid_msgs/msg/Diagnosis"
+FIT_STATUS = "quadid_msgs/msg/FitStatus"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+TOPICS = {"parameters": "quadid/parameters", "candidate": "quadid/candidate", "diagnosis": "quadid/diagnosis"}
+SCHEMA_VERSION = 1
+BODY_FRAME = "base_link_frd"
+SET_STATES = {
+    SetState.REJECTED: 1, SetState.PENDING: 2, SetState.ACCEPTED: 3, SetState.ROLLED_BACK: 4, SetState.STALE: 5,
+}  # fmt: skip
+STATUSES = {Status.IDENTIFIED: 0, Status.RATIO_ONLY: 1, Status.PRIOR_DOMINATED: 2}
+PHASES = {
+    Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
+    Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
+}  # fmt: skip
+VERDICTS = {"explained": 1, "unknown": 3}
+OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
+
+
+class Clock:
+    """Stamps: nanoseconds of headers to seconds, and back; seconds count from midnight before the first stamp."""
+
+    def __init__(self, base_ns: int | None = None) -> None:
+        """Counts from `base_ns`, by default from midnight before the first stamp seen."""
+        self.base_ns = base_ns
+
+    def seconds(self, ns: int) -> float:
+        """Seconds since the base."""
+        if self.base_ns is None:
+            self.base_ns = ns // _DAY_NS * _DAY_NS
+        return (ns - self.base_ns) * 1e-9
+
+    def nanoseconds(self, t: float) -> int:
+        """Nanoseconds of a time [s]; 0 for none."""
+        return round(t * 1e9) + (self.base_ns or 0) if math.isfinite(t) else 0
+
+    def stamp(self, t: float) -> Message:
+        """builtin_interfaces/Time of a time [s]."""
+        ns = max(self.nanoseconds(t), 0)
+        return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+
+
+_DAY_NS = 86400 * 10**9
+
+
+def parameter_set(item: OnlineSet, vehicle: str, clock: Clock) -> Message:
+    """quadid_msgs/ParameterSet of a set."""
+    parameters = list(item.parameters)
+    return {
+        "header": {"stamp": clock.stamp(item.stop), "frame_id": BODY_FRAME},
+        "schema_version": SCHEMA_VERSION,
+        "vehicle_id": vehicle,
+        "sequence": item.sequence,
+        "state": SET_STATES[item.state],
+        "reason": item.reason if not item.check else f"{item.check}: {item.reason}",
+        "names": [p.name for p in parameters],
+        "units": [p.unit or "1" for p in parameters],
+        "values": [p.value for p in parameters],
+        "covariance": item.parameters.covariance.ravel().tolist(),
+        "status": [STATUSES[p.status] for p in parameters],
+        "relative_to": [p.relative_to or "" for p in parameters],
+        "window_start": clock.stamp(item.start),
+        "window_end": clock.stamp(item.stop),
+        "samples": item.samples,
+        "mse": item.mse,
+        "mse_held_out": item.mse_held_out,
+        "log_hash": item.input_hash,
+        "approved_by": item.approved_by,
+    }
+
+
+def diagnosis(item: Diagnosed, vehicle: str, clock: Clock) -> Message:
+    """quadid_msgs/Diagnosis of what was found."""
+    nan = math.nan
+    first = item.findings[0] if item.findings else None
+    return {
+        "header": {"stamp": clock.stamp(item.t), "frame_id": BODY_FRAME},
+        "vehicle_id": vehicle,
+        "verdict": VERDICTS.get(item.verdict, 3),
+        "findings": [_finding(f, clock) for f in item.findings],
+        "mse_nominal": first.mse_before if first else nan,
+        "mse_extended": first.mse_after if first else nan,
+        "unexplained_channels": [],
+        "unexplained": [],
+        "window_start": clock.stamp(item.start),
+        "window_end": clock.stamp(item.stop),
+    }
+
+
+def _finding(finding: OnlineFinding, clock: Clock) -> Message:
+    # A time among the numbers counts from the UNIX epoch like every stamp, not from our base.
+    values = {n: clock.nanoseconds(v) * 1e-9 if n == "time" else v for n, v in finding.values.items()}
+    half = {n: Z95 * finding.sigma.get(n, math.nan) for n in values}
+    return {
+        "effect": finding.effect,
+        "confident": finding.confident,
+        "parameter_names": list(values),
+        "parameter_units": [finding.units.get(n) or "1" for n in values],
+        "parameter_values": list(values.values()),
+        "ci95_lower": [v - half[n] for n, v in values.items()],
+        "ci95_upper": [v + half[n] for n, v in values.items()],
+        "mse_before": finding.mse_before,
+        "mse_after": finding.mse_after,
+        "gain_ci95": [math.nan, math.nan],
+        "p_value": finding.p_value,
+        "alternatives": [a.effect for a in finding.alternatives],
+        "alternatives_mse": [a.mse_after for a in finding.alternatives],
+        "evidence": finding.evidence,
+    }
+
+
+def fit_status(status: SessionStatus, vehicle: str, clock: Clock, seconds: float = math.nan) -> Message:
+    """quadid_msgs/FitStatus; `seconds` is how long the last fit took."""
+    return {
+        "header": {"stamp": clock.stamp(status.t), "frame_id": BODY_FRAME},
+        "vehicle_id": vehicle,
+        "state": PHASES[status.phase],
+        "reason": f"{status.phase.value}: {status.reason}",
+        "names": list(NOMINAL_NAMES),
+        "excitation": [float(v) for v in status.excitation],
+        "samples": status.samples,
+        "window_seconds": status.window_seconds,
+        "gaps": status.gaps,
+        "cost": status.mse,
+        "seconds": seconds,
+        "fits": status.fits,
+        "rejected": status.rejected,
+    }
+
+
+def diagnostics(health: Health, name: str, hardware: str, stamp: Message, notes: dict[str, str]) -> Message:
+    """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).
+
+    Args:
+        health: of the service.
+        name: full node name.
+        hardware: vehicle.
+        stamp: now.
+        notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
+    """
+    status = health.status
+    blocked = status.phase in (Phase.BLOCKED, Phase.FAILED)
+    session = _entry(name, "session", hardware, WARN if blocked else OK, f"{status.phase.value}: {status.reason}", {
+        "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
+        "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
+        "backlog [s]": f"{status.backlog:.2f}",
+    })  # fmt: skip
+    worker_level = OK if health.worker in ("idle", "busy", "inline") else WARN
+    worker = _entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
+    history_level = OK if health.history in ("", "none kept") else ERROR
+    history = _entry(name, "history", hardware, history_level, health.history or "written", {})
+    entries = [session, _inputs(health, name, hardware, notes), worker, history]
+    return {"header": {"stamp": stamp, "frame_id": ""}, "status": entries}
+
+
+def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str]) -> Message:
+    level, message = OK, "data arrive"
+    worst = max(health.feeds.items(), key=lambda item: item[1].silence, default=None)
+    if worst is None:
+        level, message = WARN, "nothing arrives yet"
+    elif worst[1].silence > SILENT_WARNING:
+        level = ERROR if worst[1].silence > SILENT_ERROR else WARN
+        message = f"{worst[0]} is silent for {worst[1].silence:.0f} s"
+    if notes:
+        level, message = ERROR, "; ".join(f"{k}: {v}" for k, v in notes.items())
+    values: dict[str, Any] = {f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()}
+    values |= {f"dropped: {reason}": count for reason, count in health.status.faults.items()}
+    return _entry(name, "inputs", hardware, level, message, values)
+
+
+def _entry(name: str, part: str, hardware: str, level: bytes, message: str, values: dict[str, Any]) -> Message:
+    pairs = [{"key": str(k), "value": str(v)} for k, v in values.items()]
+    return {
+        "level": level, "name": f"{name.lstrip('/')}: {part}", "message": message, "hardware_id": hardware,
+        "values": pairs,
+    }  # fmt: skip

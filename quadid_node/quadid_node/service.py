@@ -1,0 +1,171 @@
+"""One vehicle's service, whatever carries its samples: session, worker and history wired together.
+
+The ROS node, the MAVLink link and the replay push samples, call `step` often, and carry out what it returns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from quadid.online import FitReply, FitRequest, Session, SessionSettings
+from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.ledger import Answer
+from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+from quadid.online.status import SessionStatus
+from quadid.vehicle import Vehicle
+from quadid.window import Sample
+from quadid_node.store import Restored, Store
+from quadid_node.worker import Trouble, Worker
+
+Output = Publish | Diagnosed | Event
+SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
+"""A channel that was there and is silent for this long [s] is worth a warning, an error."""
+RATE_MEMORY = 2.0
+"""Time over which data rates are measured [s]."""
+
+
+@dataclass(frozen=True)
+class Feed:
+    """How one channel arrives.
+
+    Attributes:
+        rate: samples a second over the last two seconds [Hz].
+        silence: since its last sample [s].
+    """
+
+    rate: float
+    silence: float
+
+
+@dataclass(frozen=True)
+class Health:
+    """Everything a monitor wants: session, channels, worker, history."""
+
+    status: SessionStatus
+    feeds: dict[str, Feed]
+    worker: str
+    restarts: int
+    history: str
+
+
+class Service:
+    """The service of one vehicle.
+
+    Attributes:
+        vehicle: as given.
+        session: the session.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, settings: SessionSettings, worker: Worker, store: Store | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        """Starts where the last run of this vehicle ended.
+
+        Args:
+            vehicle: geometry, mass, first guess.
+            settings: of the session.
+            worker: does the fits.
+            store: history; None for none.
+            clock: seconds, monotonic; only rates and silences are measured with it.
+        """
+        restored = store.restore() if store is not None else Restored(None, 1)
+        self.vehicle = vehicle
+        self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
+        self._worker, self._store, self._clock = worker, store, clock
+        self._arrived: dict[str, float] = {}
+        self._counted: dict[str, tuple[float, int]] = {}
+        self._rates: dict[str, float] = {}
+        self._notes = [Event(0.0, "error", "history", note) for note in (store.notes if store is not None else [])]
+        self._problem = ""
+
+    def push(self, sample: Sample) -> None:
+        """Takes one sample."""
+        self._arrived[sample.channel] = self._clock()
+        self.session.push(sample)
+
+    def step(self, most: int | None = None) -> list[Output]:
+        """Moves everything on by what there is to do; never waits.
+
+        Args:
+            most: blocks of rows to take in at most.
+
+        Returns:
+            What to publish and tell, already in the history.
+        """
+        outputs: list[Output] = list(self._notes)
+        self._notes.clear()
+        for item in self._worker.poll():
+            if isinstance(item, FitReply | ChangeReply):
+                self.session.deliver(item)
+            else:
+                outputs.append(self._trouble(item))
+        for action in self.session.poll(most):
+            if isinstance(action, FitRequest | ChangeRequest):
+                self._worker.submit(action)
+            else:
+                outputs.append(action)
+        outputs.extend(self._history_trouble())
+        for output in outputs:
+            self._journal(output)
+        return outputs
+
+    def approve(self, by: str, sequence: int | None = None) -> Answer:
+        """A person approves the set that waits; what follows comes with the next `step`."""
+        return self.session.approve(by, sequence)
+
+    def roll_back(self, by: str) -> Answer:
+        """A person takes the set in force back; what follows comes with the next `step`."""
+        return self.session.roll_back(by)
+
+    def health(self) -> Health:
+        """What a monitor wants to know."""
+        now = self._clock()
+        feeds = {name: Feed(self._rate(name, now), now - at) for name, at in self._arrived.items()}
+        restarts = getattr(self._worker, "restarts", 0)
+        history = self._store.problem if self._store is not None else "none kept"
+        return Health(self.session.status(), feeds, self._worker.state, restarts, history)
+
+    def close(self) -> None:
+        """Ends worker and history; what was journalled is on the disk afterwards."""
+        self._worker.close()
+        if self._store is not None:
+            self._store.close()
+
+    def _rate(self, name: str, now: float) -> float:
+        count = self.session.buffer.counts[name]
+        since, before = self._counted.get(name, (now - RATE_MEMORY, 0))
+        if now - since >= RATE_MEMORY:
+            self._rates[name] = (count - before) / max(now - since, 1e-3)
+            self._counted[name] = (now, count)
+        return self._rates.get(name, 0.0)
+
+    def _trouble(self, item: Trouble) -> Event:
+        return Event(self.session.status().t, item.level, "worker", item.text)
+
+    def _history_trouble(self) -> list[Event]:
+        problem = self._store.problem if self._store is not None else ""
+        if problem == self._problem:
+            return []
+        self._problem = problem
+        level, text = ("error", problem) if problem else ("info", "the history is written again")
+        return [Event(self.session.status().t, level, "history", text)]
+
+    def _journal(self, output: Output) -> None:
+        if self._store is None:
+            return
+        if isinstance(output, Event):
+            self._store.event(output)
+        elif isinstance(output, Diagnosed):
+            self._store.diagnosis(output)
+        else:
+            self._journal_set(output.topic, output.item)
+
+    def _journal_set(self, topic: str, item: OnlineSet) -> None:
+        assert self._store is not None
+        if topic == "candidate":
+            self._store.candidate(item)
+        elif item.state.value != "stale":
+            self._store.numbered(item)

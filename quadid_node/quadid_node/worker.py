@@ -1,0 +1,249 @@
+"""Where fits run: a child process beside the service, or inline for replays.
+
+The child is polled, never waited for.  One that dies, hangs or eats its memory is replaced after a growing pause, and
+the request it was working on is given to the next one; after three tries the session is told that the fit failed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from quadid.online import FitReply, FitRequest, fit_window
+from quadid.online.changes import ChangeReply, ChangeRequest, explain_change
+from quadid.vehicle import Vehicle
+from quadid_node.worker_main import READY, THREADS, frame, unframe
+
+Request = FitRequest | ChangeRequest
+Reply = FitReply | ChangeReply
+
+START_LIMIT = 180.0
+"""A worker that is not ready by then [s] is replaced; a first start may have to compile the kernels."""
+FIT_LIMIT = 30.0
+"""A fit that takes longer [s] counts as hung."""
+TRIES = 3
+"""Workers that may fail on one request before it is given up."""
+BACKOFF = (0.2, 1.0, 5.0, 20.0, 60.0)
+"""Pauses before the next start [s], by failures in a row."""
+CALM = 60.0
+"""Failures this long ago [s] are forgiven."""
+MEMORY_MB = 1000
+_PIPE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Something to tell people about the worker: level (warning, error, info) and a sentence."""
+
+    level: str
+    text: str
+
+
+class Worker(Protocol):
+    """What the service needs of a worker."""
+
+    def submit(self, request: Request) -> None:
+        """Begins a fit."""
+
+    def poll(self) -> list[Reply | Trouble]:
+        """What has happened since the last call."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether kernels are warm and a fit can begin at once."""
+
+    @property
+    def state(self) -> str:
+        """One word for monitors."""
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+class InlineWorker:
+    """Fits in the caller's own process, when polled: for replays, where only the result matters."""
+
+    ready = True
+    state = "inline"
+
+    def __init__(self) -> None:
+        self._waiting: list[Request] = []
+
+    def submit(self, request: Request) -> None:
+        """Takes a request, to be fitted by the next `poll`."""
+        self._waiting.append(request)
+
+    def poll(self) -> list[Reply | Trouble]:
+        """Does all fits that wait."""
+        waiting, self._waiting = self._waiting, []
+        return [explain_change(r) if isinstance(r, ChangeRequest) else fit_window(r) for r in waiting]
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class ProcessWorker:
+    """Fits in a child process of low priority.
+
+    Attributes:
+        state: ``starting``, ``idle``, ``busy``, ``resting`` (before a restart) or ``closed``.
+        restarts: how often a child was replaced.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, memory_mb: int = MEMORY_MB, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Starts the child; `ready` tells when its kernels are warm.
+
+        Args:
+            vehicle: whose model is warmed up.
+            memory_mb: most memory of the child [MiB]; 0 for no limit.
+            clock: seconds, monotonic.
+        """
+        self._vehicle, self._memory, self._clock = vehicle, memory_mb, clock
+        self._child: subprocess.Popen[bytes] | None = None
+        self._out, self._in = bytearray(), bytearray()
+        self._request: Request | None = None
+        self._tries = self._failures = self.restarts = 0
+        self._since = self._last_failure = -1e9
+        self._told: list[Trouble] = []
+        self.state = "starting"
+        self._start()
+
+    @property
+    def ready(self) -> bool:
+        """Whether kernels are warm and a fit can begin at once."""
+        return self.state in ("idle", "busy")
+
+    @property
+    def pid(self) -> int:
+        """Process id of the child; 0 while there is none."""
+        return self._child.pid if self._child is not None else 0
+
+    def submit(self, request: Request) -> None:
+        """Gives the child a request, or keeps it until there is a child that can take it."""
+        self._request, self._tries = request, 0
+        if self.state == "idle":
+            self._give()
+
+    def poll(self) -> list[Reply | Trouble]:
+        """Moves bytes, checks on the child, restarts it when it is time; never blocks."""
+        replies: list[Reply | Trouble] = []
+        if self.state == "resting" and self._clock() >= self._since:
+            self._start()
+        if self._child is not None:
+            self._pump()
+            replies.extend(self._received())
+            self._check(replies)
+        told, self._told = self._told, []
+        return [*replies, *told]
+
+    def close(self) -> None:
+        """Ends the child."""
+        self._end_child()
+        self.state = "closed"
+
+    # --- the child
+
+    def _start(self) -> None:
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
+        self._child = subprocess.Popen(
+            [sys.executable, "-m", "quadid_node.worker_main", str(self._memory)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
+        )  # fmt: skip
+        for pipe in (self._child.stdin, self._child.stdout):
+            assert pipe is not None
+            os.set_blocking(pipe.fileno(), False)
+            _widen(pipe.fileno())
+        self._in.clear()
+        self._out = bytearray(frame(self._vehicle))
+        self.state, self._since = "starting", self._clock()
+
+    def _give(self) -> None:
+        assert self._request is not None
+        self._out += frame(self._request)
+        self._tries += 1
+        self.state, self._since = "busy", self._clock()
+
+    def _pump(self) -> None:
+        """Writes and reads what goes without waiting."""
+        assert self._child is not None
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            while self._out:
+                sent = os.write(self._child.stdin.fileno(), self._out)
+                del self._out[:sent]
+        with contextlib.suppress(BlockingIOError):
+            while data := os.read(self._child.stdout.fileno(), _PIPE_BYTES):
+                self._in += data
+
+    def _received(self) -> list[Reply]:
+        replies: list[Reply] = []
+        while (item := unframe(self._in)) is not None:
+            if item == READY:
+                self.state = "idle"
+                if self._request is not None:
+                    self._give()
+            elif isinstance(item, FitReply | ChangeReply):
+                self._request, self.state = None, "idle"
+                replies.append(item)
+        if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
+            self._failures = 0
+        return replies
+
+    def _check(self, replies: list[Reply | Trouble]) -> None:
+        """Looks whether the child died or hangs; keeps or gives up its request."""
+        assert self._child is not None
+        code = self._child.poll()
+        waited = self._clock() - self._since
+        if code is not None:
+            why = f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        elif self.state == "starting" and waited > START_LIMIT:
+            why = f"not ready after {START_LIMIT:g} s"
+        elif self.state == "busy" and waited > FIT_LIMIT:
+            why = f"hung for {FIT_LIMIT:g} s"
+        else:
+            return
+        self._end_child()
+        pause = BACKOFF[min(self._failures, len(BACKOFF) - 1)]
+        self._failures, self.restarts = self._failures + 1, self.restarts + 1
+        self._last_failure = self._clock()
+        self.state, self._since = "resting", self._clock() + pause
+        self._told.append(Trouble("warning", f"the fit process {why}; the next one starts in {pause:g} s"))
+        if self._request is not None and self._tries >= TRIES:
+            problem = f"{TRIES} fit processes failed on this window (the last one {why})"
+            number = self._request.number
+            failed: Reply = (
+                ChangeReply(number, problem=problem)
+                if isinstance(self._request, ChangeRequest)
+                else FitReply(number, problem)
+            )
+            replies.append(failed)
+            self._told.append(Trouble("error", problem))
+            self._request = None
+
+    def _end_child(self) -> None:
+        child, self._child = self._child, None
+        if child is None:
+            return
+        for pipe in (child.stdin, child.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+        child.kill()
+        child.wait()
+
+
+def _widen(descriptor: int) -> None:
+    """A pipe that holds a whole request, where the system allows it."""
+    import fcntl
+
+    with contextlib.suppress(OSError, AttributeError):
+        fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)

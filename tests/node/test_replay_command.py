@@ -1,0 +1,124 @@
+"""`quadid replay` and `quadid history`, run as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from quadid_cli.main import app_main as main
+from quadid_node.store import Store
+from quadid_replay import write_mcap
+from quadid_replay.mcap_records import McapFile
+
+from tests.online.driving import flight
+from tests.online.test_gate import TRUE, online_set
+
+
+def quadid(*arguments: str) -> subprocess.CompletedProcess[str]:
+    program = Path(sys.executable).with_name("quadid")
+    return subprocess.run([str(program), *arguments], capture_output=True, text=True, check=False)
+
+
+class Ran(NamedTuple):
+    """What a command left when run in this process."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Runs a command in this process, which saves its start."""
+
+    def call(*arguments: str) -> Ran:
+        monkeypatch.setattr(sys, "argv", ["quadid", *arguments])
+        capsys.readouterr()
+        code = main()
+        told = capsys.readouterr()
+        return Ran(code, told.out, told.err)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("replay") / "flight.mcap"
+    drop = (("mass_change", "time", 33.3), ("mass_change", "fraction", 0.15))
+    write_mcap(path, flight(40.0, 5, "excited", drop).recording, epoch_ns=1_700_000_000 * 10**9)
+    return path
+
+
+def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: Callable[..., Ran]) -> None:
+    out = tmp_path / "published.mcap"
+    done = quadid("replay", str(log), "--vehicle", "pelican", "--out", str(out), "--json", "-")
+    assert done.returncode == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    assert result["schema"] == "quadid.replay/1"
+    assert [s["state"] for s in result["published"]] == ["accepted"]
+    (diagnosis,) = result["diagnoses"]
+    assert diagnosis["findings"][0]["effect"] == "mass_change"
+    when = next(p["value"] for p in diagnosis["findings"][0]["parameters"] if p["name"] == "time")
+    assert when + result["epoch"] == pytest.approx(1_700_000_033.3, abs=0.1)
+    file = McapFile(out)
+    names = {topic.name: topic.type for topic in file.topics.values()}
+    assert names == {
+        "quadid/parameters": "quadid_msgs/msg/ParameterSet", "quadid/candidate": "quadid_msgs/msg/ParameterSet",
+        "quadid/diagnosis": "quadid_msgs/msg/Diagnosis",
+    }  # fmt: skip
+    stamps = [ns for _, ns, _ in file.messages(file.topics.keys())]
+    assert min(stamps) >= 1_700_000_010 * 10**9
+    again = run("replay", str(log), "--vehicle", "pelican", "--json", "-")
+    assert json.loads(again.out)["published"] == result["published"], "the same bits every time"
+
+
+def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, run: Callable[..., Ran]) -> None:
+    path = tmp_path / "hover.mcap"
+    write_mcap(path, flight(20.0, 7, "hover").recording)
+    done = run("replay", str(path), "--vehicle", "pelican")
+    assert done.code == 3
+    assert "move too little" in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--speed", "fast"), "speed"),
+        (("--speed", "-1"), "speed"),
+        (("--approval", "never"), "approval"),
+        (("--window", "1"), "window"),
+        (("--rate", "1e9"), "rate"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(
+    log: Path, arguments: tuple[str, ...], word: str, run: Callable[..., Ran]
+) -> None:
+    done = run("replay", str(log), "--vehicle", "pelican", *arguments)
+    assert done.code == 2
+    assert word in done.err
+    assert len(done.err.strip().splitlines()) == 1
+
+
+def test_history_shows_what_was_stored(
+    tmp_path: Path, run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann", reason="three windows agree"))
+    store.close()
+    monkeypatch.setenv("QUADID_HISTORY", str(path))
+    done = run("history", "--vehicle", "pelican", "--json", "-")
+    assert done.code == 0, done.err
+    (entry,) = json.loads(done.out)["sets"]
+    assert (entry["approved_by"], entry["reason"]) == ("ann", "three windows agree")
+    shown = run("history", "--vehicle", "pelican", "--history", str(path))
+    assert "ann" in shown.out
+    missing = run("history", "--vehicle", "pelican", "--history", str(tmp_path / "none"))
+    assert missing.code == 2
+    assert "no history" in missing.err

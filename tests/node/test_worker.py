@@ -1,0 +1,177 @@
+"""The fit process: real children, really killed, stopped and starved; the service lives and says so."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+import quadid_node.worker as working
+from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
+
+from quadid.online import FitReply, FitRequest, Session, SessionSettings
+from quadid.vehicle import Vehicle
+from tests.online.driving import flight, samples
+
+PELICAN = Vehicle.shipped("pelican")
+QUICK = SessionSettings(window=5.0)
+
+
+@pytest.fixture
+def requests() -> list[FitRequest]:
+    """Two fit requests of a real session."""
+    session, out = Session(PELICAN, QUICK), []
+    for sample in samples(flight(12.0, 6).recording):
+        session.push(sample)
+    for _ in range(2):
+        session.poll()
+        request = session.running
+        assert isinstance(request, FitRequest)
+        out.append(request)
+        (reply,) = answers(InlineWorker(), request)
+        session.deliver(reply)
+    return out
+
+
+def answers(worker: InlineWorker | ProcessWorker, request: FitRequest, seconds: float = 90.0) -> list[FitReply]:
+    """Submits a request and waits for its answer."""
+    worker.submit(request)
+    return wait(worker, seconds)[0]
+
+
+def wait(worker: InlineWorker | ProcessWorker, seconds: float = 90.0) -> tuple[list[FitReply], list[Trouble]]:
+    """Polls until there is an answer; returns it and what was told meanwhile."""
+    told: list[Trouble] = []
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        out = worker.poll()
+        told += [o for o in out if isinstance(o, Trouble)]
+        replies = [o for o in out if isinstance(o, FitReply)]
+        if replies:
+            return replies, told
+        time.sleep(0.002)
+    raise AssertionError(f"no answer within {seconds} s; told: {told}")
+
+
+@pytest.fixture
+def worker() -> Iterator[ProcessWorker]:
+    """A warm worker."""
+    made = ProcessWorker(PELICAN)
+    deadline = time.monotonic() + 120.0
+    while not made.ready and time.monotonic() < deadline:
+        assert made.poll() == []
+        time.sleep(0.01)
+    assert made.ready
+    yield made
+    made.close()
+    assert made.pid == 0
+
+
+def same(a: FitReply, b: FitReply) -> bool:
+    assert a.estimate is not None
+    assert b.estimate is not None
+    return a.estimate.z.tobytes() == b.estimate.z.tobytes() and a.estimate.cost == b.estimate.cost
+
+
+def test_a_child_gives_what_inline_gives_bit_for_bit(worker: ProcessWorker, requests: list[FitRequest]) -> None:
+    for request in requests:
+        (there,) = answers(worker, request)
+        (here,) = answers(InlineWorker(), request)
+        assert same(there, here)
+
+
+def test_a_child_is_polite(worker: ProcessWorker) -> None:
+    assert os.getpriority(os.PRIO_PROCESS, worker.pid) >= 10
+    cores = os.sched_getaffinity(worker.pid)
+    assert len(cores) < max(os.cpu_count() or 1, 2)
+    with open(f"/proc/{worker.pid}/limits") as limits:
+        data = next(line for line in limits if line.startswith("Max data size"))
+    assert str(working.MEMORY_MB << 20) in data
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_killed_child_is_replaced_and_the_fit_done(
+    worker: ProcessWorker, requests: list[FitRequest], number: signal.Signals
+) -> None:
+    worker.submit(requests[0])
+    os.kill(worker.pid, number)
+    (reply,), told = wait(worker)
+    assert reply.estimate is not None
+    assert worker.restarts == 1
+    assert any(f"signal {number.value}" in t.text for t in told)
+
+
+def test_a_stopped_child_is_replaced(
+    worker: ProcessWorker, requests: list[FitRequest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(working, "FIT_LIMIT", 1.5)
+    old = worker.pid
+    os.kill(old, signal.SIGSTOP)
+    begin = time.monotonic()
+    worker.submit(requests[0])
+    assert time.monotonic() - begin < 0.1, "a child that does not read must not hold up its parent"
+    (reply,), told = wait(worker)
+    assert reply.estimate is not None
+    assert worker.pid not in (0, old)
+    assert any("hung" in t.text for t in told)
+
+
+def test_after_three_deaths_the_session_is_told(worker: ProcessWorker, requests: list[FitRequest]) -> None:
+    worker.submit(requests[0])
+    told: list[Trouble] = []
+    killed: set[int] = set()
+    deadline = time.monotonic() + 120.0
+    while time.monotonic() < deadline:
+        if worker.state == "busy" and worker.pid:
+            os.kill(worker.pid, signal.SIGKILL)
+            killed.add(worker.pid)
+        out = worker.poll()
+        told += [o for o in out if isinstance(o, Trouble)]
+        replies = [o for o in out if isinstance(o, FitReply)]
+        if replies:
+            break
+        time.sleep(0.0005)
+    assert len(killed) == 3
+    assert "3 fit processes failed" in replies[0].problem
+    pauses = [float(t.text.rsplit(" in ", 1)[1].split()[0]) for t in told if "starts in" in t.text]
+    assert pauses == sorted(pauses)
+    assert pauses[-1] > pauses[0], "the pause grows"
+    (reply,) = answers(worker, requests[1])
+    assert reply.estimate is not None, "the next window is fitted again"
+
+
+def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest]) -> None:
+    worker = ProcessWorker(PELICAN, memory_mb=40)
+    deadline = time.monotonic() + 60.0
+    told: list[Trouble] = []
+    while not told and time.monotonic() < deadline:
+        told = [o for o in worker.poll() if isinstance(o, Trouble)]
+        time.sleep(0.01)
+    worker.close()
+    assert "fit process ended" in told[0].text
+
+
+def test_a_child_ends_with_its_parent() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "from quadid_node.worker import ProcessWorker; from quadid.vehicle import Vehicle; import os\n"
+        "w = ProcessWorker(Vehicle.shipped('pelican')); print(w.pid, flush=True); os._exit(1)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    child = int(done.stdout)
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and os.path.exists(f"/proc/{child}") and _state(child) != "Z":
+        time.sleep(0.05)
+    assert not os.path.exists(f"/proc/{child}") or _state(child) == "Z"
+
+
+def _state(pid: int) -> str:
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return "Z"
