@@ -100,8 +100,10 @@ def run(
     """
     from quadid.diagnose import diagnose as diagnose_windows
     from quadid_cli.output import write_text
+    from quadid_cli.searching import check_length
 
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
+    check_length(windows)
     found, workings = diagnose_windows(windows, vehicle, unseen, seed, advance)
     target = extended_path(folder, found.vehicle_name, bool(found.findings), given)
     result = found.to_dict(str(write_text(target, vehicle_header(train) + found.vehicle_yaml)))

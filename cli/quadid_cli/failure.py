@@ -23,6 +23,9 @@ def explain(error: Exception) -> Failure | None:
         return Failure(
             _one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
         )
+    if type(error).__name__ == "LinAlgError":
+        cause = "the equations have no unique solution: these data cannot support an answer"
+        return Failure(f"{cause}; fix: look at the log with `quadid inspect`, use a livelier flight", 3)
     # typer brings its own copy of click or uses the one installed; both have this method on errors of usage.
     told = getattr(error, "format_message", None)
     if callable(told):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
-_FATAL = ("gravity", "gyro_attitude", "velocity_attitude")
+_FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover")
 """Checks of units and frames; what fails them would give numbers that look fine and mean nothing."""
 
 
@@ -156,7 +156,8 @@ def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]
 
     doubts = []
     for check in inspect(recording, vehicle).checks:
-        if check.verdict is Verdict.ERROR and check.name in _FATAL:
+        # A check without numbers could not be made; what comes next says why, and better.
+        if check.verdict is Verdict.ERROR and check.name in _FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
         if check.verdict in (Verdict.ERROR, Verdict.WARNING):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from quadid.errors import ParameterError, nearest
+from quadid.errors import NotIdentifiableError, ParameterError, nearest
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 OPTIMIZERS = (
     "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
 )  # fmt: skip
+SHORTEST = 1.5
+"""Shortest window that holds one segment of a fit, with its lead [s]."""
 BUDGET = 4000
 """Simulations of the data that any search but the standard one may spend."""
 
@@ -26,6 +28,16 @@ def check_optimizer(name: str) -> None:
         raise ParameterError(f"unknown optimizer '{name}'", ", ".join(OPTIMIZERS), nearest(name, OPTIMIZERS))
 
 
+def check_length(windows: Sequence[Window]) -> None:
+    """Raises NotIdentifiableError unless at least one window is long enough to be fitted and scored."""
+    longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
+    if longest < SHORTEST:
+        raise NotIdentifiableError(
+            f"the longest stretch of usable data is {longest:.3g} s", f"at least {SHORTEST:g} s without gaps",
+            "use a longer flight, or a wider span of it",
+        )  # fmt: skip
+
+
 def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance) -> Fit:
     """Identifies the parameters with the search called `name`.
 
@@ -34,6 +46,7 @@ def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, ad
     """
     from quadid.identify.fit import FitOptions, fit
 
+    check_length(windows)
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance)
     from quadid.baselines.optimisers import minimise

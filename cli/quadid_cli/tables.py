@@ -86,7 +86,7 @@ def print_sets(console: Console, sets: Sequence[JsonDict]) -> None:
             s["role"],
             number(s["mse"]["initial"], 3),
             number(s["mse"]["fitted"], 3),
-            *("-" if v is None or not math.isfinite(v) else f"{v:.0f} %" for v in fits),
+            *("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits),
         )
     console.print(table)
 

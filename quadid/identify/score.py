@@ -98,8 +98,8 @@ def mse_score(
     shooting = Shooting(windows, vehicle, SCORE_SECONDS)
     if not shooting.rollouts:
         raise NotIdentifiableError(
-            "no stretch is long enough to be scored", f"{SCORE_SECONDS + 0.4:g} s without gaps",
-            "record longer stretches at a steady rate",
+            f"{windows[0].name or 'window'}: no stretch is long enough to be scored",
+            f"{SCORE_SECONDS + 0.4:g} s without gaps", "record longer stretches at a steady rate",
         )  # fmt: skip
     shooting.noise = covering(noise, shooting.channels, vehicle)
     lin = settle_states(shooting, theta)
@@ -214,7 +214,8 @@ def _errors(measured: FloatArray, simulated: FloatArray) -> tuple[float, float]:
         return np.nan, np.nan
     y, error = measured[good], measured[good] - simulated[good]
     rmse, spread = float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean((y - y.mean()) ** 2)))
-    return rmse, 100.0 * (1.0 - rmse / spread) if spread > 0.0 else np.nan
+    moves = spread > 1e-12 * max(1.0, float(np.abs(y).max()))
+    return rmse, 100.0 * (1.0 - rmse / spread) if moves else np.nan
 
 
 def _series(shooting: Shooting, lin: Linearised) -> Series:

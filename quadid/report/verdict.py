@@ -95,7 +95,9 @@ def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str
         out.append(
             f"The least certain of them is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval)."
         )
-    fits = [v for s in judged for n, v in s["fit_percent"].items() if n in ("p", "q", "r") and v is not None]
+    fits = [
+        max(v, -999.0) for s in judged for n, v in s["fit_percent"].items() if n in ("p", "q", "r") and v is not None
+    ]
     if fits:
         out.append(
             f"Over one second without correction the simulated rates fit the measured ones by {min(fits):.0f} to "

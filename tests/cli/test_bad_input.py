@@ -95,6 +95,19 @@ def test_degrees_for_radians(quadid: Cli, flights: Flights, tmp_path: Path) -> N
     assert "convert to radians" in line
 
 
+def test_revolutions_a_minute_for_radians_a_second(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    rows[:, [names.index(f"w{i}") for i in range(1, 5)]] *= 30.0 / np.pi
+    log = write_table(tmp_path / "rpm.csv", names, rows)
+    assert "seem to be in rpm" in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 2)
+
+
+def test_too_short_a_flight(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    for command in ("identify", "diagnose"):
+        run = inside(command, f"{flights.unseen}@3:4.2", "--vehicle", "pelican", "--out", tmp_path)
+        assert "at least 1.5 s" in one_line(run, 3)
+
+
 def test_flu_for_frd(inside: Cli, flights: Flights, tmp_path: Path) -> None:
     names, rows = table(flights.unseen)
     rows[:, [names.index(n) for n in ("q", "r", "ay", "az")]] *= -1.0
