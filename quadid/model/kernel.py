@@ -21,24 +21,26 @@ from quadid.model import layout as ix
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP, C_DROP_TIME, C_GROUND,
-    C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY,
-    C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LP, C_MASS, C_MQ, C_RX, C_RY, C_RZ, C_SAG, C_WE, C_WN, F0_X,
-    F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ,
-    S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP, C_DROP_TIME,
+    C_GROUND, C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY,
+    C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY,
+    C_RZ, C_SAG, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY,
+    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY,
+    X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
 
 __all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_full"]
 
 FloatArray = NDArray[np.float64]
 
 GRAVITY = 9.80665
+TWELFTH = 1.0 / 12.0
 
 
-@nb.njit(**jit)
+@nb.njit(**exact)
 def body_constants(theta: FloatArray, mass: float, rotors: int, reach: float, s: FloatArray) -> None:
     """Derives the body's constants of all lanes from their parameter vectors.
 
@@ -70,25 +72,26 @@ def body_constants(theta: FloatArray, mass: float, rotors: int, reach: float, s:
         s[C_CGX + lane], s[C_CGY + lane] = th[ix.CGX], th[ix.CGY]
         s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane] = th[ix.LAX] - th[ix.CGX], th[ix.LAY] - th[ix.CGY], th[ix.LAZ]
         ground = th[ix.GROUND] * reach / 4.0
-        s[C_GROUND + lane], s[C_SAG + lane] = ground * abs(ground), th[ix.SAG]
+        s[C_GROUND + lane], s[C_LOWEST + lane], s[C_SAG + lane] = ground * abs(ground), 2.0 * abs(ground), th[ix.SAG]
         s[C_DROP_TIME + lane], s[C_DROP + lane] = th[ix.DROP_TIME], th[ix.DROP_FRACTION]
-        s[C_LOAD_TIME + lane], s[C_LOAD + lane] = th[ix.MASS_TIME], th[ix.MASS_FRACTION]
+        s[C_LOAD_TIME + lane], s[C_LOAD + lane] = th[ix.MASS_TIME], th[ix.MASS_FRACTION] / (1.0 + th[ix.MASS_FRACTION])
 
 
 @nb.njit(**jit)
 def flight_factors(t: float, span0: float, span1: float, dt: float, s: FloatArray) -> None:
-    """Writes thrust and inverse-mass factors of both half steps: battery sag, thrust drop, mass change."""
+    """Writes factors of thrust and inverse mass, means over both half steps: battery sag, thrust drop, mass change."""
     lane_kernel()
     inv = 1.0 / max(span1 - span0, 1e-9)
     half = 0.5 * dt
+    inv_half = 1.0 / half
     for h in range(2):
         ts = t + h * half
         mid = (ts + 0.5 * half - span0) * inv
         for lane in range(LANES):
-            dropped = min(max((ts + half - s[C_DROP_TIME + lane]) / half, 0.0), 1.0)
-            loaded = min(max((ts + half - s[C_LOAD_TIME + lane]) / half, 0.0), 1.0)
+            dropped = min(max((ts + half - s[C_DROP_TIME + lane]) * inv_half, 0.0), 1.0)
+            loaded = min(max((ts + half - s[C_LOAD_TIME + lane]) * inv_half, 0.0), 1.0)
             s[A_G + h * HALF + lane] = (1.0 - s[C_SAG + lane] * mid) * (1.0 - s[C_DROP + lane] * dropped)
-            s[A_M + h * HALF + lane] = 1.0 / (1.0 + s[C_LOAD + lane] * loaded)
+            s[A_M + h * HALF + lane] = 1.0 - loaded * s[C_LOAD + lane]
 
 
 @nb.njit(**inlined)
@@ -167,6 +170,8 @@ def step_core(dt: float, s: FloatArray) -> None:
         s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
         s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
         s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
+        s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
+        s[S_BENDZ + lane] = h * (a4z - a1z)
 
 
 @nb.njit(**inlined)
@@ -174,9 +179,12 @@ def _body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, s1, o1, do, g, im
     """Right-hand side with every effect: angular acceleration, specific force at the CG, acceleration in NED."""
     # Velocity relative to the air, in body axes.
     rn, re, rd = vn - s[C_WN + lane], ve - s[C_WE + lane], vd
-    r00, r01, r02 = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+    # This form of the rotation matrix keeps the heading of the world's axes out of the motion even at the inner stages,
+    # where the quaternion is not of unit length.
+    ww, xx, yy, zz = qw * qw, qx * qx, qy * qy, qz * qz
+    r00, r01, r02 = ww + xx - yy - zz, 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
+    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), ww - xx + yy - zz, 2.0 * (qy * qz - qw * qx)
+    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), ww - xx - yy + zz
     u = r00 * rn + r10 * re + r20 * rd
     v = r01 * rn + r11 * re + r21 * rd
     w = r02 * rn + r12 * re + r22 * rd
@@ -184,12 +192,12 @@ def _body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, s1, o1, do, g, im
     speed = s[C_CPAR + lane] * math.sqrt(u * u + v * v + w * w)
     b, m = s[C_B + lane] * g * lift, s[C_MASS + lane]
     # Specific force of the unloaded mass; im scales all of it when mass is taken up.
-    thrust = b * s2 * s[C_INVM + lane] + s[C_KZ + lane] * w * share
+    thrust = b * s2 + m * s[C_KZ + lane] * w * share
     hx, hy = -s[C_KX + lane] * u * share, -s[C_KY + lane] * v * share
-    sx, sy, sz = (hx - speed * u) * im, (hy - speed * v) * im, (-thrust - speed * w) * im
+    sx, sy, sz = (hx - speed * u) * im, (hy - speed * v) * im, (-thrust * s[C_INVM + lane] - speed * w) * im
     jr = s[C_JR + lane] * o1
-    tx = -b * (y2 - s[C_CGY + lane] * s2) + m * s[C_HY + lane] * hy + jr * q
-    ty = b * (x2 - s[C_CGX + lane] * s2) - m * s[C_HX + lane] * hx - jr * p
+    tx = -b * y2 + s[C_CGY + lane] * thrust + m * s[C_HY + lane] * hy + jr * q
+    ty = b * x2 - s[C_CGX + lane] * thrust - m * s[C_HX + lane] * hx - jr * p
     tz = s[C_D + lane] * g * z2 + s[C_JSPIN + lane] * do
     jxx, jyy, jzz = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane]
     jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
@@ -233,13 +241,14 @@ def step_full(dt: float, s: FloatArray) -> None:
         s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
         s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
         vn, ve, vd = s[X_VN + lane], s[X_VE + lane], s[X_VD + lane]
-        height = max(-s[X_D + lane], 0.3)
-        lift = 1.0 + s[C_GROUND + lane] / (height * height)
+        # Ground effect at the middle of the step; a tiny number keeps 0 / 0 away where there is none.
+        height = max(-s[X_D + lane] - h * vd, s[C_LOWEST + lane]) + 1e-12
+        lift = height * height / (height * height - s[C_GROUND + lane])
         # stage 1
         a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = _body(
             qw, qx, qy, qz, p, q, r, vn, ve, vd, 1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b,
-            1.5 * z2a - 0.5 * z2b, 1.5 * s1a - 0.5 * s1b, 1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, ga, ma,
-            lift, lane, s,
+            1.5 * z2a - 0.5 * z2b, 1.5 * s1a - 0.5 * s1b, 1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob,
+            1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift, lane, s,
         )  # fmt: skip
         k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
         # stage 2
@@ -266,7 +275,8 @@ def step_full(dt: float, s: FloatArray) -> None:
         a4x, a4y, a4z, n4, e4, d4, f4x, f4y, f4z = _body(
             a, b, c, d, p4, q4, r4, vn + dt * n3, ve + dt * e3, vd + dt * d3,
             1.5 * s2b - 0.5 * s2a, 1.5 * x2b - 0.5 * x2a, 1.5 * y2b - 0.5 * y2a, 1.5 * z2b - 0.5 * z2a,
-            1.5 * s1b - 0.5 * s1a, 1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, gb, mb, lift, lane, s,
+            1.5 * s1b - 0.5 * s1a, 1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga,
+            1.5 * mb - 0.5 * ma, lift, lane, s,
         )  # fmt: skip
         k4w, k4x, k4y, k4z = _rotation_rate(a, b, c, d, p4, q4, r4)
         sixth = dt / 6.0
@@ -279,6 +289,8 @@ def step_full(dt: float, s: FloatArray) -> None:
         s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
         s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
         s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
+        s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
+        s[S_BENDZ + lane] = h * (a4z - a1z)
         s[X_VN + lane] = vn + sixth * (n1 + 2.0 * (n2 + n3) + n4)
         s[X_VE + lane] = ve + sixth * (e1 + 2.0 * (e2 + e3) + e4)
         s[X_VD + lane] = vd + sixth * (d1 + 2.0 * (d2 + d3) + d4)
@@ -286,9 +298,9 @@ def step_full(dt: float, s: FloatArray) -> None:
         s[X_E + lane] += dt * ve + dt * sixth * (e1 + e2 + e3)
         s[X_D + lane] += dt * vd + dt * sixth * (d1 + d2 + d3)
         # Means over the halves from a parabola through the stages.
-        fx, fy, fz = 0.5 * (f2x + f3x), 0.5 * (f2y + f3y), 0.5 * (f2z + f3z)
+        fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
         _put_force(
-            (5.0 * f1x + 8.0 * fx - f4x) / 12.0, (5.0 * f1y + 8.0 * fy - f4y) / 12.0,
-            (5.0 * f1z + 8.0 * fz - f4z) / 12.0, (8.0 * fx - f1x + 5.0 * f4x) / 12.0,
-            (8.0 * fy - f1y + 5.0 * f4y) / 12.0, (8.0 * fz - f1z + 5.0 * f4z) / 12.0, lane, s,
+            TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
+            TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
+            lane, s,
         )  # fmt: skip

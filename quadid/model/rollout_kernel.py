@@ -18,12 +18,12 @@ from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step
 
 # isort: off
 from quadid.model.rows import (
-    A_G, E_X, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, RES, ROTOR, S_FX, X_P,
+    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, RES, ROTOR, S_FX, X_P,
     X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 from quadid.model.sensor_kernel import (
-    add_tilt_error, compare, compare_motion, delay_attitude, distort_imu, remember_attitude, sensor_constants,
-    start_filter, step_filter, step_tilt_error, use_filter,
+    compare, compare_motion, delay_attitude, distort_imu, remember_attitude, sensor_constants,
+    start_filter, step_filter, step_tilt_error, tilt_attitude, use_filter,
 )  # fmt: skip
 
 # isort: on
@@ -113,8 +113,8 @@ def _start(seg: int, x0: FloatArray, dx: FloatArray, s: FloatArray) -> None:
     for i in range(9):
         for lane in range(LANES):
             s[X_P + i * LANES + lane] = x0[seg, 4 + i] + dx[3 + i, lane]
-    for i in range(3 * LANES):
-        s[E_X + i] = 0.0
+    for lane in range(LANES):
+        s[E_QW + lane], s[E_QX + lane], s[E_QY + lane], s[E_QZ + lane] = 1.0, 0.0, 0.0, 0.0
 
 
 @nb.njit(**jit)
@@ -288,14 +288,15 @@ def _march(
                     step_filter(dt, s)
                 use_filter(s)
             if scored:
+                if need.ahrs:
+                    step_tilt_error(dt, s)
                 if need.att_delay:
                     delay_attitude(i, dt, past, s)
+                if need.ahrs:
+                    tilt_attitude(s)
                 if need.imu_static:
                     distort_imu(s)
                 compare(k, measured, s)
-                if need.ahrs:
-                    add_tilt_error(s)
-                    step_tilt_error(dt, s)
                 if sums:
                     _collect(seg, i - n_pre, k, weights, basis, s, total, inside)
                 else:

@@ -23,15 +23,16 @@ from quadid.model.rows import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, inlined, jit, lane_kernel
 
 FloatArray = NDArray[np.float64]
 
+THIRD = 1.0 / 3.0
 A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
 """Pieces of a step: its halves, each before and after the input switches."""
 
 
-@nb.njit(**jit)
+@nb.njit(**exact)
 def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray) -> None:
     """Derives the rotors' constants of all lanes.
 
@@ -45,14 +46,14 @@ def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray
         for r in range(len(rot)):
             rot[r, R_GAIN + lane] = 1.0 - theta[lane, ix.LOSS + r]
         s[C_W0 + lane] = theta[lane, ix.DEAD_SPEED]
-        tau = max(theta[lane, ix.TAU], 1e-9)
+        tau = max(theta[lane, ix.TAU], 0.0)
         delay = max(theta[lane, ix.DELAY], 0.0) / dt
         f = delay - math.floor(delay)
         s[C_TAU + lane], s[C_SHIFT + lane], s[C_PART + lane] = tau, math.floor(delay), f
         cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
         for piece in range(4):
             h = cuts[piece] * dt
-            e = math.exp(-h / tau)
+            e = math.exp(-h / max(tau, 1e-12))
             at = piece * PIECE + lane
             s[P_E + at] = e
             s[P_E1 + at] = tau * (1.0 - e)
@@ -76,7 +77,7 @@ def _piece(w0, a, slope, tau, e, e1, e2, e3, h):  # type: ignore[no-untyped-def]
     base = a - slope * tau
     c = w0 - base
     i1 = base * h + 0.5 * slope * h * h + c * e1
-    i2 = base * base * h + base * slope * h * h + slope * slope * h * h * h / 3.0
+    i2 = base * base * h + base * slope * h * h + THIRD * slope * slope * h * h * h
     i2 += 2.0 * c * (base * e1 + slope * e2) + c * c * e3
     return i1, i2, base + slope * h + c * e
 

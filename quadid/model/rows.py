@@ -24,13 +24,13 @@ def _rows(first: int, count: int) -> range:
 (
     C_B, C_D, C_IXX, C_IYY, C_IZZ, C_IXY, C_IXZ, C_IYZ, C_JXX, C_JYY, C_JZZ, C_JXY, C_JXZ, C_JYZ, C_JR, C_JSPIN,
     C_INVM, C_MASS, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_WN, C_WE, C_CGX, C_CGY, C_W0,
-    C_RX, C_RY, C_RZ, C_GROUND, C_SAG, C_DROP_TIME, C_DROP, C_LOAD_TIME, C_LOAD,
-) = _rows(0, 41)  # fmt: skip
-# Constants of the sensors; three rows from C_GB, C_AB, C_GS, C_MA.
+    C_RX, C_RY, C_RZ, C_GROUND, C_LOWEST, C_SAG, C_DROP_TIME, C_DROP, C_LOAD_TIME, C_LOAD,
+) = _rows(0, 42)  # fmt: skip
+# Constants of the sensors; three rows from C_GB, C_AB, C_GS; nine, row by row of a matrix, from C_R.
 (C_SIGMA, C_KAPPA, C_EC, C_ES, C_EC2, C_ES2, C_AHRS, C_ATT_DELAY) = _rows(C_LOAD + LANES, 8)
-(C_GB, C_AB, C_GS, C_MA) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)
+(C_GB, C_AB, C_GS, C_R) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)
 # Constants of the rotors: lag, delay in whole steps and the rest, input row in use.
-(C_TAU, C_SHIFT, C_PART, C_ROW) = _rows(C_MA + 3 * LANES, 4)
+(C_TAU, C_SHIFT, C_PART, C_ROW) = _rows(C_R + 9 * LANES, 4)
 # Constants of the four pieces of a step: e = exp(-h / tau), its integrals, and the length h.
 (P_E, P_E1, P_E2, P_E3, P_H) = _rows(C_ROW + LANES, 5)
 PIECE = 5 * LANES
@@ -44,10 +44,14 @@ HALF = 9 * LANES
 (F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, F0_X, F0_Y, F0_Z) = _rows(X_D + LANES, 9)
 # What reaches the sensors at the start of the step: attitude, rate, specific force (mean over one sample).
 (S_QW, S_QX, S_QY, S_QZ, S_P, S_Q, S_R, S_FX, S_FY, S_FZ) = _rows(F0_Z + LANES, 10)
-# Three rows each: filtered rate and force with their derivatives; inputs of the filters one sample back; AHRS error.
-(G_W, G_DW, G_F, G_DF, G_W0, G_F0, G_FM, E_X) = range(S_FZ + LANES, S_FZ + 25 * LANES, 3 * LANES)
+# How far the rate bends over the step: its quadratic part, at the end of the step.
+(S_BENDX, S_BENDY, S_BENDZ) = _rows(S_FZ + LANES, 3)
+# Three rows each: filtered rate and force with their derivatives; what went into them one sample back.
+(G_W, G_DW, G_F, G_DF, G_W0, G_F0, G_FM, G_BEND) = range(S_BENDZ + LANES, S_BENDZ + 25 * LANES, 3 * LANES)
+# Tilt error of the AHRS, a quaternion in world axes: reported = E q; now and after the step.
+(E_QW, E_QX, E_QY, E_QZ, N_QW, N_QX, N_QY, N_QZ) = _rows(G_BEND + 3 * LANES, 8)
 # Delayed attitude: state looked up in the past, its rate, the rate before that, and how far back from there.
-(D_QW, D_QX, D_QY, D_QZ, D_P, D_Q, D_R, D_P0, D_Q0, D_R0, D_H) = _rows(E_X + 3 * LANES, 11)
+(D_QW, D_QX, D_QY, D_QZ, D_P, D_Q, D_R, D_P0, D_Q0, D_R0, D_H) = _rows(N_QZ + LANES, 11)
 # Residuals of this step.
 RES = D_H + LANES
 N_ROWS = RES // LANES + MAX_CHANNELS

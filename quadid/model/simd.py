@@ -20,14 +20,19 @@ LANES = 16
 CACHE_LINE = 8
 """float64 numbers in one cache line and in one AVX-512 register; access across lines costs twice."""
 
-cached: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+FREE = {"contract", "nnan", "ninf", "nsz"}
+"""Freedom of the compiler: fused multiply-add, and no regard for infinities.  No regrouping of sums: each compilation
+would round differently, and flights replayed after a restart would not be the same bit for bit."""
+cached: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FREE, "error_model": "numpy"}
 """Options of the kernels that Python calls."""
 allocating: dict[str, Any] = {
-    "nogil": True, "fastmath": True, "error_model": "numpy", "no_cfunc_wrapper": True
+    "nogil": True, "fastmath": FREE, "error_model": "numpy", "no_cfunc_wrapper": True
 }  # fmt: skip
 """Options of kernels that make arrays."""
 jit: dict[str, Any] = {**allocating, "_nrt": False}
 """Options of all others: without reference counts, whose atomic updates cost more than a short lane loop."""
+exact: dict[str, Any] = {**jit, "fastmath": False}
+"""Options of kernels that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
 inlined: dict[str, Any] = {**jit, "forceinline": True}
 """Options of the pieces that kernels are made of."""
 
