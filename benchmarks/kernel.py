@@ -1,0 +1,256 @@
+"""Speed of the simulation kernel in nanoseconds per particle-step, against NumPy and against the processor's peak.
+
+    python -m benchmarks.kernel --out docs/results
+
+One particle-step is one parameter vector simulated over one sample at 50 Hz: rotors, Runge-Kutta step, sensors,
+residual.  Times are the best of many short runs, since other programs only ever add to them.  The NumPy step does the
+nominal model's step alone, vectorised over particles, and is checked against the kernel first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.model import layout as ix
+from quadid.model.layout import Layout
+from quadid.model.rollout import Rollout, Segments
+from quadid.model.simd import LANES, aligned, jit, lane_kernel
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+SECONDS, RATE, LENGTH = 40, 50, 50
+PEAK_ROUNDS, PEAK_CHAINS, PEAK_DEPTH = 2000, 12, 16
+NOMINAL_OPERATIONS = 190 + 26 + 9
+"""Additions, multiplications and fused pairs per particle in the compiled nominal step, comparison and delivery."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One line of the table: what was run, nanoseconds per particle-step on one core and on all."""
+
+    name: str
+    one_core: float
+    all_cores: float
+
+
+def best(run: Callable[[], object], seconds: float = 1.5) -> float:
+    """Shortest time of one call [s], out of as many as fit in `seconds`; the first one warms up."""
+    run()
+    shortest, end = np.inf, time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        start = time.perf_counter()
+        run()
+        shortest = min(shortest, time.perf_counter() - start)
+    return float(shortest)
+
+
+def recorded(vehicle: Vehicle, channels: int) -> Window:
+    """A window of lively rotor speeds and noise for measurements: the kernel's speed does not depend on values."""
+    rng = np.random.default_rng(1)
+    n = SECONDS * RATE
+    rotor_speed = vehicle.hover_speed() * (1.0 + 0.02 * rng.standard_normal((n, len(vehicle.rotors))))
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    gyro, accel, velocity, position = 0.1 * rng.standard_normal((4, n, 3))
+    motion = channels > 9
+    return Window(
+        0.0, 1.0 / RATE, rotor_speed, gyro, level, accel, velocity if motion else None, position if motion else None
+    )
+
+
+def particles(vehicle: Vehicle, m: int) -> FloatArray:
+    """Parameter vectors scattered about the vehicle file's, shape (m, size)."""
+    rng = np.random.default_rng(2)
+    thetas = np.tile(Layout(vehicle).initial(vehicle), (m, 1))
+    thetas[:, :6] *= np.exp(0.1 * rng.standard_normal((m, 6)))
+    return thetas
+
+
+def free(thetas: FloatArray, *entries: tuple[int, float]) -> FloatArray:
+    """Parameter vectors with each of these effects at its own value in every one."""
+    rng = np.random.default_rng(3)
+    out = thetas.copy()
+    for index, size in entries:
+        out[:, index] = size * rng.uniform(0.5, 1.5, len(out))
+    return out
+
+
+LAG, DELAY, SAG = (ix.TAU, 0.02), (ix.DELAY, 0.02), (ix.SAG, 0.1)
+DRAG = ((ix.KX, 0.2), (ix.KY, 0.2))
+
+
+def every_effect(vehicle: Vehicle, thetas: FloatArray) -> FloatArray:
+    """Parameter vectors with all effects of the catalogue."""
+    entries = Layout(vehicle).entries.values()
+    return free(thetas, *((e.index, e.typical) for e in entries if e.index > ix.JR and not e.name.endswith(".time")))
+
+
+def run_model(name: str, vehicle: Vehicle, thetas: FloatArray, channels: int, score: bool) -> Timing:
+    """Times residuals (`roll` into memory in use) or the swarm's cost (`costs`)."""
+    rollout = Rollout(recorded(vehicle, channels), vehicle)
+    segments = Segments.cut(len(rollout), LENGTH)
+    x0 = rollout.initial_states(segments)
+    steps = len(segments.starts) * (LENGTH + 1)
+    weights = np.ones((len(rollout), channels))
+    directions = 6 if channels == 9 else 12
+    shape = (len(segments.starts), LENGTH * channels, directions)
+    basis = np.linalg.qr(np.random.default_rng(4).standard_normal(shape))[0]
+
+    def runner(vectors: FloatArray) -> Callable[[], object]:
+        if score:
+            return lambda: rollout.costs(segments, vectors, x0, weights, basis)
+        out = rollout.roll(segments, vectors, x0)
+        return lambda: rollout.roll(segments, vectors, x0, out=out)
+
+    one = best(runner(thetas[:LANES])) / (steps * LANES)  # a single block of lanes stays on the calling thread
+    return Timing(name, 1e9 * one, 1e9 * best(runner(thetas)) / (steps * len(thetas)))
+
+
+# --- the same nominal step in NumPy
+
+
+def numpy_step(x: FloatArray, theta: FloatArray, moments: FloatArray, mass: float, dt: float) -> FloatArray:
+    """One Runge-Kutta step of attitude and rate, Eqs. 1 and 9, all particles at once.
+
+    Args:
+        x: quaternion and rate, shape (7, particles); advanced in place.
+        theta: b, d, J_xx, J_yy, J_zz, J_r, shape (6, particles).
+        moments: sums over rotors of omega^2, x omega^2, y omega^2, spin omega^2, spin omega.
+        mass: mass [kg].
+        dt: step [s].
+
+    Returns:
+        Specific force along z [m/s^2], shape (particles,).
+    """
+    b, d, jx, jy, jz, jr = theta
+    roll, pitch, yaw, spin = -b * moments[2], b * moments[1], d * moments[3], jr * moments[4]
+
+    def slope(y: FloatArray) -> FloatArray:
+        w, i, j, k, p, q, r = y
+        return np.stack([
+            -0.5 * (i * p + j * q + k * r), 0.5 * (w * p + j * r - k * q), 0.5 * (w * q + k * p - i * r),
+            0.5 * (w * r + i * q - j * p), ((jy - jz) * q * r + roll + spin * q) / jx,
+            ((jz - jx) * p * r + pitch - spin * p) / jy, ((jx - jy) * p * q + yaw) / jz,
+        ])  # fmt: skip
+
+    k1 = slope(x)
+    k2 = slope(x + 0.5 * dt * k1)
+    k3 = slope(x + 0.5 * dt * k2)
+    k4 = slope(x + dt * k3)
+    x += dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+    x[:4] *= 1.5 - 0.5 * np.sum(x[:4] ** 2, axis=0)
+    return np.asarray(-b * moments[0] / mass)
+
+
+def numpy_moments(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
+    """Rotor sums of every row, shape (n, 5)."""
+    square = speeds**2
+    x, y = vehicle.rotor_positions[:, 0], vehicle.rotor_positions[:, 1]
+    return np.column_stack([square.sum(axis=1), square @ x, square @ y, square @ vehicle.spins, speeds @ vehicle.spins])
+
+
+def run_numpy(vehicle: Vehicle, thetas: FloatArray) -> float:
+    """Checks the NumPy step against the kernel; returns its nanoseconds per particle-step."""
+    window = recorded(vehicle, 9)
+    moments, theta = numpy_moments(vehicle, window.rotor_speed), np.ascontiguousarray(thetas[:, :6].T)
+    rollout, segments = Rollout(window, vehicle), Segments(LENGTH, 1, np.array([1]))
+    start = rollout.initial_states(segments)
+    x = np.tile(start[0, :7, None], (1, len(thetas)))
+    for k in range(LENGTH + 1):
+        numpy_step(x, theta, moments[k], vehicle.mass, window.dt)
+    ends = rollout.roll(segments, thetas, start)[1]
+    ends = np.moveaxis(ends, -1, 1).reshape(-1, *ends.shape[1:3])[: len(thetas), 0, :7]
+    worst = float(np.abs(ends - x.T).max())
+    if worst > 1e-9:
+        raise AssertionError(f"NumPy and the kernel differ by {worst:g}")
+
+    def run() -> None:
+        y = np.tile(start[0, :7, None], (1, len(thetas)))
+        for k in range(20):
+            numpy_step(y, theta, moments[k], vehicle.mass, window.dt)
+
+    return 1e9 * best(run) / (20 * len(thetas))
+
+
+# --- the processor's peak
+
+
+def _peak_source() -> str:
+    lines = [
+        "def peak(rounds, a, x):",
+        "    lane_kernel()",
+        "    for _ in range(rounds):",
+        "        for lane in range(8):",
+    ]
+    lines += [f"            c{j} = x[{8 * j} + lane]" for j in range(PEAK_CHAINS)]
+    lines += [f"            c{j} = c{j} * a + 0.5" for _ in range(PEAK_DEPTH) for j in range(PEAK_CHAINS)]
+    lines += [f"            x[{8 * j} + lane] = c{j}" for j in range(PEAK_CHAINS)]
+    return "\n".join(lines)
+
+
+def fma_peak() -> float:
+    """Fused multiply-adds of float64 per nanosecond on one core: independent chains that stay in registers."""
+    scope: dict[str, object] = {"lane_kernel": lane_kernel}
+    exec(_peak_source(), scope)  # written out, because there are no loops over registers
+    peak = nb.njit(**jit)(scope["peak"])
+    x = aligned((8 * PEAK_CHAINS,))
+    x[:] = 0.0
+    seconds = best(lambda: peak(PEAK_ROUNDS, 0.5, x))
+    return PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8 / (1e9 * seconds)
+
+
+def main() -> None:
+    """Prints the table; writes it as JSON too when asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder for kernel.json")
+    parser.add_argument("--particles", type=int, default=8 * LANES)
+    arguments = parser.parse_args()
+    vehicle = Vehicle.shipped("pelican")
+    nominal = particles(vehicle, arguments.particles)
+    cases: list[tuple[str, FloatArray, int]] = [
+        ("nominal", nominal, 9),
+        ("motor lag, one a particle", free(nominal, LAG), 9),
+        ("motor lag and delay", free(nominal, LAG, DELAY), 9),
+        ("rotor drag (full equations)", free(nominal, *DRAG), 9),
+        ("rotor drag, lag, delay, sag", free(nominal, *DRAG, LAG, DELAY, SAG), 9),
+        ("every effect", every_effect(vehicle, nominal), 9),
+        ("every effect, velocity and position", every_effect(vehicle, nominal), 15),
+    ]
+    peak = fma_peak()
+    timings = []
+    print(f"{'ns per particle-step':45s}{'one core':>12s}{'all cores':>12s}")
+    for score in (False, True):
+        for name, thetas, channels in cases:
+            timing = run_model(name + (", cost" if score else ""), vehicle, thetas, channels, score)
+            timings.append(timing)
+            print(f"{timing.name:45s}{timing.one_core:12.1f}{timing.all_cores:12.1f}", flush=True)
+    plain = {str(m): run_numpy(vehicle, particles(vehicle, m)) for m in (64, 256, 4096)}
+    for m, ns in plain.items():
+        print(f"{f'NumPy, nominal step alone, {m} particles':45s}{ns:12.1f}")
+    share = NOMINAL_OPERATIONS / timings[0].one_core / peak
+    gain = min(plain.values()) / timings[0].one_core
+    print(f"\npeak of this processor, one core: {peak:.1f} fused multiply-adds of float64 per ns")
+    print(f"the nominal rollout keeps {share:.0%} of it busy; NumPy at its best takes {gain:.0f} times as long")
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        result = {
+            "schema": "quadid.benchmark.kernel/1", "rate": RATE, "lanes": LANES, "cores": os.cpu_count(),
+            "particles": arguments.particles, "fma_per_ns": peak, "share_of_peak": share,
+            "timings": [asdict(t) for t in timings], "numpy": plain, "gain_over_numpy": gain,
+        }  # fmt: skip
+        (arguments.out / "kernel.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

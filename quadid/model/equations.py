@@ -1,0 +1,61 @@
+r"""The equations of the model under test, effect by effect, with their sources.  Nothing but this text lives here.
+
+World NED, body FRD, SI.  nu = (p, q, r) body rate, q = attitude quaternion body to world, R its matrix, v velocity in
+NED, (u, v, w) = R' (v - wind) velocity through the air in body axes, omega_i speed of rotor i at (x_i, y_i), s_i its
+spin (+1: turns about -z), Omega_r = sum s_i omega_i, omega_h hover speed of a rotor, m mass, z down.  Equation numbers
+are those of Abanou & Mansour, *Precision Parameter Identification in Quadcopter UAV Systems Using Particle Swarm
+Algorithm*.
+
+Nominal
+    ======================================================================================  ========================
+    q' = q (0, nu) / 2                                                                      Eqs. 1, 10
+    f_i = b omega_i^2,  tau_i = d omega_i^2                                                 Eqs. 3, 4
+    Gamma = sum f_i along -z                                                                Eq. 5
+    tau_x = -sum y_i f_i,  tau_y = sum x_i f_i,  tau_z = sum s_i tau_i                      Eq. 6, signs mended
+    J nu' = tau - nu x J nu + J_r Omega_r (q, -p, 0)                                        Eqs. 7, 9
+    a = (0, 0, -Gamma / m),  v' = R a + (0, 0, g)                                           Eq. 8
+    gyro = nu at t;  attitude = q at t;  accelerometer = mean of a over a sample about t    contract
+    ======================================================================================  ========================
+
+Rotors
+    motor_lag           tau omega' = u - omega: first-order response to the input.  Bouabdallah 2007, thesis EPFL 3727.
+    command_delay       u(t) = command(t - delay): held commands switch, measured speeds bend, within a sample.
+    thrust_curve        f_i = b (omega_i - dead_speed)^2; the drag torque keeps omega_i^2.
+    weak_rotor          f_i and tau_i of that rotor times 1 - loss.
+    rotor_spin_up       tau_z += J Omega_r': the rotors' angular momentum is -J Omega_r z, its change acts back.
+
+Air
+    rotor_drag          force (-m k_x u, -m k_y v, 0) sum omega_i / sum omega_h.  Martin & Salaun 2010,
+                        doi:10.1109/ROBOT.2010.5509980; Faessler et al. 2018, doi:10.1109/LRA.2017.2776353.
+    rotor_drag_moment   that force acts at height h above the CG: tau_x += h_y F_y, tau_y -= h_x F_x.
+    parasitic_drag      force -m c |(u, v, w)| (u, v, w).
+    axial_inflow        thrust -m k_z (climb speed -w) sum omega_i / sum omega_h: what momentum theory takes
+                        from thrust in climb, to first order; acts at the geometric centre.
+    rate_damping        p' -= l_p p,  q' -= m_q q.
+    wind                (north, east, 0), subtracted from v wherever the air matters.
+    ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z at mid-step, at
+                        least half the scaled radius; a negative scale lowers thrust.  Cheeseman & Bennett 1955,
+                        ARC R&M 3021.
+
+Body
+    cg_offset           arms and IMU are measured from the CG at (x, y, 0).
+    product_of_inertia  J has -J_xy, -J_xz, -J_yz off its diagonal.
+    mass_change         from its time on specific forces are divided by 1 + fraction; J stays.
+    thrust_drop         from its time on f_i and tau_i times 1 - fraction; within a half step in proportion.
+    battery_sag         f_i and tau_i times 1 - fraction (t - t_first) / (t_last - t_first) of the whole log.
+
+Sensors
+    imu_lever_arm       a + nu' x r + nu x (nu x r), r from the CG to the IMU.
+    imu_misalignment    sensor = exp([m]x) body, gyro and accelerometer alike.
+    gyro_scale, gyro_bias, accel_bias
+                        gyro = (1 + scale) rate + bias;  accelerometer = force + bias, after the misalignment.
+    imu_lag             y'' + 2 sigma y' + 2 sigma^2 (y - u) = 0, sigma = sqrt(2) pi cutoff: Butterworth, second order.
+    attitude_delay      attitude(t - delay), from stored steps by rate and its change within the step.
+    ahrs_acceleration_error
+                        q_hat' = q_hat (0, nu + k n x d) / 2 with n = -a / |a| and d = R_hat' (0, 0, 1): the
+                        complementary filter of Mahony, Hamel & Pflimlin 2008, doi:10.1109/TAC.2008.923738, without
+                        its bias; right at the first scored sample of each segment.
+
+Numbers: rotor moments are exact means over half steps (`rotor_kernel`); forces linear in time through them, classical
+Runge-Kutta for the rest (`kernel`): fourth order in the step, second with ground effect.
+"""
