@@ -40,6 +40,13 @@ def replay(
     window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
     refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
     approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
+    gate: Annotated[
+        str,
+        typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05; see docs/online.md."),
+    ] = "",
+    candidates: Annotated[
+        bool, typer.Option("--candidates", help="Every estimate in the JSON, not only sets.")
+    ] = False,
     seed: Seed = 0,
     preset: Preset = "auto",
     json: JsonTarget = None,
@@ -58,12 +65,13 @@ def replay(
     output.check_file(out, "--out")
     pace = _pace(speed)
     described = load_vehicle(vehicle)
-    settings = session_settings(rate=rate, window=window, refit=refit, approval=approval, seed=seed)
+    asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
+    settings = session_settings(rate=rate, window=window, refit=refit, approval=approval, seed=seed, **asked)
     recording = open_log(log, preset)
     service, clock = Service(described, settings, InlineWorker()), Clock()
     with terminal.progress() as advance:
         outputs = play(recording, service, clock, pace, advance)
-    result = summary(recording, service, outputs, clock)
+    result = summary(recording, service, outputs, clock, candidates)
     if out is not None:
         write_outputs(out, outputs, described.name, clock)
         result["out"] = str(out.absolute())
@@ -125,7 +133,21 @@ def _work(service: Service) -> list[Output]:
     return out
 
 
-def summary(recording: Recording, service: Service, outputs: Sequence[Output], clock: Clock) -> dict[str, Any]:
+def parse_pairs(text: str) -> dict[str, float]:
+    """Reads ``name=number,name=number``; raises ReplayError."""
+    out = {}
+    for part in filter(None, text.split(",")):
+        name, _, number = part.partition("=")
+        try:
+            out[name.strip()] = float(number)
+        except ValueError as error:
+            raise ReplayError(f"cannot read '{part}'", "NAME=NUMBER,NAME=NUMBER", "for example windows=3") from error
+    return out
+
+
+def summary(
+    recording: Recording, service: Service, outputs: Sequence[Output], clock: Clock, candidates: bool = False
+) -> dict[str, Any]:
     """The replay as JSON, of the form ``quadid.replay/1``; times count from ``epoch`` [s, UNIX], 0 for boot time."""
     from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
 
@@ -136,12 +158,14 @@ def summary(recording: Recording, service: Service, outputs: Sequence[Output], c
     for o in outputs:
         if isinstance(o, Publish) and o.topic == "candidate" and o.item.state.value == "rejected":
             refused[o.item.check] = refused.get(o.item.check, 0) + 1
+    every = [o.item for o in outputs if isinstance(o, Publish) and o.topic == "candidate"] if candidates else []
     return {
         "schema": "quadid.replay/1",
         "log": recording.name,
         "epoch": (clock.base_ns or 0) // 10**9,
         "vehicle": service.vehicle.name,
         "published": [set_to_dict(s) for s in sets],
+        **({"candidates": [set_to_dict(s, covariance=False) for s in every]} if candidates else {}),
         "refused": refused,
         "diagnoses": [diagnosis_to_dict(o) for o in outputs if isinstance(o, Diagnosed)],
         "events": [

@@ -5,6 +5,7 @@ The ROS node, the MAVLink link and the replay push samples, call `step` often, a
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,13 +42,14 @@ class Feed:
 
 @dataclass(frozen=True)
 class Health:
-    """Everything a monitor wants: session, channels, worker, history."""
+    """Everything a monitor wants: session, channels, worker, history, how long the last fit took [s]."""
 
     status: SessionStatus
     feeds: dict[str, Feed]
     worker: str
     restarts: int
     history: str
+    fit_seconds: float
 
 
 class Service:
@@ -80,6 +82,12 @@ class Service:
         self._rates: dict[str, float] = {}
         self._notes = [Event(0.0, "error", "history", note) for note in (store.notes if store is not None else [])]
         self._problem = ""
+        self._fit_began, self._fit_seconds = 0.0, math.nan
+
+    @property
+    def ready(self) -> bool:
+        """Whether fits can begin at once."""
+        return self._worker.ready
 
     def push(self, sample: Sample) -> None:
         """Takes one sample."""
@@ -95,19 +103,31 @@ class Service:
         Returns:
             What to publish and tell, already in the history.
         """
+        outputs = self._tidy()
+        for action in self.session.poll(most):
+            if isinstance(action, FitRequest | ChangeRequest):
+                self._fit_began = self._clock()
+                self._worker.submit(action)
+            else:
+                outputs.append(action)
+        return self._journalled(outputs)
+
+    def idle(self) -> list[Output]:
+        """Looks after worker and history only, while nobody could hear what the session says."""
+        return self._journalled(self._tidy())
+
+    def _tidy(self) -> list[Output]:
         outputs: list[Output] = list(self._notes)
         self._notes.clear()
         for item in self._worker.poll():
             if isinstance(item, FitReply | ChangeReply):
+                self._fit_seconds = self._clock() - self._fit_began
                 self.session.deliver(item)
             else:
                 outputs.append(self._trouble(item))
-        for action in self.session.poll(most):
-            if isinstance(action, FitRequest | ChangeRequest):
-                self._worker.submit(action)
-            else:
-                outputs.append(action)
-        outputs.extend(self._history_trouble())
+        return [*outputs, *self._history_trouble()]
+
+    def _journalled(self, outputs: list[Output]) -> list[Output]:
         for output in outputs:
             self._journal(output)
         return outputs
@@ -126,7 +146,7 @@ class Service:
         feeds = {name: Feed(self._rate(name, now), now - at) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else "none kept"
-        return Health(self.session.status(), feeds, self._worker.state, restarts, history)
+        return Health(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)
 
     def close(self) -> None:
         """Ends worker and history; what was journalled is on the disk afterwards."""

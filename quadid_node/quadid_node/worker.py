@@ -144,6 +144,11 @@ class ProcessWorker:
         told, self._told = self._told, []
         return [*replies, *told]
 
+    def poll_ready(self) -> bool:
+        """Polls while nothing was submitted yet; what is told waits for the next `poll`."""
+        self._told = [item for item in self.poll() if isinstance(item, Trouble)]
+        return self.ready
+
     def close(self) -> None:
         """Ends the child."""
         self._end_child()

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.conftest import absent
 
 HERE = Path(__file__).resolve().parent
 
@@ -14,3 +20,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.xdist_group("node"))
+            if item.path.stem.startswith("test_ros"):
+                item.add_marker(pytest.mark.ros)
+
+
+@pytest.fixture(scope="session")
+def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A DDS domain of this run's own, reachable from this machine only."""
+    for module in ("rclpy", "quadid_msgs"):
+        if importlib.util.find_spec(module) is None:
+            absent(f"{module} is not installed in {sys.prefix}: run 'make messages'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(1 + (os.getpid() + 50) % 100))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+        patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
+        patch.delenv("RMW_IMPLEMENTATION", raising=False)
+        yield

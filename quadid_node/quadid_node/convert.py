@@ -1,0 +1,157 @@
+"""Between ROS messages and the core: the only file that knows message types.
+
+In: the same decoders as for MCAP logs (`quadid_replay.mcap_messages`) read the serialized bytes, so that a live stream
+and its recording give the same numbers bit for bit.  Out: dictionaries of `messages` become messages.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from quadid_replay.cdr_blocks import BlockReader, Blocks, Read
+from quadid_replay.mcap_messages import SIGNALS, TYPES, Signals
+
+from quadid.errors import QuadidError
+from quadid.window import Sample
+from quadid_node.chooser import Chooser
+from quadid_node.messages import Clock
+from quadid_node.presets import Input
+
+
+class MessageTypeError(QuadidError):
+    """A message type whose package is not installed."""
+
+
+def message_class(name: str) -> Any:
+    """The class of ``package/Type`` or ``package/msg/Type``.
+
+    Raises:
+        MessageTypeError: the package is not installed, or has no such type.
+    """
+    package, kind = name.split("/")[0], name.split("/")[-1]
+    apt = f"ros-jazzy-{package.replace('_', '-')}"
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)
+    except ModuleNotFoundError as error:
+        fix = "colcon build the msgs folder, or run 'make messages'" if package == "quadid_msgs" else f"install {apt}"
+        raise MessageTypeError(f"message type {name}: package {package} is not installed", fix=fix) from error
+    except (ImportError, AttributeError) as error:
+        fix = f"install the version for this ROS distribution ({apt})"
+        raise MessageTypeError(f"message type {name} cannot be used ({error})", fix=fix) from error
+
+
+class Decoder:
+    """Turns the serialized messages of one topic into samples.
+
+    Attributes:
+        failed: messages that could not be decoded.
+    """
+
+    def __init__(self, entry: Input, clock: Clock, chooser: Chooser, rotors: int) -> None:
+        """Prepares for one input.
+
+        Args:
+            entry: topic, type, channels with ranks.
+            clock: of the stamps.
+            chooser: shared by all topics.
+            rotors: number of rotors; surplus motor outputs are left out.
+        """
+        from rclpy.serialization import deserialize_message
+
+        kind = TYPES[entry.type]
+        cls = message_class(entry.type)
+        self._signals: Callable[[Blocks, Any], Signals] = kind.signals
+        self._ranks = dict(entry.channels)
+        self._clock, self._chooser, self._rotors = clock, chooser, rotors
+        self.failed = 0
+
+        def decode(data: bytes) -> Any:
+            return deserialize_message(data, cls)
+
+        if kind.stamp is None:
+            self._read = BlockReader(decode, kind.blocks, kind.extra).read
+        else:
+            stamp = kind.stamp
+
+            def read(data: bytes) -> Read:
+                message = decode(data)
+                return Read(*stamp(message), kind.blocks(message), kind.extra(message))
+
+            self._read = read
+
+    def samples(self, data: bytes) -> Iterator[Sample]:
+        """Yields the samples of one message that may be used now."""
+        try:
+            message = self._read(data)
+            signals = self._signals(message.blocks, message.extra)
+        except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
+            self.failed += 1
+            return
+        ns = message.seconds * 10**9 + message.nanoseconds
+        if ns <= 0:
+            self.failed += 1
+            return
+        t = self._clock.seconds(ns)
+        for name, values in signals:
+            channel, convert = SIGNALS[name]
+            rank = self._ranks.get(channel)
+            if rank is None:
+                continue
+            plain = _FAST[name](values) if name in _FAST else tuple(convert(np.array([values]))[0].tolist())
+            if channel in ("motor_command", "rotor_speed"):
+                plain = plain[: self._rotors]
+            # The attitude of an IMU or a pose stands behind a topic of its own, as when reading logs.
+            behind = 5 if name == "pose_attitude" else 0
+            yield from self._chooser.take(Sample(t, channel, plain), rank + behind)
+
+
+def _flip(v: Any) -> tuple[float, ...]:
+    """FLU to FRD, as `flip_body`, without an array."""
+    return (v[0], -v[1], -v[2])
+
+
+def _same(v: Any) -> tuple[float, ...]:
+    return tuple(v)
+
+
+_FAST: dict[str, Callable[[Any], tuple[float, ...]]] = {
+    "body_rate": _flip,
+    "body_force": _flip,
+    "gyro": _same,
+    "accel": _same,
+    "rotor_speed": _same,
+    "motor_command": _same,
+    "outputs": _same,
+    "battery": _same,
+}
+"""Signals whose conversion needs no array; the numbers are the same to the bit."""
+
+
+def best_ranks(inputs: tuple[Input, ...]) -> dict[str, int]:
+    """The best rank that each channel can have."""
+    out: dict[str, int] = {}
+    for entry in inputs:
+        for channel, rank in entry.channels:
+            out[channel] = min(rank, out.get(channel, rank))
+    return out
+
+
+def to_message(name: str, fields: Mapping[str, Any]) -> Any:
+    """A message of type `name` with these fields; absent fields keep their defaults."""
+    return _filled(message_class(name)(), fields)
+
+
+def _filled(message: Any, fields: Mapping[str, Any]) -> Any:
+    kinds: dict[str, str] = message.get_fields_and_field_types()
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            _filled(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            cls = message_class(kinds[name].removeprefix("sequence<").rstrip(">"))
+            setattr(message, name, [_filled(cls(), item) for item in value])
+        else:
+            setattr(message, name, value)
+    return message

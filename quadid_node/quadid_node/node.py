@@ -1,0 +1,326 @@
+"""The ROS 2 lifecycle node `identify` (node name `quadid`): topics and services around one `Service`.
+
+Callbacks convert, call and publish; everything else is in `service` and in the core.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock as RosClock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+
+from quadid.errors import QuadidError
+from quadid.online import Diagnosed, Event, Publish
+from quadid.online.ledger import Answer
+from quadid_node import messages
+from quadid_node.chooser import Chooser
+from quadid_node.convert import Decoder, best_ranks, message_class, to_message
+from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, read_vehicle, vehicle_id
+from quadid_node.presets import Source, source
+from quadid_node.service import Output, Service
+from quadid_node.store import Store, default_path
+from quadid_node.worker import ProcessWorker
+
+STEP_SECONDS = 0.05
+BLOCKS_A_STEP = 2
+WARM_UP_SECONDS = 8.0
+"""How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
+SENSOR_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED_QOS = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+)  # fmt: skip
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class IdentifyNode(LifecycleNode):
+    """Identifies one vehicle from its topics and publishes the parameter sets that passed the gate."""
+
+    def __init__(self) -> None:
+        """Declares the parameters; everything else waits for `configure`."""
+        super().__init__("quadid")
+        for p in PARAMETERS:
+            self.declare_parameter(p.name, p.default, _descriptor(p.default, p.description, p.span))
+        self.add_on_set_parameters_callback(self._on_set)
+        self._service: Service | None = None
+        self._decoders: dict[str, Decoder] = {}
+        self._notes: dict[str, str] = {}
+        self._paused = False
+        self._open: list[tuple[Callable[[Any], Any], Any]] = []
+        self._publishers_by_topic: dict[str, Any] = {}
+        self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
+        self._active = False
+        self._fit_began, self._fit_seconds = 0.0, float("nan")
+
+    # --- life cycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Reads parameters and vehicle, opens the history, starts the fit process, subscribes."""
+        try:
+            self._configure()
+        except QuadidError as error:
+            self.get_logger().error(str(error))
+            self._tear_down()
+            return FAILURE
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begins to take samples and to publish, once the kernels are warm."""
+        assert self._service is not None
+        if not self._service.ready:
+            self.get_logger().warning("the fit process is warming up (a first start compiles): activate again shortly")
+            return FAILURE
+        result = super().on_activate(state)
+        self._active = True
+        self.get_logger().info(f"ready: identifies '{self._id}'")
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stops taking samples and publishing; what was learned is kept."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Ends fit process and history."""
+        self._tear_down()
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As `on_cleanup`."""
+        self._tear_down()
+        return SUCCESS
+
+    def _configure(self) -> None:
+        values = {p.name: self.get_parameter(p.name).value for p in PARAMETERS}
+        vehicle, settings = read_vehicle(values["vehicle"]), read_settings(values)
+        preset = source(values["source"])
+        self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
+        self._observer = bool(values["observer"])
+        self._stamps = messages.Clock()
+        self._subscribe(preset, len(vehicle.rotors))
+        keeps = not self._observer and values["history"] != "none"
+        store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
+        worker = ProcessWorker(vehicle, values["worker_memory"])
+        self._service = Service(vehicle, settings, worker, store)
+        self._hint = preset.motor_hint
+        self._offer()
+        deadline = time.monotonic() + WARM_UP_SECONDS
+        while not self._service.ready and time.monotonic() < deadline:
+            worker.poll_ready()
+            time.sleep(0.02)
+
+    def _subscribe(self, preset: Source, rotors: int) -> None:
+        chooser = Chooser(best_ranks(preset.inputs))
+        for entry in preset.inputs:
+            decoder = Decoder(entry, self._stamps, chooser, rotors)
+            topic = self.resolve_topic_name(entry.topic)
+            events = SubscriptionEventCallbacks(
+                incompatible_qos=lambda event, t=topic: self._note(t, "its publisher's QoS does not match"),
+                incompatible_type=lambda event, t=topic: self._note(t, "its publisher uses another message type"),
+            )
+            subscription = self.create_subscription(
+                message_class(entry.type), entry.topic, lambda data, d=decoder: self._on_message(d, data), SENSOR_QOS,
+                event_callbacks=events, raw=True,
+            )  # fmt: skip
+            self._decoders[topic] = decoder
+            self._open.append((self.destroy_subscription, subscription))
+
+    def _offer(self) -> None:
+        for topic in ("parameters", "candidate", "diagnosis"):
+            kind = message_class(messages.DIAGNOSIS if topic == "diagnosis" else messages.PARAMETER_SET)
+            qos = LATCHED_QOS if topic == "parameters" else 10
+            self._publishers_by_topic[topic] = self.create_lifecycle_publisher(kind, messages.TOPICS[topic], qos)
+        status = self.create_lifecycle_publisher(message_class(messages.FIT_STATUS), "quadid/status", 10)
+        health = self.create_lifecycle_publisher(message_class(messages.DIAGNOSTICS), "/diagnostics", 10)
+        self._publishers_by_topic |= {"status": status, "diagnostics": health}
+        self._open += [(self.destroy_publisher, p) for p in self._publishers_by_topic.values()]
+        for name, answer in (("fit_now", self._fit_now), ("approve", self._approve), ("rollback", self._roll_back)):
+            service = self.create_service(Trigger, f"quadid/{name}", answer)
+            self._open.append((self.destroy_service, service))
+        for period, work in ((STEP_SECONDS, self._step), (1.0, self._report)):
+            timer = self.create_timer(period, work, clock=self._steady)
+            self._open.append((self.destroy_timer, timer))
+
+    def _tear_down(self) -> None:
+        self._active = False
+        for destroy, item in reversed(self._open):
+            destroy(item)
+        self._open.clear()
+        self._publishers_by_topic.clear()
+        self._decoders.clear()
+        if self._service is not None:
+            self._service.close()
+            self._service = None
+
+    # --- callbacks
+
+    def _on_message(self, decoder: Decoder, data: bytes) -> None:
+        if self._active and not self._paused and self._service is not None:
+            for sample in decoder.samples(data):
+                self._service.push(sample)
+
+    def _step(self) -> None:
+        if self._service is None:
+            return
+        for output in self._service.step(BLOCKS_A_STEP) if self._active else self._service.idle():
+            self._put(output)
+
+    def _put(self, output: Output) -> None:
+        if isinstance(output, Event):
+            self._log(output.level, output.text)
+        elif isinstance(output, Publish) and not self._observer:
+            self._publish(
+                output.topic, messages.PARAMETER_SET, messages.parameter_set(output.item, self._id, self._stamps)
+            )
+        elif isinstance(output, Diagnosed) and not self._observer:
+            self._publish("diagnosis", messages.DIAGNOSIS, messages.diagnosis(output, self._id, self._stamps))
+
+    def _log(self, level: str, text: str) -> None:
+        """One call a level: rclpy remembers the level of each line of code and refuses another."""
+        log = self.get_logger()
+        if level == "info":
+            log.info(text)
+        elif level == "warning":
+            log.warning(text)
+        else:
+            log.error(text)
+
+    def _publish(self, topic: str, kind: str, fields: messages.Message) -> None:
+        self._publishers_by_topic[topic].publish(to_message(kind, fields))
+
+    def _report(self) -> None:
+        """Once a second: status, health, and who else publishes."""
+        if self._service is None:
+            return
+        self._look_for_rivals()
+        health = self._service.health()
+        fields = messages.fit_status(health.status, self._id, self._stamps, health.fit_seconds)
+        if "no rotor speeds" in fields["reason"]:
+            fields["reason"] += f"; here: {self._hint}"
+        self._publish("status", messages.FIT_STATUS, fields)
+        notes = dict(self._notes)
+        notes |= {t: f"{d.failed} messages could not be read" for t, d in self._decoders.items() if d.failed}
+        stamp = self.get_clock().now().to_msg()
+        now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
+        report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)
+        self._publish("diagnostics", messages.DIAGNOSTICS, report)
+
+    def _look_for_rivals(self) -> None:
+        """A second publisher on an input would mix two vehicles: pause until it is gone."""
+        rivals = {t: self.count_publishers(t) for t in self._decoders}
+        crowded = [t for t, n in rivals.items() if n > 1]
+        for topic in self._decoders:
+            if topic in crowded:
+                self._note(topic, f"{rivals[topic]} publishers on one topic: paused until there is one")
+            elif "publishers on one topic" in self._notes.get(topic, ""):
+                del self._notes[topic]
+        self._paused = bool(crowded)
+        ours = self.resolve_topic_name(messages.TOPICS["parameters"])
+        if self.count_publishers(ours) > 1 and not self._observer:
+            self._note(ours, "someone else publishes parameter sets on our topic: check sequence and log_hash")
+        else:
+            self._notes.pop(ours, None)
+
+    def _note(self, topic: str, text: str) -> None:
+        if self._notes.get(topic) != text:
+            self.get_logger().error(f"{topic}: {text}")
+        self._notes[topic] = text
+
+    def _on_set(self, changes: list[Any]) -> SetParametersResult:
+        if self._service is not None:
+            for change in changes:
+                problem = check_change(change.name, change.value)
+                if problem:
+                    return SetParametersResult(successful=False, reason=problem)
+                if change.name == "approval":
+                    self._service.session.ledger.approval = change.value
+        return SetParametersResult(successful=True)
+
+    def _fit_now(self, request: Any, response: Any) -> Any:
+        return self._answer(response, lambda service: service.session.fit_now())
+
+    def _approve(self, request: Any, response: Any) -> Any:
+        return self._answer(response, lambda service: service.approve("ros service"))
+
+    def _roll_back(self, request: Any, response: Any) -> Any:
+        return self._answer(response, lambda service: service.roll_back("ros service"))
+
+    def _answer(self, response: Any, command: Callable[[Service], Answer]) -> Any:
+        if self._service is None or not self._active:
+            response.success, response.message = False, "the node is not active"
+            return response
+        answer = command(self._service)
+        response.success, response.message = answer.done, answer.text
+        self._step()
+        return response
+
+
+def _descriptor(default: Any, description: str, span: tuple[float, float] | None) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=description)
+    if span is not None and isinstance(default, float):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]
+    elif span is not None:
+        descriptor.integer_range = [IntegerRange(from_value=int(span[0]), to_value=int(span[1]), step=0)]
+    return descriptor
+
+
+def _start(node: IdentifyNode, tries: dict[str, int]) -> bool:
+    """Configures and activates; returns False when the node cannot be configured."""
+    if tries["configured"] == 0:
+        tries["configured"] = 1
+        if node.trigger_configure() != SUCCESS:
+            return False
+    if node.trigger_activate() == SUCCESS:
+        tries["active"] = 1
+    return True
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node until SIGINT or SIGTERM; returns the exit code: 0 done, 2 bad parameters."""
+    stop: list[int] = []
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node = IdentifyNode()
+    executor = EventsExecutor()
+    executor.add_node(node)
+    code, tries = 0, {"configured": 0, "active": 0}
+    autostart = bool(node.get_parameter("autostart").value)
+    try:
+        while not stop and code == 0:
+            if autostart and not tries["active"] and not _start(node, tries):
+                code = 2
+            executor.spin_once(timeout_sec=0.2)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        with contextlib.suppress(Exception):
+            node.trigger_shutdown()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""The node's parameters: default, range and description of each; read from ROS, checked, turned into settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from quadid.errors import QuadidError, VehicleError
+from quadid.online import SessionSettings
+from quadid.vehicle import Vehicle
+from quadid_node.settings import session_settings
+
+
+@dataclass(frozen=True)
+class NodeParameter:
+    """One parameter of the node.
+
+    Attributes:
+        name: ROS name.
+        default: its type is the parameter's type.
+        description: one sentence with the unit.
+        span: lowest and highest value, for numbers.
+        live: whether it may be changed while the node is configured.
+    """
+
+    name: str
+    default: Any
+    description: str
+    span: tuple[float, float] | None = None
+    live: bool = False
+
+
+P = NodeParameter
+PARAMETERS: tuple[NodeParameter, ...] = (
+    P("vehicle", "pelican", "A shipped vehicle, or the path of a vehicle file."),
+    P("vehicle_id", "", "Name in messages and history; default: the namespace, else the vehicle's name."),
+    P("source", "canonical", "Whose topic names and types: canonical, mavros, px4, ardupilot, rotors."),
+    P("window", 10.0, "[s] of flight that one fit looks at.", (4.0, 60.0)),
+    P("refit", 1.0, "[s] between fits.", (0.5, 60.0)),
+    P("rate", 50.0, "[Hz] of the uniform grid.", (20.0, 400.0)),
+    P("memory", 120.0, "[s] time constant with which excited flight is forgotten.", (20.0, 86400.0)),
+    P("seed", 0, "Decides every random number.", (0, 2**31 - 1)),
+    P("approval", "auto", "auto: what passes the gate is published; manual: it waits for quadid/approve.", live=True),
+    P("gate.windows", 3, "Windows without a common sample that must agree.", (2, 20)),
+    P("gate.width", 0.05, "Largest half-width of the 95 % interval of b, J_xx, J_yy, relative.", (0.001, 1.0)),
+    P("gate.yaw_width", 0.3, "Largest half-width of the interval of d, J_zz, J_r, relative.", (0.001, 3.0)),
+    P("gate.step", 0.25, "Largest change of a parameter from the set in force, relative.", (0.001, 2.0)),
+    P("gate.creep", 0.4, "Largest change from the last set that a person approved, or the first.", (0.001, 4.0)),
+    P("history", "", "History file; default QUADID_HISTORY, else in the user's data folder; 'none' keeps none."),
+    P("observer", False, "Keep no history and publish nothing: for a second node on one vehicle."),
+    P("autostart", True, "Configure and activate without a lifecycle manager."),
+    P("worker_memory", 1000, "[MiB] most memory of the fit process; 0: no limit.", (0, 65536)),
+)
+"""Every parameter of the node."""
+
+
+def read_settings(values: dict[str, Any]) -> SessionSettings:
+    """Settings of the session from parameter values; raises QuadidError."""
+    gate = {n.replace("gate.", "gate_"): v for n, v in values.items() if n.startswith("gate.")}
+    plain = {n: values[n] for n in ("window", "refit", "rate", "memory", "seed")}
+    return session_settings(approval=values["approval"], **plain, **gate)
+
+
+def read_vehicle(name: str) -> Vehicle:
+    """The shipped vehicle of that name, or a vehicle file; raises VehicleError."""
+    path = Path(name)
+    if path.suffix.lower() not in (".yaml", ".yml") and "/" not in name:
+        return Vehicle.shipped(name)
+    try:
+        return Vehicle.from_yaml(path.read_text(encoding="utf-8"), path.name)
+    except (OSError, UnicodeDecodeError) as error:
+        raise VehicleError(f"vehicle file {name} cannot be read ({error})", "a shipped name or a YAML file") from error
+
+
+def vehicle_id(given: str, namespace: str, vehicle: Vehicle) -> str:
+    """Name of one vehicle of a fleet."""
+    return given or namespace.strip("/").replace("/", "_") or vehicle.name
+
+
+def check_change(name: str, value: Any) -> str:
+    """Why a parameter may not be changed to this now; empty when it may."""
+    known = {p.name: p for p in PARAMETERS}
+    if name not in known:
+        return ""  # not ours: use_sim_time, QoS overrides
+    if not known[name].live:
+        return f"{name} is read when the node is configured: set it before, or clean up and configure again"
+    try:
+        session_settings(approval=value)
+    except QuadidError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,143 @@
+"""Processes and ears for tests of the node: start it, play a log to it, listen to what it says, call its services."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = {"window": 5.0, "gate.windows": 2, "gate.width": 0.08, "gate.yaw_width": 0.6}
+"""A first set after 10 s of flight."""
+
+
+class Process:
+    """A child whose output is kept line by line."""
+
+    def __init__(self, *command: str, **environment: str) -> None:
+        self.lines: list[str] = []
+        self._fresh: queue.Queue[str] = queue.Queue()
+        self.child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment}, start_new_session=True,
+        )  # fmt: skip
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.child.stdout is not None
+        for line in self.child.stdout:
+            self.lines.append(line.rstrip())
+            self._fresh.put(line)
+
+    @property
+    def text(self) -> str:
+        """Everything said so far."""
+        return "\n".join(self.lines)
+
+    def wait_for(self, word: str, seconds: float = 60.0) -> str:
+        """Waits for a line with `word` in it, and returns it."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            for line in self.lines:
+                if word in line:
+                    return line
+            if self.child.poll() is not None and self._fresh.empty():
+                break
+            time.sleep(0.02)
+        raise AssertionError(f"'{word}' was not said within {seconds:g} s; said: {self.text}")
+
+    def end(self, number: int = signal.SIGINT, times: int = 1, seconds: float = 20.0) -> tuple[int, float]:
+        """Sends a signal (several times), waits; returns the exit code and how long it took [s]."""
+        begin = time.monotonic()
+        for _ in range(times):
+            if self.child.poll() is None:
+                self.child.send_signal(number)
+                time.sleep(0.05)
+        code = self.child.wait(seconds)
+        return code, time.monotonic() - begin
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.child.poll() is None:
+            self.child.kill()
+            self.child.wait()
+
+
+def node(history: Path | str, namespace: str = "", **parameters: Any) -> Process:
+    """Starts the node, as `ros2 run quadid_node identify` would."""
+    given = {**QUICK, "history": str(history), **{k.replace("__", "."): v for k, v in parameters.items()}}
+    arguments = [a for k, v in given.items() for a in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
+    where = ["-r", f"__ns:=/{namespace}"] if namespace else []
+    return Process(sys.executable, "-m", "quadid_node.node", "--ros-args", *arguments, *where)
+
+
+def player(log: Path, speed: float = 1.0, namespace: str = "", *more: str) -> Process:
+    """Plays a log, as `ros2 run quadid_node replay LOG` would."""
+    where = ["--ros-args", "-r", f"__ns:=/{namespace}"] if namespace else []
+    return Process(sys.executable, "-m", "quadid_node.replay_node", str(log), "--speed", str(speed), *more, *where)
+
+
+class Ear:
+    """A ROS node in this process that keeps what it hears."""
+
+    def __init__(self, namespace: str = "") -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.context = rclpy.Context()
+        self.context.init()
+        self.node = rclpy.create_node("ear", namespace=namespace, context=self.context)
+        self.heard: dict[str, list[Any]] = {}
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+
+    def listen(self, topic: str, kind: Any, qos: Any = 10, raw: bool = False) -> list[Any]:
+        """Subscribes; what comes is in the returned list."""
+        return self.on(topic, kind, self.heard.setdefault(topic, []).append, qos, raw)
+
+    def on(self, topic: str, kind: Any, callback: Callable[[Any], Any], qos: Any = 10, raw: bool = False) -> list[Any]:
+        """Subscribes with a callback."""
+        self.node.create_subscription(kind, topic, callback, qos, raw=raw)
+        return self.heard.setdefault(topic, [])
+
+    def until(self, done: Callable[[], Any], seconds: float = 60.0) -> bool:
+        """Spins until something is true; returns whether it became so."""
+        deadline = time.monotonic() + seconds
+        while not done() and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+        return bool(done())
+
+    def call(self, service: str, kind: Any, request: Any = None, seconds: float = 20.0) -> Any:
+        """Calls a service and returns its answer."""
+        client = self.node.create_client(kind, service)
+        assert self.until(client.service_is_ready, seconds), f"no service {service}"
+        future = client.call_async(kind.Request() if request is None else request)
+        assert self.until(future.done, seconds), f"no answer of {service}"
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self) -> None:
+        """Ends it."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.context.shutdown()
+
+    def __enter__(self) -> Ear:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,129 @@
+"""What must hold without ROS: imports, the choice of sources, the table of parameters, messages as dictionaries."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from quadid_node.chooser import DECIDE, SILENT, Chooser
+from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, vehicle_id
+from quadid_node.playback import base_seconds, stream
+from quadid_node.presets import source
+from quadid_replay import open_log, write_mcap
+from quadid_replay.mcap_messages import TYPES
+
+from quadid.errors import QuadidError
+from quadid.window import Sample
+from quadid_node import messages
+from tests.online.driving import flight
+
+
+def test_everything_but_the_nodes_imports_without_ros() -> None:
+    code = (
+        "import sys\n"
+        "class Block:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('rclpy', 'quadid_msgs', 'sensor_msgs', 'std_srvs', 'rcl_interfaces'):\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Block())\n"
+        "import quadid_node.service, quadid_node.store, quadid_node.worker, quadid_node.convert, quadid_node.presets\n"
+        "import quadid_node.node_parameters, quadid_node.playback, quadid_node.mavlink_link, quadid_node.zenoh_link\n"
+        "import quadid_node.serve, quadid_cli.replay, quadid_cli.serve, quadid_cli.watch, quadid_cli.history\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_shipped_configuration_names_only_declared_parameters(repository: Path) -> None:
+    text = (repository / "quadid_node" / "config" / "quadid.yaml").read_text(encoding="utf-8")
+    given = yaml.safe_load(text)["/**"]["ros__parameters"]
+    known = {p.name: p for p in PARAMETERS}
+    for name, value in given.items():
+        assert name in known
+        assert isinstance(value, type(known[name].default))
+
+
+def test_defaults_make_settings_and_every_number_has_its_range() -> None:
+    settings = read_settings({p.name: p.default for p in PARAMETERS})
+    assert settings.window == 10.0
+    assert settings.gate.approval == "auto"
+    for p in PARAMETERS:
+        assert p.description.endswith(".")
+        if isinstance(p.default, int | float) and not isinstance(p.default, bool):
+            assert p.span is not None
+            assert p.span[0] <= p.default <= p.span[1]
+
+
+def test_changes_at_run_time_are_refused_with_the_reason() -> None:
+    assert check_change("approval", "manual") == ""
+    assert "approval" in check_change("approval", "sometimes")
+    assert "configured" in check_change("vehicle", "hexacopter")
+    assert check_change("use_sim_time", True) == ""
+
+
+def test_the_namespace_names_the_vehicle_of_a_fleet() -> None:
+    from quadid.vehicle import Vehicle
+
+    pelican = Vehicle.shipped("pelican")
+    assert vehicle_id("", "/", pelican) == "pelican"
+    assert vehicle_id("", "/fleet/quad1", pelican) == "fleet_quad1"
+    assert vehicle_id("mine", "/quad1", pelican) == "mine"
+
+
+@pytest.mark.parametrize("name", ["canonical", "mavros", "px4", "ardupilot", "rotors"])
+def test_every_preset_topic_has_a_type_that_can_be_read_and_feeds_something(name: str) -> None:
+    preset = source(name)
+    for entry in preset.inputs:
+        assert entry.type in TYPES
+        assert entry.channels
+    fed = {channel for entry in preset.inputs for channel, _ in entry.channels}
+    assert {"gyro", "accel", "attitude"} <= fed
+    assert ("rotor_speed" in fed) or ("motor_command" in fed) or name == "ardupilot"
+    assert preset.motor_hint
+
+
+def test_an_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(QuadidError, match="did you mean 'mavros'"):
+        source("mavross")
+
+
+def at(t: float, channel: str = "attitude") -> Sample:
+    return Sample(t, channel, (1.0, 0.0, 0.0, 0.0))
+
+
+def test_the_better_source_is_used_from_its_first_sample() -> None:
+    chooser = Chooser({"attitude": 0})
+    assert list(chooser.take(at(0.0), 1)) == []
+    assert [s.t for s in chooser.take(at(0.1), 0)] == [0.1]
+    assert list(chooser.take(at(0.2), 1)) == []
+    assert [s.t for s in chooser.take(at(0.3), 0)] == [0.3]
+
+
+def test_a_lone_worse_source_is_used_without_loss() -> None:
+    chooser, got = Chooser({"attitude": 0}), []
+    for k in range(30):
+        got += [s.t for s in chooser.take(at(0.1 * k), 1)]
+    assert got == [0.1 * k for k in range(30)]
+    assert DECIDE < 2.9
+
+
+def test_a_source_that_falls_silent_gives_way() -> None:
+    chooser = Chooser({"attitude": 0})
+    list(chooser.take(at(0.0), 0))
+    got = [s.t for k in range(80) for s in chooser.take(at(0.1 * k), 1)]
+    assert got
+    assert min(got) > SILENT
+
+
+def test_stamps_come_back_to_the_nanosecond(tmp_path: Path) -> None:
+    recording = flight(4.0).recording
+    write_mcap(tmp_path / "f.mcap", recording, epoch_ns=1_700_000_123 * 10**9)
+    read = open_log(tmp_path / "f.mcap")
+    assert base_seconds(read) == 1_700_000_123
+    clock = messages.Clock()
+    first = next(iter(stream(read, clock)))
+    assert clock.base_ns == 1_700_000_123 // 86400 * 86400 * 10**9
+    assert clock.stamp(first.t) == {"sec": 1_700_000_123, "nanosec": 0}

@@ -1,0 +1,275 @@
+"""The ROS node over DDS, every part a process of its own: simulated vehicle, node, subscribers, services, signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from quadid_node.presets import Input
+from quadid_node.store import read_history
+from quadid_replay import TopicWriter, write_mcap
+
+from quadid.vehicle import Vehicle
+from tests.node.peers import ROOT, Ear, Process, node, player
+from tests.online.driving import flight
+
+pytestmark = pytest.mark.usefixtures("ros")
+PELICAN = Vehicle.shipped("pelican")
+SPEED = 2.0
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixteen seconds of flight."""
+    path = tmp_path_factory.mktemp("ros") / "flight.mcap"
+    write_mcap(path, flight(16.0, 6).recording)
+    return path
+
+
+@pytest.fixture
+def ear() -> Iterator[Ear]:
+    with Ear() as made:
+        yield made
+
+
+def latched() -> Any:
+    from quadid_node.node import LATCHED_QOS
+
+    return LATCHED_QOS
+
+
+def record(ear: Ear, entry: Input, writer: TopicWriter) -> None:
+    """Writes a topic to MCAP as it arrives, as `ros2 bag record` does."""
+    from quadid_node.convert import message_class
+    from quadid_node.node import SENSOR_QOS
+
+    package, kind = entry.type.split("/")
+
+    def write(data: bytes) -> None:
+        writer.write_cdr(entry.topic, f"{package}/msg/{kind}", data, time.time_ns())
+
+    ear.on(entry.topic, message_class(entry.type), write, SENSOR_QOS, raw=True)
+
+
+def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bits(
+    log: Path, tmp_path: Path, ear: Ear
+) -> None:
+    """Vehicle, node, recorder; a controller that comes late; the recording replayed; a restart."""
+    from diagnostic_msgs.msg import DiagnosticArray
+    from quadid_msgs.msg import FitStatus, ParameterSet
+    from quadid_node.presets import source
+
+    history, recorded = tmp_path / "h.sqlite", tmp_path / "recorded.mcap"
+    with node(history) as identify, TopicWriter(recorded) as writer:
+        candidates = ear.listen("quadid/candidate", ParameterSet, 100)
+        status = ear.listen("quadid/status", FitStatus)
+        health = ear.listen("/diagnostics", DiagnosticArray)
+        for entry in source("canonical").inputs:
+            record(ear, entry, writer)
+        assert ear.until(lambda: status, 90.0), identify.text
+        with player(log, SPEED) as vehicle:
+            assert ear.until(lambda: any(c.state == ParameterSet.STATE_ACCEPTED for c in candidates), 60.0), (
+                identify.text
+            )
+            assert ear.until(lambda: vehicle.child.poll() is not None, 30.0)
+        ear.until(lambda: False, 1.5)
+        with Process(sys.executable, str(ROOT / "examples" / "controller_subscriber.py"), "--show-tracking") as late:
+            line = late.wait_for("attitude tracking error", 60.0)
+            assert "applied" in late.text
+            before, after = (float(word) for word in line.split() if word.startswith("0."))
+            assert after < before, line
+        assert {s.name.split(": ")[1] for s in health[-1].status} == {"session", "inputs", "worker", "history"}
+        assert identify.end()[0] == 0
+    accepted = next(c for c in candidates if c.state == ParameterSet.STATE_ACCEPTED)
+    assert dict(zip(accepted.names, accepted.values, strict=True))["b"] == pytest.approx(2.33e-5, rel=0.01)
+    assert accepted.schema_version == 1
+    assert accepted.vehicle_id == "pelican"
+
+    out = tmp_path / "result.json"
+    options = ["--window", "5", "--gate", "windows=2,width=0.08,yaw_width=0.6", "--json", str(out), "--candidates"]
+    with Process(
+        str(Path(sys.executable).with_name("quadid")), "replay", str(recorded), "--vehicle", "pelican", *options
+    ) as again:
+        assert again.child.wait(120) == 0, again.text
+    replayed = json.loads(out.read_text())["candidates"]
+    live = [(list(c.values), c.log_hash) for c in candidates]
+    assert len(live) > 5
+    assert live == [([p["value"] for p in c["parameters"]], c["input_hash"]) for c in replayed][: len(live)]
+
+    with node(history) as restarted:
+        stale = ear.listen("quadid/parameters", ParameterSet, latched())
+        assert ear.until(lambda: stale, 90.0), restarted.text
+        assert stale[-1].state == 5
+        assert list(stale[-1].values) == list(accepted.values)
+        assert "not yet confirmed" in stale[-1].reason
+
+
+def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, tmp_path: Path, ear: Ear) -> None:
+    from quadid_msgs.msg import ParameterSet
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+    from std_srvs.srv import Trigger
+
+    def change(name: str, **value: Any) -> Any:
+        kind = ParameterType.PARAMETER_DOUBLE if "double_value" in value else ParameterType.PARAMETER_STRING
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=ParameterValue(type=kind, **value))])
+        return ear.call("quadid/set_parameters", SetParameters, request).results[0]
+
+    with node(tmp_path / "h.sqlite", approval="manual") as identify:
+        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        candidates = ear.listen("quadid/candidate", ParameterSet, 100)
+        answer = ear.call("quadid/approve", Trigger, seconds=90.0)
+        assert not answer.success
+        assert not change("gate.width", double_value=5.0).successful, "outside its range"
+        refused = change("window", double_value=8.0)
+        assert not refused.successful
+        assert "when the node is configured" in refused.reason
+        assert not change("approval", string_value="never").successful
+        assert change("approval", string_value="manual").successful
+        with player(log, SPEED):
+            assert ear.until(lambda: any(c.state == ParameterSet.STATE_PENDING for c in candidates), 60.0), (
+                identify.text
+            )
+            assert not sets, "nothing is published before a person approves"
+            assert ear.call("quadid/approve", Trigger).success
+            assert ear.until(lambda: sets, 5.0)
+            assert sets[0].approved_by == "ros service"
+            again = ear.call("quadid/approve", Trigger)
+            back = ear.call("quadid/rollback", Trigger)
+        assert not back.success
+        assert "no earlier set" in back.message
+        assert ear.call("quadid/fit_now", Trigger).success
+        assert identify.end()[0] == 0
+    stored = read_history(tmp_path / "h.sqlite", "pelican")["sets"]
+    assert [s["approved_by"] for s in stored][: 1 + again.success] == ["ros service"] * (1 + again.success)
+
+
+def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
+    from quadid_msgs.msg import ParameterSet
+
+    heavy = (("mass_change", "time", 0.0), ("mass_change", "fraction", 0.2))
+    logs = {}
+    for name, effects in (("quad1", ()), ("quad2", heavy)):
+        logs[name] = tmp_path / f"{name}.mcap"
+        write_mcap(logs[name], flight(14.0, 6, "excited", effects).recording)
+    history = tmp_path / "h.sqlite"
+    with Ear() as ear, node(history, "quad1") as first, node(history, "quad2") as second:
+        sets = {n: ear.listen(f"/{n}/quadid/parameters", ParameterSet, latched()) for n in logs}
+        for started in (first, second):
+            started.wait_for("ready", 120.0)
+        with player(logs["quad1"], 1.0, "quad1"), player(logs["quad2"], 1.0, "quad2"):
+            assert ear.until(lambda: all(sets.values()), 60.0), first.text + second.text
+        found = {n: dict(zip(s[0].names, s[0].values, strict=True))["b"] for n, s in sets.items()}
+        assert {n: s[0].vehicle_id for n, s in sets.items()} == {"quad1": "quad1", "quad2": "quad2"}
+        assert found["quad1"] == pytest.approx(2.33e-5, rel=0.01)
+        assert found["quad2"] == pytest.approx(2.33e-5 / 1.2, rel=0.01)
+        assert first.end()[0] == 0
+        assert second.end()[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["int", "term", "int int"]
+)
+def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, times: int) -> None:
+    with node(tmp_path / "h.sqlite") as identify:
+        identify.wait_for("ready", 120.0)
+        code, took = identify.end(number, times)
+    assert code == 0, identify.text
+    assert took < 2.0
+    assert "Traceback" not in identify.text
+
+
+def test_a_killed_fit_process_is_replaced_and_the_set_comes(log: Path, tmp_path: Path, ear: Ear) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from quadid_msgs.msg import ParameterSet
+
+    with node(tmp_path / "h.sqlite") as identify:
+        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        candidates = ear.listen("quadid/candidate", ParameterSet, 100)
+        health = ear.listen("/diagnostics", DiagnosticArray)
+        identify.wait_for("ready", 120.0)
+        with player(log, 1.0) as vehicle:
+            assert ear.until(lambda: candidates, 60.0)
+            os.kill(worker_of(identify.child.pid), signal.SIGKILL)
+            assert ear.until(lambda: sets, 60.0), identify.text
+            ear.until(lambda: vehicle.child.poll() is not None, 30.0)
+        assert "ended by signal 9" in identify.text
+        assert ear.until(lambda: restarts(health) == 1, 10.0)
+        assert ear.until(lambda: level(health, "inputs") == b"\x02", 15.0), "silent inputs become an error"
+        assert "silent" in next(s.message for s in health[-1].status if s.name.endswith("inputs"))
+
+
+def worker_of(pid: int) -> int:
+    """Process id of the fit process of a node."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return next(int(c) for c in children if b"worker_main" in Path(f"/proc/{c}/cmdline").read_bytes())
+
+
+def restarts(health: list[Any]) -> int:
+    entry = next(s for s in health[-1].status if s.name.endswith("worker"))
+    return int(next(v.value for v in entry.values if v.key == "restarts"))
+
+
+def message(health: list[Any], part: str) -> str:
+    found: str = next(s.message for s in health[-1].status if s.name.endswith(part))
+    return found
+
+
+def level(health: list[Any], part: str) -> bytes:
+    found: bytes = next(s.level for s in health[-1].status if s.name.endswith(part))
+    return found
+
+
+def test_a_second_publisher_pauses_it(log: Path, tmp_path: Path, ear: Ear) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from sensor_msgs.msg import Imu
+
+    with node(tmp_path / "h.sqlite") as identify:
+        health = ear.listen("/diagnostics", DiagnosticArray)
+        identify.wait_for("ready", 120.0)
+        with player(log, 1.0):
+            assert ear.until(lambda: health and level(health, "inputs") == b"\x00", 20.0)
+            rogue = ear.node.create_publisher(Imu, "imu", 10)
+            assert ear.until(lambda: "2 publishers" in message(health, "inputs"), 20.0), message(health, "inputs")
+            assert level(health, "inputs") == b"\x02"
+            ear.node.destroy_publisher(rogue)
+            assert ear.until(lambda: level(health, "inputs") == b"\x00", 20.0), identify.text
+
+
+@pytest.mark.parametrize(
+    ("parameters", "word"),
+    [
+        ({"source": "mavros"}, "package mavros_msgs is not installed"),
+        ({"source": "mavroz"}, "did you mean 'mavros'?"),
+        ({"vehicle": "pelikan"}, "no shipped vehicle 'pelikan'"),
+    ],
+)
+def test_what_cannot_be_configured_is_told_with_the_fix(tmp_path: Path, parameters: dict[str, str], word: str) -> None:
+    with node(tmp_path / "h.sqlite", **parameters) as identify:
+        assert identify.child.wait(60) == 2
+        identify.wait_for(word, 5.0)
+        assert "Traceback" not in identify.text
+
+
+def test_a_second_node_on_one_history_is_refused_and_may_observe(tmp_path: Path) -> None:
+    with node(tmp_path / "h.sqlite") as first:
+        first.wait_for("ready", 120.0)
+        with node(tmp_path / "h.sqlite") as second:
+            assert second.child.wait(60) == 2
+            assert "another service writes" in second.text
+        with node(tmp_path / "h.sqlite", observer=True) as observer:
+            observer.wait_for("ready", 120.0)
+            assert observer.end()[0] == 0
+
+
+def test_a_log_that_cannot_be_played_is_told(tmp_path: Path) -> None:
+    with player(tmp_path / "none.mcap") as vehicle:
+        assert vehicle.child.wait(60) == 2
+        assert "no file" in vehicle.text
