@@ -33,9 +33,9 @@ Air
                         from thrust in climb, to first order; acts at the geometric centre.
     rate_damping        p' -= l_p p,  q' -= m_q q.
     wind                (north, east, 0), subtracted from v wherever the air matters.
-    ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z at mid-step, at
-                        least half the scaled radius; a negative scale lowers thrust.  Cheeseman & Bennett 1955,
-                        ARC R&M 3021.
+    ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z in
+                        mid-step, at least half the scaled radius; a negative scale lowers thrust.  Cheeseman &
+                        Bennett 1955, ARC R&M 3021.
 
 Body
     cg_offset           arms and IMU are measured from the CG at (x, y, 0).

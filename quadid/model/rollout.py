@@ -64,6 +64,7 @@ class Segments:
 
 
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
+_NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
 
 
 class _Lanes(NamedTuple):
@@ -138,11 +139,10 @@ class Rollout:
             raise ValueError(
                 f"out of shapes {residuals.shape}, {ends.shape}; these arguments need {shapes[0]}, {shapes[1]}"
             )
-        nothing = np.empty((0, 0)), np.empty((0, 0, 0)), np.empty(0)
 
         def one(block: int, lanes: _Lanes) -> None:
             rows = residuals[block].reshape(count, segments.length, -1)
-            self._run(segments, n_pre, x0, lanes, self.channels, *nothing[:2], rows, ends[block], nothing[2])
+            self._run(segments, n_pre, x0, lanes, self._mask, None, rows, ends[block], _NOTHING)
 
         self._each_block(segments, n_pre, theta, dx, self.channels, one)
         return residuals, ends
@@ -177,10 +177,10 @@ class Rollout:
             raise ValueError(f"basis of shape {basis.shape}; allowed: {rows} and any number of directions")
         cost = np.zeros((-(-len(theta) // LANES), LANES))
         weights, basis = np.ascontiguousarray(weights), np.ascontiguousarray(basis)
-        no_residuals, no_ends = np.empty((0, 0, 0)), np.empty((0, 0, 0))
 
         def one(block: int, lanes: _Lanes) -> None:
-            self._run(segments, n_pre, x0, lanes, channels, weights, basis, no_residuals, no_ends, cost[block])
+            room = aligned((1, 1, channels * LANES))
+            self._run(segments, n_pre, x0, lanes, weights, basis, room, _NO_ENDS, cost[block])
 
         self._each_block(segments, n_pre, theta, None, channels, one)
         return cost.reshape(-1)[: len(theta)]
@@ -226,14 +226,14 @@ class Rollout:
         return table
 
     def _run(
-        self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, channels: int, weights: FloatArray,
-        basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
+        self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, scale: FloatArray,
+        basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
         w = self.window
         roll_segments(
-            w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, self._mask,
-            segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, channels, segments.length, weights, basis,
-            out, ends, cost,
+            w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, scale,
+            segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length,
+            basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:

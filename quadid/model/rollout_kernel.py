@@ -18,7 +18,7 @@ from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step
 
 # isort: off
 from quadid.model.rows import (
-    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, RES, ROTOR, S_FX, X_P,
+    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, ROTOR, S_FX, X_P,
     X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 from quadid.model.sensor_kernel import (
@@ -131,97 +131,55 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
             target[i, j] = source[i, j]
 
 
-# Rows are written out one by one below: a short loop over them would be unrolled first and then never be vectorised.
-
-
-@nb.njit(**jit)
-def _deliver(seg: int, row: int, k: int, mask: FloatArray, s: FloatArray, out: FloatArray) -> None:
-    """Writes the residuals of sample k, 0 where nothing was measured, to out[seg, row] (channels * LANES,)."""
-    lane_kernel()
-    for lane in range(LANES):
-        out[seg, row, lane] = mask[k, 0] * s[RES + lane]
-        out[seg, row, LANES + lane] = mask[k, 1] * s[RES + LANES + lane]
-        out[seg, row, 2 * LANES + lane] = mask[k, 2] * s[RES + 2 * LANES + lane]
-        out[seg, row, 3 * LANES + lane] = mask[k, 3] * s[RES + 3 * LANES + lane]
-        out[seg, row, 4 * LANES + lane] = mask[k, 4] * s[RES + 4 * LANES + lane]
-        out[seg, row, 5 * LANES + lane] = mask[k, 5] * s[RES + 5 * LANES + lane]
-        out[seg, row, 6 * LANES + lane] = mask[k, 6] * s[RES + 6 * LANES + lane]
-        out[seg, row, 7 * LANES + lane] = mask[k, 7] * s[RES + 7 * LANES + lane]
-        out[seg, row, 8 * LANES + lane] = mask[k, 8] * s[RES + 8 * LANES + lane]
-    for c in range(9, mask.shape[1]):
-        for lane in range(LANES):
-            out[seg, row, c * LANES + lane] = mask[k, c] * s[RES + c * LANES + lane]
-
-
 @nb.njit(**jit)
 def _collect(
-    seg: int, row: int, k: int, weights: FloatArray, basis: FloatArray, s: FloatArray, total: FloatArray,
-    inside: FloatArray,
-) -> None:  # fmt: skip
-    """Adds the weighted residuals of sample k to their sum of squares and to their components along the basis.
+    seg: int, row: int, basis: FloatArray, r: FloatArray, total: FloatArray, inside: FloatArray, channels: int
+) -> None:
+    """Adds the weighted residuals of a sample to their sum of squares and to their components along the basis.
 
     Args:
         seg: segment.
         row: its scored row.
-        k: row of the window.
-        weights: (n, channels).
         basis: (segments, length * channels, directions).
-        s: rows.
+        r: weighted residuals (1, 1, channels * LANES).
         total: sum of squares (LANES,), added to.
         inside: components (directions, LANES), added to.
+        channels: 9, 12 or 15.
     """
     lane_kernel()
-    channels = weights.shape[1]
     at = row * channels
     for lane in range(LANES):
-        s[RES + lane] *= weights[k, 0]
-        s[RES + LANES + lane] *= weights[k, 1]
-        s[RES + 2 * LANES + lane] *= weights[k, 2]
-        s[RES + 3 * LANES + lane] *= weights[k, 3]
-        s[RES + 4 * LANES + lane] *= weights[k, 4]
-        s[RES + 5 * LANES + lane] *= weights[k, 5]
-        s[RES + 6 * LANES + lane] *= weights[k, 6]
-        s[RES + 7 * LANES + lane] *= weights[k, 7]
-        s[RES + 8 * LANES + lane] *= weights[k, 8]
-        r0, r1, r2 = s[RES + lane], s[RES + LANES + lane], s[RES + 2 * LANES + lane]
-        r3, r4, r5 = s[RES + 3 * LANES + lane], s[RES + 4 * LANES + lane], s[RES + 5 * LANES + lane]
-        r6, r7, r8 = s[RES + 6 * LANES + lane], s[RES + 7 * LANES + lane], s[RES + 8 * LANES + lane]
+        r0, r1, r2 = r[0, 0, lane], r[0, 0, LANES + lane], r[0, 0, 2 * LANES + lane]
+        r3, r4, r5 = r[0, 0, 3 * LANES + lane], r[0, 0, 4 * LANES + lane], r[0, 0, 5 * LANES + lane]
+        r6, r7, r8 = r[0, 0, 6 * LANES + lane], r[0, 0, 7 * LANES + lane], r[0, 0, 8 * LANES + lane]
         total[lane] += r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3 + r4 * r4 + r5 * r5 + r6 * r6 + r7 * r7 + r8 * r8
     for j in range(basis.shape[2]):
         b0, b1, b2 = basis[seg, at, j], basis[seg, at + 1, j], basis[seg, at + 2, j]
         b3, b4, b5 = basis[seg, at + 3, j], basis[seg, at + 4, j], basis[seg, at + 5, j]
         b6, b7, b8 = basis[seg, at + 6, j], basis[seg, at + 7, j], basis[seg, at + 8, j]
         for lane in range(LANES):
-            rate = b0 * s[RES + lane] + b1 * s[RES + LANES + lane] + b2 * s[RES + 2 * LANES + lane]
-            turn = b3 * s[RES + 3 * LANES + lane] + b4 * s[RES + 4 * LANES + lane] + b5 * s[RES + 5 * LANES + lane]
-            force = b6 * s[RES + 6 * LANES + lane] + b7 * s[RES + 7 * LANES + lane] + b8 * s[RES + 8 * LANES + lane]
-            inside[j, lane] += rate + turn + force
+            rate = b0 * r[0, 0, lane] + b1 * r[0, 0, LANES + lane] + b2 * r[0, 0, 2 * LANES + lane]
+            turn = b3 * r[0, 0, 3 * LANES + lane] + b4 * r[0, 0, 4 * LANES + lane] + b5 * r[0, 0, 5 * LANES + lane]
+            push = b6 * r[0, 0, 6 * LANES + lane] + b7 * r[0, 0, 7 * LANES + lane] + b8 * r[0, 0, 8 * LANES + lane]
+            inside[j, lane] += rate + turn + push
     if channels > 9:
         for lane in range(LANES):
-            s[RES + 9 * LANES + lane] *= weights[k, 9]
-            s[RES + 10 * LANES + lane] *= weights[k, 10]
-            s[RES + 11 * LANES + lane] *= weights[k, 11]
-            r0, r1, r2 = s[RES + 9 * LANES + lane], s[RES + 10 * LANES + lane], s[RES + 11 * LANES + lane]
+            r0, r1, r2 = r[0, 0, 9 * LANES + lane], r[0, 0, 10 * LANES + lane], r[0, 0, 11 * LANES + lane]
             total[lane] += r0 * r0 + r1 * r1 + r2 * r2
         for j in range(basis.shape[2]):
             b0, b1, b2 = basis[seg, at + 9, j], basis[seg, at + 10, j], basis[seg, at + 11, j]
             for lane in range(LANES):
-                inside[j, lane] += (
-                    b0 * s[RES + 9 * LANES + lane] + b1 * s[RES + 10 * LANES + lane] + b2 * s[RES + 11 * LANES + lane]
-                )
+                r0, r1, r2 = r[0, 0, 9 * LANES + lane], r[0, 0, 10 * LANES + lane], r[0, 0, 11 * LANES + lane]
+                inside[j, lane] += b0 * r0 + b1 * r1 + b2 * r2
     if channels > 12:
         for lane in range(LANES):
-            s[RES + 12 * LANES + lane] *= weights[k, 12]
-            s[RES + 13 * LANES + lane] *= weights[k, 13]
-            s[RES + 14 * LANES + lane] *= weights[k, 14]
-            r0, r1, r2 = s[RES + 12 * LANES + lane], s[RES + 13 * LANES + lane], s[RES + 14 * LANES + lane]
+            r0, r1, r2 = r[0, 0, 12 * LANES + lane], r[0, 0, 13 * LANES + lane], r[0, 0, 14 * LANES + lane]
             total[lane] += r0 * r0 + r1 * r1 + r2 * r2
         for j in range(basis.shape[2]):
             b0, b1, b2 = basis[seg, at + 12, j], basis[seg, at + 13, j], basis[seg, at + 14, j]
             for lane in range(LANES):
-                inside[j, lane] += (
-                    b0 * s[RES + 12 * LANES + lane] + b1 * s[RES + 13 * LANES + lane] + b2 * s[RES + 14 * LANES + lane]
-                )
+                r0, r1, r2 = r[0, 0, 12 * LANES + lane], r[0, 0, 13 * LANES + lane], r[0, 0, 14 * LANES + lane]
+                inside[j, lane] += b0 * r0 + b1 * r1 + b2 * r2
 
 
 @nb.njit(**jit)
@@ -240,13 +198,12 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 @nb.njit(**jit)
 def _march(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    mask: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs, channels: int,
-    n_seg: int, weights: FloatArray, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
+    scale: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
+    channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
     s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray, total: FloatArray, inside: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
-    sums = len(weights) > 0
     steps = n_pre + n_seg
     turned = 0  # rotor steps already taken
     for seg in range(len(starts)):
@@ -262,7 +219,7 @@ def _march(
         for i in range(steps):
             k = first + i
             if need.shared:
-                spread_moments(table, k, s)
+                spread_moments(table, k, need.full, s)
             else:
                 if k == following:
                     _copy(rot, ahead)
@@ -272,8 +229,9 @@ def _march(
             if need.att_delay:
                 remember_attitude(i, s, past)
             scored = i >= n_pre
+            at, row = (0, 0) if sums else (seg, i - n_pre)
             if scored and channels > 9:
-                compare_motion(k, channels, measured, s)
+                compare_motion(at, row, k, measured, scale, s, out)
             # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
             if need.full:
                 step_full(dt, s)
@@ -296,11 +254,9 @@ def _march(
                     tilt_attitude(s)
                 if need.imu_static:
                     distort_imu(s)
-                compare(k, measured, s)
+                compare(at, row, k, measured, scale, s, out)
                 if sums:
-                    _collect(seg, i - n_pre, k, weights, basis, s, total, inside)
-                else:
-                    _deliver(seg, i - n_pre, k, mask, s, out)
+                    _collect(seg, i - n_pre, basis, out, total, inside, channels)
         if sums:
             _settle(total, inside, cost)
         else:
@@ -312,8 +268,8 @@ def _march(
 @nb.njit(**allocating)
 def _roll_segments(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    mask: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray, dx: FloatArray,
-    need: Needs, channels: int, n_seg: int, weights: FloatArray, basis: FloatArray, out: FloatArray, ends: FloatArray,
+    scale: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray, dx: FloatArray,
+    need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray,
     cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
@@ -329,7 +285,7 @@ def _roll_segments(
         flight: numbers of the window.
         table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
         measured: (n, 16), see `compare`.
-        mask: (n, channels), 1 where measured, else 0.
+        scale: (n, channels), factor on residuals: 1 where measured, else 0; or weights.
         starts: first scored row of each segment, rising; rows start - n_pre to start + n_seg must exist.
         n_pre: steps rolled before the first scored row, at least 1.
         x0: initial state at start - n_pre, (segments, 13).
@@ -338,11 +294,11 @@ def _roll_segments(
         need: which parts of the model any lane needs.
         channels: 9, 12 with velocity, 15 with position too.
         n_seg: scored rows a segment.
-        weights: see `_collect`; none to write residuals instead.
-        basis: see `_collect`.
-        out: residuals (segments, n_seg, channels * LANES), written unless there are weights.
-        ends: states one step after the last scored row (segments, 13, LANES), written unless there are weights.
-        cost: (LANES,), added to where there are weights.
+        sums: add up the cost of the residuals instead of writing them.
+        basis: see `_collect`; read for sums.
+        out: residuals (segments, n_seg, channels * LANES), written; for sums work space (1, 1, channels * LANES).
+        ends: states one step after the last scored row (segments, 13, LANES), written unless for sums.
+        cost: (LANES,), added to for sums.
     """
     rotors, dt = len(geometry), flight.dt
     s = cache_aligned(N_ROWS * LANES)
@@ -362,7 +318,7 @@ def _roll_segments(
     rotor_constants(theta, dt, rot, s)
     rotors_start(u, rot)
     _march(
-        u, held, geometry, flight, table, measured, mask, starts, n_pre, x0, dx, need, channels, n_seg, weights, basis,
+        u, held, geometry, flight, table, measured, scale, starts, n_pre, x0, dx, need, channels, n_seg, sums, basis,
         out, ends, cost, s, rot, ahead, past, total, inside,
     )  # fmt: skip
 

@@ -52,9 +52,7 @@ HALF = 9 * LANES
 (E_QW, E_QX, E_QY, E_QZ, N_QW, N_QX, N_QY, N_QZ) = _rows(G_BEND + 3 * LANES, 8)
 # Delayed attitude: state looked up in the past, its rate, the rate before that, and how far back from there.
 (D_QW, D_QX, D_QY, D_QZ, D_P, D_Q, D_R, D_P0, D_Q0, D_R0, D_H) = _rows(N_QZ + LANES, 11)
-# Residuals of this step.
-RES = D_H + LANES
-N_ROWS = RES // LANES + MAX_CHANNELS
+N_ROWS = D_H // LANES + 1
 
 # Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gain.
 (R_SPEED, R_PAST, R_NOW, R_NEXT, R_GAIN) = _rows(0, 5)
