@@ -3,8 +3,8 @@
     python -m benchmarks.kernel --out docs/results
 
 One particle-step is one parameter vector simulated over one sample at 50 Hz: rotors, Runge-Kutta step, sensors,
-residual.  Times are the best of many short runs, since other programs only ever add to them.  The NumPy step does the
-nominal model's step alone, vectorised over particles, and is checked against the kernel first.
+residual.  Times are the best of many short runs, in rounds over all cases, since other programs only ever add to them.
+The NumPy step does the nominal model's step alone, vectorised over particles, and is checked against the kernel first.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numba as nb
@@ -32,28 +32,31 @@ FloatArray = NDArray[np.float64]
 
 SECONDS, RATE, LENGTH = 40, 50, 50
 PEAK_ROUNDS, PEAK_CHAINS, PEAK_DEPTH = 2000, 12, 16
-NOMINAL_OPERATIONS = 190 + 26 + 9
-"""Additions, multiplications and fused pairs per particle in the compiled nominal step, comparison and delivery."""
+NOMINAL_OPERATIONS = 190 + 35
+"""Additions, multiplications and fused pairs per particle in the compiled nominal step and comparison."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """One line of the table: what was run, nanoseconds per particle-step on one core and on all."""
+@dataclass
+class Case:
+    """Something to be timed: `run` does `steps` particle-steps (or operations); `shortest` is its best time [s]."""
 
     name: str
-    one_core: float
-    all_cores: float
+    steps: int
+    run: Callable[[], object]
+    shortest: float = np.inf
 
+    def time(self, seconds: float) -> None:
+        """Runs for a while and keeps the best time of one run."""
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            start = time.perf_counter()
+            self.run()
+            self.shortest = min(self.shortest, time.perf_counter() - start)
 
-def best(run: Callable[[], object], seconds: float = 1.5) -> float:
-    """Shortest time of one call [s], out of as many as fit in `seconds`; the first one warms up."""
-    run()
-    shortest, end = np.inf, time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        start = time.perf_counter()
-        run()
-        shortest = min(shortest, time.perf_counter() - start)
-    return float(shortest)
+    @property
+    def ns(self) -> float:
+        """Nanoseconds per step."""
+        return 1e9 * self.shortest / self.steps
 
 
 def recorded(vehicle: Vehicle, channels: int) -> Window:
@@ -96,8 +99,8 @@ def every_effect(vehicle: Vehicle, thetas: FloatArray) -> FloatArray:
     return free(thetas, *((e.index, e.typical) for e in entries if e.index > ix.JR and not e.name.endswith(".time")))
 
 
-def run_model(name: str, vehicle: Vehicle, thetas: FloatArray, channels: int, score: bool) -> Timing:
-    """Times residuals (`roll` into memory in use) or the swarm's cost (`costs`)."""
+def model_cases(name: str, vehicle: Vehicle, thetas: FloatArray, channels: int, score: bool) -> tuple[Case, Case]:
+    """Residuals (`roll` into memory in use) or the swarm's cost (`costs`), on one core and on all."""
     rollout = Rollout(recorded(vehicle, channels), vehicle)
     segments = Segments.cut(len(rollout), LENGTH)
     x0 = rollout.initial_states(segments)
@@ -107,14 +110,13 @@ def run_model(name: str, vehicle: Vehicle, thetas: FloatArray, channels: int, sc
     shape = (len(segments.starts), LENGTH * channels, directions)
     basis = np.linalg.qr(np.random.default_rng(4).standard_normal(shape))[0]
 
-    def runner(vectors: FloatArray) -> Callable[[], object]:
+    def case(vectors: FloatArray) -> Case:
         if score:
-            return lambda: rollout.costs(segments, vectors, x0, weights, basis)
+            return Case(name, steps * len(vectors), lambda: rollout.costs(segments, vectors, x0, weights, basis))
         out = rollout.roll(segments, vectors, x0)
-        return lambda: rollout.roll(segments, vectors, x0, out=out)
+        return Case(name, steps * len(vectors), lambda: rollout.roll(segments, vectors, x0, out=out))
 
-    one = best(runner(thetas[:LANES])) / (steps * LANES)  # a single block of lanes stays on the calling thread
-    return Timing(name, 1e9 * one, 1e9 * best(runner(thetas)) / (steps * len(thetas)))
+    return case(thetas[:LANES]), case(thetas)  # a single block of lanes stays on the calling thread
 
 
 # --- the same nominal step in NumPy
@@ -160,8 +162,8 @@ def numpy_moments(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
     return np.column_stack([square.sum(axis=1), square @ x, square @ y, square @ vehicle.spins, speeds @ vehicle.spins])
 
 
-def run_numpy(vehicle: Vehicle, thetas: FloatArray) -> float:
-    """Checks the NumPy step against the kernel; returns its nanoseconds per particle-step."""
+def numpy_case(vehicle: Vehicle, thetas: FloatArray) -> Case:
+    """The NumPy step, once it has been checked against the kernel."""
     window = recorded(vehicle, 9)
     moments, theta = numpy_moments(vehicle, window.rotor_speed), np.ascontiguousarray(thetas[:, :6].T)
     rollout, segments = Rollout(window, vehicle), Segments(LENGTH, 1, np.array([1]))
@@ -180,7 +182,7 @@ def run_numpy(vehicle: Vehicle, thetas: FloatArray) -> float:
         for k in range(20):
             numpy_step(y, theta, moments[k], vehicle.mass, window.dt)
 
-    return 1e9 * best(run) / (20 * len(thetas))
+    return Case(f"NumPy, nominal step alone, {len(thetas)} particles", 20 * len(thetas), run)
 
 
 # --- the processor's peak
@@ -199,26 +201,20 @@ def _peak_source() -> str:
     return "\n".join(lines)
 
 
-def fma_peak() -> float:
-    """Fused multiply-adds of float64 per nanosecond on one core: independent chains that stay in registers."""
+def peak_case() -> Case:
+    """Fused multiply-adds of float64 on one core: independent chains that stay in registers."""
     scope: dict[str, object] = {"lane_kernel": lane_kernel}
     exec(_peak_source(), scope)  # written out, because there are no loops over registers
     peak = nb.njit(**jit)(scope["peak"])
     x = aligned((8 * PEAK_CHAINS,))
     x[:] = 0.0
-    seconds = best(lambda: peak(PEAK_ROUNDS, 0.5, x))
-    return PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8 / (1e9 * seconds)
+    return Case("peak", PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8, lambda: peak(PEAK_ROUNDS, 0.5, x))
 
 
-def main() -> None:
-    """Prints the table; writes it as JSON too when asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="folder for kernel.json")
-    parser.add_argument("--particles", type=int, default=8 * LANES)
-    arguments = parser.parse_args()
-    vehicle = Vehicle.shipped("pelican")
-    nominal = particles(vehicle, arguments.particles)
-    cases: list[tuple[str, FloatArray, int]] = [
+def all_model_cases(vehicle: Vehicle, m: int) -> list[tuple[Case, Case]]:
+    """Every line of the table that times the model."""
+    nominal = particles(vehicle, m)
+    lines: list[tuple[str, FloatArray, int]] = [
         ("nominal", nominal, 9),
         ("motor lag, one a particle", free(nominal, LAG), 9),
         ("motor lag and delay", free(nominal, LAG, DELAY), 9),
@@ -227,27 +223,43 @@ def main() -> None:
         ("every effect", every_effect(vehicle, nominal), 9),
         ("every effect, velocity and position", every_effect(vehicle, nominal), 15),
     ]
-    peak = fma_peak()
-    timings = []
+    return [
+        model_cases(name + (", cost" if score else ""), vehicle, thetas, channels, score)
+        for score in (False, True)
+        for name, thetas, channels in lines
+    ]
+
+
+def main() -> None:
+    """Prints the table; writes it as JSON too when asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder for kernel.json")
+    parser.add_argument("--particles", type=int, default=8 * LANES)
+    parser.add_argument("--rounds", type=int, default=8)
+    arguments = parser.parse_args()
+    vehicle = Vehicle.shipped("pelican")
+    model = all_model_cases(vehicle, arguments.particles)
+    plain = [numpy_case(vehicle, particles(vehicle, m)) for m in (64, 256, 4096)]
+    peak = peak_case()
+    for _ in range(arguments.rounds):
+        for case in (*(c for pair in model for c in pair), *plain, peak):
+            case.time(0.15)
     print(f"{'ns per particle-step':45s}{'one core':>12s}{'all cores':>12s}")
-    for score in (False, True):
-        for name, thetas, channels in cases:
-            timing = run_model(name + (", cost" if score else ""), vehicle, thetas, channels, score)
-            timings.append(timing)
-            print(f"{timing.name:45s}{timing.one_core:12.1f}{timing.all_cores:12.1f}", flush=True)
-    plain = {str(m): run_numpy(vehicle, particles(vehicle, m)) for m in (64, 256, 4096)}
-    for m, ns in plain.items():
-        print(f"{f'NumPy, nominal step alone, {m} particles':45s}{ns:12.1f}")
-    share = NOMINAL_OPERATIONS / timings[0].one_core / peak
-    gain = min(plain.values()) / timings[0].one_core
-    print(f"\npeak of this processor, one core: {peak:.1f} fused multiply-adds of float64 per ns")
+    for one, every in model:
+        print(f"{one.name:45s}{one.ns:12.1f}{every.ns:12.1f}")
+    for case in plain:
+        print(f"{case.name:45s}{case.ns:12.1f}")
+    nominal = model[0][0].ns
+    share, gain = NOMINAL_OPERATIONS * peak.ns / nominal, min(case.ns for case in plain) / nominal
+    print(f"\npeak of this processor, one core: {1.0 / peak.ns:.1f} fused multiply-adds of float64 per ns")
     print(f"the nominal rollout keeps {share:.0%} of it busy; NumPy at its best takes {gain:.0f} times as long")
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
+        timings = [{"name": one.name, "one_core": one.ns, "all_cores": every.ns} for one, every in model]
         result = {
             "schema": "quadid.benchmark.kernel/1", "rate": RATE, "lanes": LANES, "cores": os.cpu_count(),
-            "particles": arguments.particles, "fma_per_ns": peak, "share_of_peak": share,
-            "timings": [asdict(t) for t in timings], "numpy": plain, "gain_over_numpy": gain,
+            "particles": arguments.particles, "fma_per_ns": 1.0 / peak.ns, "share_of_peak": share,
+            "timings": timings, "numpy": {case.name: case.ns for case in plain}, "gain_over_numpy": gain,
         }  # fmt: skip
         (arguments.out / "kernel.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
