@@ -178,7 +178,7 @@ class Window:
     @property
     def t(self) -> FloatArray:
         """Times of the rows [s], shape (n,)."""
-        return self.t0 + self.dt * np.arange(len(self))
+        return np.asarray(self.t0 + self.dt * np.arange(len(self)), dtype=np.float64)
 
     def slice(self, start: int, stop: int) -> Window:
         """Returns rows `start` to `stop` (exclusive) as a window of the same log."""

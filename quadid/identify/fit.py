@@ -29,6 +29,15 @@ SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
 SPECTRUM_SECONDS = 0.5
+SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
+"""Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
+MOMENT_MISFIT = 1.5
+MOMENT_GAIN = 0.5
+"""They are set aside when the fit is this bad, or rests on a bound, and the rate residual falls below this share."""
+_SET_ASIDE = (
+    "slow roll and pitch moments that the model lacks were set aside in every segment, so that they do not pass for "
+    "inertia; parameters come from the faster motion alone; quadid diagnose names the cause"
+)
 FLEXIBLE_DRAG = 0.1
 """Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
 
@@ -126,15 +135,51 @@ def fit(
     first = polish(short, theta, free, iterations=8)
     short.noise = residual_noise(short, first)
     first = polish(short, first.theta, free, iterations=8)
-    noise, spent = noise_floor(windows, short, first.theta, free)
-    report("polish", 0.4)
-    final = Shooting(windows, vehicle, options.seconds, noise, layout)
-    result = polish(final, first.theta, final.free(free_names), robust=options.robust)
+    moments = _slow_moments(short, theta, first, free)
+    aside: tuple[str, ...] = ()
+    if moments is not None:
+        # Longer segments would only let the missing moments in again.
+        result = moments
+        final, spent, aside = short, 0, (_SET_ASIDE,)
+    else:
+        noise, spent = noise_floor(windows, short, first.theta, free)
+        report("polish", 0.4)
+        final = Shooting(windows, vehicle, options.seconds, noise, layout)
+        result = polish(final, first.theta, final.free(free_names), robust=options.robust)
     if not np.isfinite(result.cost):
         result = first
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
-    return _finish(final, result.theta, free_names, result.outcome, evaluations, result)
+    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result)
+    return replace(found, warnings=(*aside, *found.warnings))
+
+
+def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> Polished | None:
+    """Refits with a slow roll and pitch moment of its own in each segment; None unless the data ask for it.
+
+    Aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model that lacks them otherwise takes them
+    for a large inertia.  On return `short` keeps the moments free when they are used.
+    """
+    if plain.lin.cost.sum() < MOMENT_MISFIT * plain.lin.rows.sum() and _at_rest(free, plain.theta):
+        return None
+    kept, noise = short.snapshot(), short.noise
+    short.restore({})
+    short.local = SLOW_MOMENTS
+    best = polish(short, start, free, iterations=10)
+    for _ in range(2):
+        short.noise = residual_noise(short, best)
+        best = polish(short, best.theta, free, iterations=8)
+    free_variance, variance = residual_noise(short, best).variance[:2], noise.variance[:2]
+    if np.any(free_variance < MOMENT_GAIN * variance):
+        return best
+    short.local, short.noise = (), noise
+    short.restore(kept)
+    return None
+
+
+def _at_rest(free: Free, theta: FloatArray) -> bool:
+    """True when no parameter rests on a bound."""
+    return all(e.lower * 1.001 < theta[e.index] < e.upper * 0.999 for e in free.entries)
 
 
 def _finish(

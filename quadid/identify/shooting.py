@@ -20,6 +20,7 @@ from quadid.identify.linearised import Linearised as Linearised
 from quadid.identify.linearised import join, log_determinant_beyond
 from quadid.identify.noise import NoiseModel
 from quadid.model import layout as ix
+from quadid.model.kernel import LANES
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
@@ -33,6 +34,8 @@ LEAD_SECONDS = 0.2
 _TANGENT_STEP = np.array([1e-6] * 3 + [1e-6] * 3 + [1e-5] * 3 + [1e-5] * 3)
 _RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 """Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
+LOCAL_SIGMA = 10.0
+"""Standard deviation, in typical sizes, of parameters that are free in every segment (`Shooting.local`)."""
 VELOCITY_PRIOR = 4.0
 """Standard deviation [m/s] of a segment's initial velocity around dead reckoning where none is measured."""
 _VELOCITY_NAMES = ("rotor_drag.", "parasitic_drag.", "rotor_drag_moment.", "axial_inflow.", "ground_effect.", "wind.")
@@ -47,8 +50,9 @@ class Shooting:
 
     Attributes:
         noise: noise model used for weights.
-        theta: full parameter vector at the current point.
-        x0: current initial states, per window (segments, 13).
+        robust: row weights against outliers, per window, or None.
+        local: parameters that each segment has a value of its own for, eliminated with its initial state; what they
+            explain, such as slow moments that the model lacks, no longer pulls at the others.
     """
 
     def __init__(
@@ -70,6 +74,7 @@ class Shooting:
         self._x0: dict[int, list[FloatArray]] = {}
         self._reckoned: dict[int, list[FloatArray]] = {}
         self.robust: list[FloatArray | None] = [None] * len(self.rollouts)
+        self.local: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -152,11 +157,19 @@ class Shooting:
             robust = self.robust[i]
             if robust is not None and robust.shape == weights.shape:
                 weights = weights * robust
-            out, steps = self._roll_directions(rollout, segments, theta, free, states[i], n_pre, k)
+            both = Free((*self.free(self.local).entries, *free.entries))
+            out, steps = self._roll_directions(rollout, segments, theta, both, states[i], n_pre, k)
             grams = self._grams(out, steps, weights)
             base = np.ascontiguousarray(out[0, ..., : self.channels, 0])
             away = states[i][:, 7:10] - self._reckoned[n_pre][i]
-            parts.append(self._eliminate(i, grams, base, weights, away, segments, k))
+            part = self._eliminate(i, grams, base, weights, away, segments, k)
+            for j in range(k, k + len(self.local)):
+                # What the local parameters explain is no residual: lane 1 + j holds their direction.
+                lane = out[(1 + j) // LANES, ..., : self.channels, (1 + j) % LANES]
+                part.residuals[...] -= (lane - out[0, ..., : self.channels, 0]) * (part.back[0][:, j] / steps[j])[
+                    :, None, None
+                ]
+            parts.append(part)
         return join(parts)
 
     def _roll_directions(
@@ -199,10 +212,11 @@ class Shooting:
         # A simulation that ran away has an infinite cost, which every search steps back from.
         away = 0.0 if np.isfinite(grams).all() else np.inf
         h = grams if away == 0.0 else np.zeros_like(grams)
-        haa, hab, hbb = h[:, :k, :k].copy(), h[:, :k, k:width], h[:, k:width, k:width]
-        ga, gb, cost = h[:, :k, width].copy(), h[:, k:width, width], h[:, width, width].copy()
+        own = k + len(self.local)
+        haa, hab, hbb = h[:, :own, :own].copy(), h[:, :own, own:width], h[:, own:width, own:width]
+        ga, gb, cost = h[:, :own, width].copy(), h[:, own:width, width], h[:, width, width].copy()
         informed = np.einsum("sii->si", haa).copy()
-        haa[:, range(k), range(k)] += 1.0 / _RIDGE[:k] ** 2
+        haa[:, range(own), range(own)] += np.concatenate([1.0 / _RIDGE[:k] ** 2, np.full(own - k, LOCAL_SIGMA**-2.0)])
         occam = np.zeros(count)
         if k >= 9 and not self._has_velocity(i):
             haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
@@ -262,7 +276,7 @@ class Shooting:
     def step_states(self, theta: FloatArray, free: Free, lin: Linearised, z: FloatArray) -> list[FloatArray]:
         """Initial states after the parameter step `z`, shapes as `states`; does not store them."""
         n_pre, k = self._shape(theta, free)
-        offset, slope = lin.back
+        offset, slope = lin.back[0][:, :k], lin.back[1][:, :k]
         da = -(offset + slope @ z)
         limit = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)[:k]
         da = np.clip(da, -limit, limit)
