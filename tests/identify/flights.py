@@ -73,7 +73,7 @@ def turned(q: FloatArray, half: FloatArray) -> FloatArray:
 
 def without_rows(window: Window, **rows: Any) -> Window:
     """The window with NaN in the given rows of the given channels."""
-    changed = {}
+    changed: dict[str, Any] = {}
     for name, which in rows.items():
         values = np.array(getattr(window, name))
         values[which] = np.nan

@@ -142,7 +142,7 @@ def test_the_cost_of_a_segment_is_the_least_over_its_initial_states(short: Windo
         one = DenseProblem(rollout, replace(cut, starts=cut.starts[s : s + 1]), NOISE, 9, 1)
 
         def residual(a: FloatArray, one: DenseProblem = one, s: int = s) -> FloatArray:
-            return one.residual(theta, perturbed(x0[s : s + 1], np.concatenate([a, np.zeros(6)])))[0]
+            return np.asarray(one.residual(theta, perturbed(x0[s : s + 1], np.concatenate([a, np.zeros(6)])))[0])
 
         start = np.random.default_rng(s).normal(0.0, [0.01] * 3 + [0.03] * 3)
         best = least_squares(residual, start, x_scale=[0.01] * 3 + [0.03] * 3, xtol=1e-12, ftol=1e-12)
