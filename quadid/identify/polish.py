@@ -7,7 +7,9 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
+from quadid.errors import NotIdentifiableError
 from quadid.identify.shooting import Free, Linearised, Shooting
 
 FloatArray = NDArray[np.float64]
@@ -28,6 +30,12 @@ class Convergence(StrEnum):
 
 LONGEST_STEP = 3.0
 """No scaled parameter moves farther than this in one step."""
+_FLAT = 1e-14
+"""Curvature, relative to the largest, below which a direction is flat: no step is made along it."""
+_ROOM = 1e-13
+"""A parameter on both of its bounds still has this much room, which the solver asks for."""
+_STEADY_WEIGHT = 0.01
+"""Robust weights are renewed while any of them changes by more than this."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +114,11 @@ def polish(
         free: parameters to move.
         prior: weak by default.
         iterations: most linearisations to spend.
-        robust: down-weight outliers (weights are renewed at each accepted step).
+        robust: down-weight outliers (weights are renewed after accepted steps until they stay).
         tolerance: stop when every step is below this fraction of the parameter's standard deviation.
+
+    Raises:
+        NotIdentifiableError: the data lead to equations with infinite or missing entries.
     """
     prior = prior or default_prior(shooting, free)
     lin = shooting.linearise(theta, free)
@@ -144,37 +155,69 @@ def polish(
             outcome = Convergence.CONVERGED
             break
         settled = True
-        if robust:
-            shooting.robust = list(robust_weights(shooting, lin))
+        if robust and _renewed(shooting, lin):
+            # A cost under old weights says nothing about one under new weights.
+            lin = shooting.linearise(theta, free)
+            spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
 
 
-def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
-    """Minimises ``2 g z + z h z`` over steps that keep every parameter within its bounds (active set).
+def _renewed(shooting: Shooting, lin: Linearised) -> bool:
+    """Renews the robust weights; False, and the old ones stay, when they would hardly change."""
+    weights = robust_weights(shooting, lin)
+    steady = all(
+        old is not None and np.max(np.abs(new - old), initial=0.0) <= _STEADY_WEIGHT
+        for new, old in zip(weights, shooting.robust, strict=True)
+    )
+    if not steady:
+        shooting.robust = list(weights)
+    return not steady
 
-    Parameters whose step would leave the bounds are fixed there and the others solved again.
+
+def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
+    """Minimises ``2 g z + z h z`` over steps that keep every parameter within its bounds.
+
+    Args:
+        free: parameters to move, with their bounds.
+        theta: where the step starts, full vector.
+        h: positive semi-definite, shape (P, P).
+        g: shape (P,).
+
+    Raises:
+        NotIdentifiableError: the data lead to equations with infinite or missing entries.
     """
-    low, high = np.empty(len(g)), np.empty(len(g))
-    for j, e in enumerate(free.entries):
-        value = theta[e.index]
-        if free.is_log[j]:
-            low[j], high[j] = np.log(e.lower / value), np.log(e.upper / value)
-        else:
-            low[j], high[j] = (e.lower - value) / e.typical, (e.upper - value) / e.typical
-    fixed = np.zeros(len(g), dtype=bool)
-    z = np.zeros(len(g))
-    for _ in range(len(g) + 1):
-        loose = ~fixed
-        if not loose.any():
-            break
-        rhs = g[loose] + h[np.ix_(loose, fixed)] @ z[fixed]
-        z[loose] = -np.linalg.solve(h[np.ix_(loose, loose)], rhs)
-        out = loose & ((z < low - 1e-12) | (z > high + 1e-12))
-        if not out.any():
-            break
-        z[out] = np.clip(z[out], low[out], high[out])
-        fixed |= out
-    return np.clip(z, low, high)
+    if not (np.isfinite(h).all() and np.isfinite(g).all()):
+        raise NotIdentifiableError(
+            "the linearised simulation is not finite, so no step towards a fit exists",
+            "a flight that the vehicle file can simulate for a second at a time",
+            "check mass, rotor positions and the unit of the rotor signal; `quadid inspect` looks for wrong units",
+        )
+    if not len(g):
+        return np.zeros(0)
+    low, high = _step_limits(free, theta)
+    # h = F F': parameters are scaled first, so that only a true lack of information makes a direction vanish.
+    scale = np.sqrt(np.where(np.diag(h) > 0.0, np.diag(h), 1.0))
+    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    seen = values > _FLAT * values[-1]
+    root, axes = np.sqrt(values[seen]), vectors[:, seen]
+    target = -(axes.T @ (g / scale)) / root
+    z = np.asarray(axes @ (target / root) / scale)
+    if np.all((z >= low) & (z <= high)):
+        return z
+    box = (low * scale - _ROOM, high * scale + _ROOM)
+    solved = lsq_linear(root[:, None] * axes.T, target, box, method="bvls", tol=1e-12, max_iter=20 * len(g))
+    return np.clip(solved.x / scale, low, high)
+
+
+def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest scaled step of each parameter within its bounds, shapes (P,)."""
+    value = theta[free.index]
+    lower = np.array([e.lower for e in free.entries])
+    upper = np.array([e.upper for e in free.entries])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low = np.where(free.is_log, np.log(lower / value), (lower - value) / free.scale)
+        high = np.where(free.is_log, np.log(upper / value), (upper - value) / free.scale)
+    return np.minimum(low, 0.0), np.maximum(high, 0.0)
 
 
 def scaled_difference(free: Free, theta: FloatArray, moved: FloatArray) -> FloatArray:
