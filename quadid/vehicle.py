@@ -105,9 +105,15 @@ class Noise(_Strict):
 
 
 class Stabiliser(_Strict):
-    """Gains of the on-board attitude stabiliser, where known; names as in `quadid.flight.stabiliser`."""
+    """The on-board attitude stabiliser, where known.
+
+    Attributes:
+        gains: by name, as in `quadid.stabiliser`.
+        rate: how often it runs [Hz]; None for once a log row.
+    """
 
     gains: dict[str, float]
+    rate: PositiveFloat | None = None
 
 
 class Vehicle(_Strict):
