@@ -1,0 +1,162 @@
+"""`quadid serve`: the online service on a MAVLink link, no ROS needed."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from quadid_cli.options import JsonTarget, Seed, VehicleName
+
+if TYPE_CHECKING:
+    from quadid_node.mavlink_link import MavlinkLink
+    from quadid_node.service import Health, Output, Service
+    from rich.console import Console
+
+SAY_EVERY = 10.0
+"""Time between two lines about how things are [s]."""
+
+
+def serve(
+    vehicle: VehicleName,
+    mavlink: Annotated[
+        str,
+        typer.Option("--mavlink", metavar="URL", help="Link: udpin:0.0.0.0:14540, tcp:HOST:PORT, /dev/ttyACM0,921600."),
+    ],
+    system: Annotated[
+        int, typer.Option("--system", metavar="N", help="System id of the vehicle; 0: the first autopilot heard.")
+    ] = 0,
+    key: Annotated[
+        Path | None, typer.Option("--key", metavar="FILE", help="Signing key: unsigned frames are then refused.")
+    ] = None,
+    zenoh: Annotated[
+        str | None,
+        typer.Option("--zenoh", metavar="WHERE", help="Publish on Zenoh too: a locator, a config file, or 'local'."),
+    ] = None,
+    name: Annotated[
+        str, typer.Option("--id", metavar="NAME", help="Name of this vehicle; default the vehicle's.")
+    ] = "",
+    approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
+    refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
+    gate: Annotated[
+        str, typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05.")
+    ] = "",
+    file: Annotated[
+        Path | None,
+        typer.Option("--history", metavar="FILE", help="History file; default QUADID_HISTORY, else the user's."),
+    ] = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
+    seed: Seed = 0,
+    json: JsonTarget = None,
+) -> None:
+    """Identify a flying vehicle over MAVLink; tell parameters, findings and health as component 191."""
+    from quadid_node.mavlink_link import MavlinkLink
+    from quadid_node.mavlink_wire import read_key
+    from quadid_node.serve import Outlet, run
+    from quadid_node.service import Service
+    from quadid_node.settings import session_settings
+    from quadid_node.store import Store, default_path
+    from quadid_node.worker import ProcessWorker
+
+    from quadid_cli import output, terminal
+    from quadid_cli.loading import load_vehicle
+    from quadid_cli.replay import parse_pairs
+
+    output.check_file(json, "--json")
+    described = load_vehicle(vehicle)
+    asked = {f"gate_{n}": v for n, v in parse_pairs(gate).items()}
+    settings = session_settings(approval=approval, window=window, refit=refit, seed=seed, **asked)
+    known = name or described.name
+    link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
+    store = Store(file or default_path(), known)
+    service = Service(described, settings, ProcessWorker(described), store)
+    stop = _Stop(seconds)
+    outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
+    if zenoh is not None:
+        from quadid_node.zenoh_link import ZenohLink
+
+        outlets.append(ZenohLink(zenoh, known, service))
+    try:
+        run(service, link, outlets, stop)
+        result = summary(service, link, known)
+    finally:
+        for outlet in outlets:
+            getattr(outlet, "close", lambda: None)()
+        service.close()
+        link.close()
+    output.write_json(result, json)
+
+
+class _Stop:
+    """Says when to stop: after a signal, or when the time is over."""
+
+    def __init__(self, seconds: float) -> None:
+        self._end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
+        self._told = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._tell)
+
+    def _tell(self, number: int, frame: FrameType | None) -> None:
+        self._told = True
+
+    def __call__(self) -> bool:
+        return self._told or time.monotonic() > self._end
+
+
+class _Console:
+    """Tells a person what happens."""
+
+    def __init__(self, console: Console, link: MavlinkLink) -> None:
+        self._console, self._link, self._said, self._ready = console, link, -1e9, False
+
+    def publish(self, item: Output) -> None:
+        """A line for each event and finding."""
+        from quadid.online import Event
+
+        if isinstance(item, Event):
+            self._console.print(f"{item.level:7} {item.text}", markup=False, soft_wrap=True)
+
+    def report(self, health: Health) -> None:
+        """A line when fits can begin, and one now and then about how things are."""
+        if not self._ready and health.worker in ("idle", "busy"):
+            self._ready = True
+            self._console.print("ready: the fit process is warm")
+        if time.monotonic() - self._said < SAY_EVERY:
+            return
+        self._said = time.monotonic()
+        traffic = self._link.traffic()
+        rates = ", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"
+        status = health.status
+        self._console.print(
+            f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}",
+            markup=False,
+            soft_wrap=True,
+        )
+
+    def attend(self) -> None:
+        """Nothing is asked through a terminal."""
+
+
+def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
+    """How it ended, of the form ``quadid.serve/1``."""
+    from quadid_node.codec import set_to_dict, status_to_dict
+
+    health, traffic = service.health(), link.traffic()
+    force = service.session.ledger.in_force
+    return {
+        "schema": "quadid.serve/1",
+        "vehicle": name,
+        "system": link.vehicle_system,
+        "in_force": set_to_dict(force) if force is not None else None,
+        "status": status_to_dict(health.status),
+        "rates": traffic.rates,
+        "refused": traffic.refused,
+        "dropped": traffic.dropped,
+        "worker_restarts": health.restarts,
+        "history": health.history,
+    }

@@ -1,0 +1,119 @@
+"""A live vehicle's MAVLink messages to samples, on its boot clock; the rules are those of telemetry logs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from quadid_replay.clocks import WrapCounter
+from quadid_replay.motors import ardupilot_motor_outputs
+from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds
+
+from quadid.window import Sample
+from quadid_node.chooser import Chooser
+
+ARDUPILOT = 3
+MOTOR_PREFERENCE = {
+    "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
+    "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
+}
+RANKS = {
+    (channel, name): rank
+    for table in (PREFERENCE, MOTOR_PREFERENCE)
+    for channel, names in table.items()
+    for rank, name in enumerate(names)
+}
+"""Which message a channel is best taken from."""
+
+
+class MavlinkDecoder:
+    """Messages of one vehicle to samples.
+
+    Attributes:
+        counts: messages by name.
+        parameters: parameters of the autopilot seen so far.
+        autopilot: its MAV_AUTOPILOT.
+    """
+
+    def __init__(self, rotors: int) -> None:
+        """Expects a vehicle with `rotors` rotors."""
+        self.counts: Counter[str] = Counter()
+        self.parameters: dict[str, float] = {}
+        self.autopilot = 0
+        self._rotors = rotors
+        self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
+        self._servo_clock = WrapCounter()
+        self._newest: float | None = None
+        self._offset: float | None = None
+        self._row: list[float] = []
+        self._row_time = math.nan
+
+    def samples(self, message: Any, received: float) -> Iterator[Sample]:
+        """Yields the samples that may be used now.
+
+        Args:
+            message: decoded message of the vehicle.
+            received: when it came [s, any clock that runs on].
+        """
+        name = message.get_type()
+        self.counts[name] += 1
+        if name == "PARAM_VALUE":
+            self.parameters[str(message.param_id)] = float(message.param_value)
+            return
+        if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
+            return
+        readings = READERS[name](message)
+        t = self._time(message, received) if readings else None
+        if t is None:
+            return
+        for reading in readings:
+            yield from self._channel(t, reading)
+
+    def _time(self, message: Any, received: float) -> float | None:
+        """Boot time of a message; its receive time mapped onto the boot clock where it tells none."""
+        boot = boot_seconds(message)
+        if boot == 0.0 and self._newest is not None and self._newest > 1.0:
+            boot = None  # zero stands for unknown
+        if boot is not None and message.get_type() == "SERVO_OUTPUT_RAW" and self._newest is not None:
+            boot = self._servo_clock.unwrap_near(boot * 1e6, self._newest * 1e6) * 1e-6
+        if boot is None:
+            return None if self._offset is None else received - self._offset
+        if self._newest is not None and boot < self._newest - 1.0:
+            self._offset = None  # perhaps a reboot: the offset belongs to the old boot
+        delay = received - boot
+        self._offset = delay if self._offset is None else min(self._offset, delay)
+        self._newest = boot
+        return boot
+
+    def _channel(self, t: float, reading: Reading) -> Iterator[Sample]:
+        source = reading.source.split(" ")[0]
+        if reading.signal == "esc":
+            yield from self._escs(t, reading, source)
+            return
+        channel, values = reading.signal, tuple(float(v) for v in reading.values)
+        if channel in ("servo", "actuator"):
+            channel, values = "motor_command", self._motors(channel, values)
+        rank = RANKS.get((channel, source))
+        if rank is not None and all(math.isfinite(v) for v in values):
+            yield from self._chooser.take(Sample(t, channel, values), rank)
+
+    def _motors(self, signal: str, values: tuple[float, ...]) -> tuple[float, ...]:
+        """The outputs that are motors: as the autopilot's parameters say, else the first ones."""
+        order = ardupilot_motor_outputs(self.parameters) if signal == "servo" else []
+        if len(order) >= self._rotors:
+            return tuple(values[i] for i in order[: self._rotors])
+        return values[: self._rotors]
+
+    def _escs(self, t: float, reading: Reading, source: str) -> Iterator[Sample]:
+        """Joins the messages of one round to a row at the time of the first."""
+        if reading.place == 0:
+            self._row, self._row_time = [math.nan] * self._rotors, t
+        if not self._row:
+            return
+        for i, value in enumerate(reading.values[: self._rotors - reading.place]):
+            self._row[reading.place + i] = float(value)
+        if all(math.isfinite(v) for v in self._row):
+            row, self._row = tuple(self._row), []
+            yield from self._chooser.take(Sample(self._row_time, "rotor_speed", row), RANKS["rotor_speed", source])

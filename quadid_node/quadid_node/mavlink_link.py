@@ -1,0 +1,242 @@
+"""The service on a MAVLink link: asks for messages, measures what comes, and tells its results as component 191."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from quadid_replay.tlog_messages import READERS
+
+from quadid.online import Diagnosed, Event, Publish
+from quadid.online.records import OnlineSet
+from quadid.window import Sample
+from quadid_node.mavlink_decode import MavlinkDecoder
+from quadid_node.mavlink_wire import LinkError, Wire, dialect
+from quadid_node.service import Output
+
+COMPONENT = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER."""
+REQUESTED = {
+    "HIGHRES_IMU": 100.0, "RAW_IMU": 100.0, "ATTITUDE_QUATERNION": 50.0, "SERVO_OUTPUT_RAW": 50.0,
+    "ACTUATOR_OUTPUT_STATUS": 50.0, "ESC_STATUS": 50.0, "ESC_TELEMETRY_1_TO_4": 50.0, "ATTITUDE_TARGET": 50.0,
+    "LOCAL_POSITION_NED": 20.0, "BATTERY_STATUS": 1.0,
+}  # fmt: skip
+"""Messages asked for, with their rates [Hz]."""
+REPEAT_REQUEST = 10.0
+"""Messages that come at less than 60 % of the asked rate are asked for again after this long [s]."""
+FRAMES_A_SECOND = 4000
+"""More frames than this are a flood: the rest is dropped unread."""
+PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
+SEVERITY = {"error": 3, "warning": 4, "info": 6}
+_READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+_REAL32 = 9
+_TEXT = 50
+_IDS = {m.msgname: n for n, m in dialect.mavlink_map.items()}
+_ANSWERED = ("HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET", "COMMAND_ACK", "PARAM_VALUE")
+_WANTED = frozenset(_IDS[n] for n in (*READERS, *_ANSWERED) if n in _IDS)
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What comes over the link: measured rates [Hz] by message, requests denied, frames refused, bytes dropped."""
+
+    rates: dict[str, float]
+    denied: tuple[str, ...]
+    refused: int
+    dropped: int
+
+
+class MavlinkLink:
+    """The service's end of a MAVLink link.
+
+    Attributes:
+        vehicle_system: system id of the vehicle; 0 before it was heard.
+    """
+
+    def __init__(
+        self, url: str, rotors: int, system: int = 0, key: bytes | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        """Opens the link.
+
+        Args:
+            url: any URL of pymavlink.
+            rotors: of the vehicle.
+            system: system id of the vehicle; 0 takes the first autopilot heard.
+            key: signing key.
+            clock: seconds, monotonic.
+
+        Raises:
+            LinkError: the link cannot be opened.
+        """
+        if not 0 <= system <= 255:
+            raise LinkError(f"system id {system}", "1 to 255, or 0 for the first one heard")
+        self._wire = Wire(url, system or 1, COMPONENT, key)
+        self._decoder = MavlinkDecoder(rotors)
+        self._clock = clock
+        self.vehicle_system = 0
+        self._only, self._target = system, 0
+        self._beat, self._tell, self._asked, self._measured = -1e9, -1e9, -1e9, clock()
+        self._begin = clock()
+        self._before: dict[str, int] = {}
+        self._rates: dict[str, float] = {}
+        self._denied: dict[str, str] = {}
+        self._set: OnlineSet | None = None
+        self._budget, self._budget_second = FRAMES_A_SECOND, 0
+
+    # --- in
+
+    def receive(self) -> Iterator[Sample]:
+        """Yields the samples that have arrived; answers what was asked of us."""
+        now = self._clock()
+        if int(now) != self._budget_second:
+            self._budget_second, self._budget = int(now), FRAMES_A_SECOND
+        for message in self._wire.receive(_WANTED, self._budget):
+            self._budget -= 1
+            kind = message.get_type()
+            if kind == "HEARTBEAT":
+                self._on_heartbeat(message)
+            elif kind == "COMMAND_ACK":
+                self._on_ack(message)
+            elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"):
+                self._on_parameter(kind, message)
+            elif self._is_vehicle(message):
+                yield from self._decoder.samples(message, now)
+
+    def _is_vehicle(self, message: Any) -> bool:
+        return bool(
+            self.vehicle_system
+            and message.get_srcSystem() == self.vehicle_system
+            and message.get_srcComponent() == self._target
+        )
+
+    def _on_heartbeat(self, message: Any) -> None:
+        """The first autopilot heard is our vehicle; we speak under its system id."""
+        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID or self.vehicle_system:
+            return
+        if self._only and message.get_srcSystem() != self._only:
+            return
+        self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
+        self._wire.mav.srcSystem = self.vehicle_system
+        self._decoder.autopilot = message.autopilot
+        for n in range(1, 13):
+            name = f"SERVO{n}_FUNCTION".encode()
+            if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+                self._wire.send(dialect.MAVLink_param_request_read_message(self.vehicle_system, self._target, name, -1))
+
+    def _on_ack(self, message: Any) -> None:
+        if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL and message.result not in (0, 5):
+            self._denied[str(message.result)] = f"result {message.result}"
+
+    def _for_us(self, message: Any) -> bool:
+        return message.target_system in (0, self._wire.mav.srcSystem) and message.target_component in (0, COMPONENT)
+
+    def _on_parameter(self, kind: str, message: Any) -> None:
+        if not self._for_us(message):
+            return
+        entries = self._entries()
+        if kind == "PARAM_REQUEST_LIST":
+            for index in range(len(entries)):
+                self._send_parameter(index)
+            return
+        names = [name for name, _ in entries]
+        wanted = str(message.param_id)
+        index = getattr(message, "param_index", -1)
+        if kind == "PARAM_REQUEST_READ" and 0 <= index < len(names):
+            self._send_parameter(index)
+        elif wanted in names and kind == "PARAM_REQUEST_READ":
+            self._send_parameter(names.index(wanted))
+        elif wanted in names or message.target_component == COMPONENT:
+            self._refuse(message, wanted, _READ_ONLY if wanted in names else _UNKNOWN)
+            if wanted in names:
+                self._send_parameter(names.index(wanted))  # for ground stations that do not know PARAM_ERROR
+
+    def _refuse(self, message: Any, name: str, error: int) -> None:
+        index = getattr(message, "param_index", -1)
+        who = message.get_srcSystem(), message.get_srcComponent()
+        self._wire.send(dialect.MAVLink_param_error_message(*who, name.encode()[:16], index, error))
+
+    # --- out
+
+    def step(self) -> None:
+        """What is due: heartbeat, requests, measured rates, the numbers again for who came late."""
+        now = self._clock()
+        if now - self._beat >= 1.0:
+            self._beat = now
+            self._wire.send(dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
+            ))  # fmt: skip
+        if now - self._measured >= 2.0:
+            self._measure(now)
+        if self.vehicle_system and now - self._asked >= REPEAT_REQUEST:
+            self._asked = now
+            self._ask()
+        if self._set is not None and now - self._tell >= 5.0:
+            self._tell = now
+            self._send_values()
+
+    def publish(self, output: Output) -> None:
+        """Tells a result: numbers of a set in force, a line of text for what people should know."""
+        if isinstance(output, Publish) and output.topic == "parameters":
+            self._set = output.item
+            self._tell = self._clock()
+            for index in range(len(self._entries())):
+                self._send_parameter(index)
+            self._send_values()
+            self._say(6, f"quadid: set {output.item.sequence} {output.item.state.value}")
+        elif isinstance(output, Diagnosed):
+            for finding in output.findings:
+                numbers = " ".join(f"{n} {v:.3g}" for n, v in finding.values.items() if n != "time")
+                self._say(4, f"quadid: {finding.effect} {numbers}{'' if finding.confident else ' (?)'}")
+        elif isinstance(output, Event) and output.level != "info":
+            self._say(SEVERITY[output.level], f"quadid: {output.text}")
+
+    def traffic(self) -> Traffic:
+        """What comes over the link."""
+        return Traffic(dict(self._rates), tuple(self._denied.values()), self._wire.refused, self._wire.dropped)
+
+    def close(self) -> None:
+        """Closes the link."""
+        self._wire.close()
+
+    def _ask(self) -> None:
+        """Asks for the messages that do not come at 60 % of their rate."""
+        for name, rate in REQUESTED.items():
+            if name in _IDS and self._rates.get(name, 0.0) < 0.6 * rate:
+                self._wire.send(dialect.MAVLink_command_long_message(
+                    self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
+                    float(_IDS[name]), 1e6 / rate, 0.0, 0.0, 0.0, 0.0, 0.0,
+                ))  # fmt: skip
+
+    def _measure(self, now: float) -> None:
+        counts = self._decoder.counts
+        span = now - self._measured
+        self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
+        self._before, self._measured = dict(counts), now
+
+    def _entries(self) -> list[tuple[str, float]]:
+        """Our read-only parameters: number and state of the set, then values and relative standard deviations."""
+        if self._set is None:
+            return [("QI_SEQ", 0.0)]
+        out = [("QI_SEQ", float(self._set.sequence)), ("QI_STALE", float(self._set.state.value == "stale"))]
+        for p in self._set.parameters:
+            if p.name in PARAMETERS:
+                out += [(PARAMETERS[p.name], p.value), (f"{PARAMETERS[p.name]}_SD", p.sigma)]
+        return out
+
+    def _send_parameter(self, index: int) -> None:
+        entries = self._entries()
+        name, value = entries[index]
+        self._wire.send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, len(entries), index))
+
+    def _send_values(self) -> None:
+        ms = int((self._clock() - self._begin) * 1e3) % 2**32
+        for name, value in self._entries():
+            if len(name) <= 10:
+                self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+
+    def _say(self, severity: int, text: str) -> None:
+        plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text)
+        self._wire.send(dialect.MAVLink_statustext_message(severity, plain[:_TEXT].encode()))

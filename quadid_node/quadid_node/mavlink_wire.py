@@ -1,0 +1,202 @@
+"""MAVLink on the wire: frames out of bytes, signatures that fail closed, one transport for any pymavlink URL."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import time
+from collections.abc import Container, Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega
+from quadid_replay.esc_messages import extend_dialect
+
+from quadid.errors import QuadidError
+
+dialect: Any = extend_dialect(ardupilotmega)
+_Coder: Any = dialect.MAVLink
+SIGNING_EPOCH = 1420070400
+"""Signature timestamps count 10 us units from 2015-01-01."""
+MOST_BEHIND = 60 * 100_000
+"""A new stream may be this far behind the newest signature seen [10 us]: older ones are replays."""
+KEY_BYTES = 32
+_HEAD = {0xFE: 8, 0xFD: 12}
+_SIGNED, _SIGNATURE = 1, 13
+_LONGEST = 12 + 255 + _SIGNATURE
+
+
+class LinkError(QuadidError):
+    """A link that cannot be opened, or a key that cannot be used."""
+
+
+def frames(buffer: bytearray, whole: bool) -> Iterator[bytes]:
+    """Takes complete frames off the front of `buffer`; what is no frame is skipped.
+
+    Args:
+        buffer: bytes received; frames and garbage before them are removed.
+        whole: a datagram, which never holds half a frame: whatever is left of it is dropped.
+    """
+    while buffer:
+        start = next((i for i, b in enumerate(buffer) if b in _HEAD), len(buffer))
+        if start:
+            del buffer[:start]
+            continue
+        length = _length(buffer)
+        if length is None or length > len(buffer):
+            if whole:
+                del buffer[:1]
+                continue
+            return
+        yield bytes(buffer[:length])
+        del buffer[:length]
+
+
+def _length(buffer: bytearray) -> int | None:
+    if len(buffer) < 3:
+        return None
+    extra = _SIGNATURE if buffer[0] == 0xFD and buffer[2] & _SIGNED else 0
+    return _HEAD[buffer[0]] + buffer[1] + extra
+
+
+def message_id(frame: bytes) -> int:
+    """Number of the message in a frame."""
+    return frame[5] if frame[0] == 0xFE else frame[7] | frame[8] << 8 | frame[9] << 16
+
+
+class SafeMavlink(_Coder):
+    """pymavlink's coder with its signature check mended: nothing of a frame is believed before its signature.
+
+    pymavlink notes a frame's timestamp first and checks the signature afterwards, so that one forged frame from the far
+    future locks the true sender out.
+    """
+
+    def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
+        """Checks signature, then timestamp; notes the timestamp only of a frame that passed both."""
+        digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()[:6]
+        if not hmac.compare_digest(digest, bytes(msgbuf[-6:])):
+            return False
+        timestamp = int.from_bytes(msgbuf[-12:-6], "little")
+        stream = (msgbuf[-13], srcSystem, srcComponent)
+        last = self.signing.stream_timestamps.get(stream)
+        if timestamp <= last if last is not None else timestamp + MOST_BEHIND < self.signing.timestamp:
+            return False
+        self.signing.stream_timestamps[stream] = timestamp
+        self.signing.timestamp = max(self.signing.timestamp, timestamp)
+        return True
+
+
+def read_key(path: Path) -> bytes:
+    """Reads a signing key: 32 bytes, or 64 hexadecimal digits.
+
+    Raises:
+        LinkError: no such file, or no key in it; the link is then not opened at all.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise LinkError(f"signing key {path} cannot be read ({error.strerror})", fix="check the path") from error
+    text = data.strip()
+    if len(text) == 2 * KEY_BYTES:
+        try:
+            return bytes.fromhex(text.decode("ascii"))
+        except (ValueError, UnicodeDecodeError):
+            pass
+    if len(data) != KEY_BYTES:
+        raise LinkError(f"{path} holds {len(data)} bytes", "a key of 32 bytes, or 64 hexadecimal digits")
+    return data
+
+
+class Wire:
+    """A link.
+
+    Attributes:
+        refused: frames with a wrong checksum, and with a key those without a good signature.
+        dropped: bytes dropped unread because too many came.
+    """
+
+    def __init__(self, url: str, system: int, component: int, key: bytes | None = None) -> None:
+        """Opens the link.
+
+        Args:
+            url: any URL of pymavlink, as ``udpin:0.0.0.0:14540`` or ``/dev/ttyACM0,921600``.
+            system: our system id.
+            component: our component id.
+            key: signing key; with one, every frame that is not signed with it is refused.
+
+        Raises:
+            LinkError: the link cannot be opened.
+        """
+        device, _, baud = url.partition(",")
+        try:
+            options = {"baud": int(baud)} if baud else {}
+            self._conn: Any = mavutil.mavlink_connection(device, autoreconnect=True, **options)
+        except (OSError, ValueError, IndexError) as error:
+            raise LinkError(
+                f"cannot open {url} ({error})",
+                "a pymavlink URL",
+                "for example udpin:0.0.0.0:14540 or /dev/ttyACM0,921600",
+            ) from error
+        self._datagrams = isinstance(self._conn, mavutil.mavudp)
+        self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
+        if key is not None:
+            self.mav.signing.secret_key = key
+            self.mav.signing.sign_outgoing = True
+            self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * 100_000)
+        self._buffer = bytearray()
+        self.refused = self.dropped = 0
+
+    def receive(self, wanted: Container[int], most: int) -> Iterator[Any]:
+        """Yields the wanted messages that have arrived; never waits.
+
+        Args:
+            wanted: message numbers; others are not even decoded.
+            most: frames to decode at most; what comes beyond is read and dropped.
+        """
+        decoded = 0
+        while data := self._read():
+            if decoded >= most:
+                self.dropped += len(data)
+                continue
+            self._buffer = bytearray(data) if self._datagrams else self._buffer + data
+            believed = False
+            for frame in frames(self._buffer, self._datagrams):
+                if message_id(frame) not in wanted:
+                    continue
+                decoded += 1
+                try:
+                    message = self.mav.decode(bytearray(frame))
+                except dialect.MAVError:
+                    self.refused += 1
+                    continue
+                believed = True
+                yield message
+            self._keep_peer(believed)
+
+    def send(self, message: Any) -> None:
+        """Sends a message; a link that is down loses it."""
+        frame = message.pack(self.mav)
+        self.mav.seq = (self.mav.seq + 1) % 256
+        try:
+            self._conn.write(frame)
+        except OSError:
+            self.dropped += len(frame)
+
+    def close(self) -> None:
+        """Closes the link."""
+        self._conn.close()
+
+    def _read(self) -> bytes:
+        """Bytes that have arrived, or none; remembers who was not known before."""
+        self._known = set(getattr(self._conn, "clients", ()))
+        try:
+            return bytes(self._conn.recv(4096) or b"")
+        except (OSError, TypeError):
+            return b""
+
+    def _keep_peer(self, believed: bool) -> None:
+        """Answers go to every address that was heard: one that said nothing believable is forgotten again."""
+        clients = getattr(self._conn, "clients", None)
+        if clients is not None and not believed:
+            clients &= self._known

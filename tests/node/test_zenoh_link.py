@@ -1,0 +1,257 @@
+"""Zenoh: real sessions through a router process with mutual TLS and access control by certificate name."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import zenoh
+from quadid_cli.watch import snapshot, table
+from quadid_node.service import Service
+from quadid_node.worker import InlineWorker
+from quadid_node.zenoh_link import Fleet, ZenohError, ZenohLink, key_of
+
+from quadid.online import SessionSettings
+from quadid.online.records import Diagnosed, OnlineFinding, Publish
+from quadid.vehicle import Vehicle
+from tests.online.test_gate import TRUE, online_set
+
+PELICAN = Vehicle.shipped("pelican")
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "zenoh"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def until(done: Callable[[], object], seconds: float = 10.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not done() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return bool(done())
+
+
+class Net:
+    """A router process, and configuration files of its clients."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.port = folder, free_port()
+        certs = folder / "certs"
+        for place, names in ((certs, ("router", "quad1", "quad2", "quad3", "watch")), (folder / "foreign", ("quad1",))):
+            subprocess.run([str(EXAMPLES / "certificates.sh"), str(place), *names], check=True)
+        router = self._write("router.json5", (EXAMPLES / "router.json5").read_text())
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("zenoh_router.py")), str(router)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "routing\n"
+
+    def _write(self, name: str, text: str, certs: str = "certs") -> Path:
+        path = self.folder / name
+        text = text.replace("certs/", f"{self.folder / certs}/").replace("0.0.0.0:7447", f"127.0.0.1:{self.port}")
+        path.write_text(text.replace("localhost:7447", f"localhost:{self.port}"))
+        return path
+
+    def client(self, name: str, certs: str = "certs") -> str:
+        """Configuration file of a client with the certificate `name`."""
+        text = (EXAMPLES / "quad1.json5").read_text().replace("quad1", name)
+        return str(self._write(f"{certs}-{name}.json5", text, certs))
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
+    made = Net(tmp_path_factory.mktemp("zenoh"))
+    yield made
+    assert made.process.stdin is not None
+    made.process.stdin.close()
+    made.process.wait(10)
+
+
+def service() -> Service:
+    return Service(PELICAN, SessionSettings(), InlineWorker())
+
+
+def accepted(number: int, b: float = TRUE["b"]) -> Publish:
+    return Publish("parameters", replace(online_set({**TRUE, "b": b}), sequence=number, approved_by="auto"))
+
+
+def test_three_vehicles_are_seen_and_who_comes_late_gets_the_latest(net: Net) -> None:
+    links = {n: ZenohLink(net.client(n), n, service()) for n in ("quad1", "quad2", "quad3")}
+    try:
+        for k, link in enumerate(links.values()):
+            link.publish(accepted(1, 2.0e-5))
+            link.publish(accepted(2, 2.0e-5 + 1e-6 * k))
+            link.report(service().health())
+        time.sleep(0.5)
+        fleet = Fleet(net.client("watch"))
+        try:
+            complete = until(lambda: len(fleet.latest) == 3 and all(len(v) == 2 for v in fleet.latest.values()))
+            assert complete, fleet.latest.keys()
+            assert until(lambda: fleet.alive == dict.fromkeys(links, True))
+            found = {n: k["parameters"]["parameters"][0]["value"] for n, k in fleet.latest.items()}
+            assert found == pytest.approx({"quad1": 2.0e-5, "quad2": 2.1e-5, "quad3": 2.2e-5})
+            assert {k["parameters"]["sequence"] for k in fleet.latest.values()} == {2}
+            links["quad2"].publish(accepted(3))
+            assert until(lambda: fleet.latest["quad2"]["parameters"]["sequence"] == 3)
+            links.pop("quad3").close()
+            assert until(lambda: not fleet.alive["quad3"]), "its token went with it"
+            assert "quad1" in json.dumps(snapshot(fleet))
+            assert table(snapshot(fleet)).row_count == 3
+        finally:
+            fleet.close()
+    finally:
+        for link in links.values():
+            link.close()
+
+
+def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
+    owned = service()
+    owned.session.ledger.approval = "manual"
+    owned.session.ledger.hold(online_set(TRUE), 30.0)
+    link, fleet = ZenohLink(net.client("quad1"), "quad1", owned), Fleet(net.client("watch"))
+    try:
+        time.sleep(0.5)
+        answers = []
+        import threading
+
+        asker = threading.Thread(target=lambda: answers.extend([fleet.command("quad1", "approve") for _ in range(2)]))
+        asker.start()
+        deadline = time.monotonic() + 15.0
+        while len(answers) < 2 and time.monotonic() < deadline:
+            link.attend()
+            time.sleep(0.01)
+        asker.join()
+        assert answers[0][0]
+        assert answers[1] == (False, "nothing waits for approval")
+        assert owned.session.ledger.in_force is not None
+        assert owned.session.ledger.in_force.approved_by == "zenoh"
+    finally:
+        fleet.close()
+        link.close()
+
+
+def test_forged_values_and_spying_are_refused_by_the_router(net: Net) -> None:
+    watcher = Fleet(net.client("watch"))
+    mallory = zenoh.open(zenoh.Config.from_file(net.client("quad2")))
+    victim = ZenohLink(net.client("quad1"), "quad1", service())
+    try:
+        heard: list[bytes] = []
+        spy = mallory.declare_subscriber("quadid/**", lambda sample: heard.append(sample.payload.to_bytes()))
+        time.sleep(0.5)
+        mallory.put(key_of("quad1", "parameters"), json.dumps({"sequence": 666}))
+        mallory.put(key_of("quad2", "parameters"), json.dumps({"sequence": 7}))
+        victim.publish(accepted(1))
+        assert until(lambda: "quad2" in watcher.latest and "quad1" in watcher.latest)
+        time.sleep(0.5)
+        assert watcher.latest["quad1"]["parameters"]["sequence"] == 1
+        own = [json.dumps({"sequence": n}).encode() for n in (666, 7)]
+        assert [h for h in heard if h not in own] == [], "no vehicle hears another's values, only its own session's"
+        stolen = [r for r in mallory.get("quadid/quad1/*", timeout=1.0) if r.ok is not None]
+        assert stolen == []
+        told = [r for r in mallory.get("quadid/quad1/command/rollback", timeout=1.0) if r.ok is not None]
+        assert told == []
+        spy.undeclare()  # type: ignore[no-untyped-call]
+    finally:
+        for session in (watcher, victim):
+            session.close()
+        mallory.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("how", ["foreign authority", "no certificate", "no TLS"])
+def test_who_has_no_certificate_of_ours_does_not_get_in(net: Net, how: str) -> None:
+    if how == "foreign authority":
+        config = zenoh.Config.from_file(net.client("quad1", "foreign"))
+        config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(net.folder / "certs" / "ca.pem")))
+    else:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        scheme = "tls" if how == "no certificate" else "tcp"
+        config.insert_json5("connect/endpoints", f'["{scheme}/localhost:{net.port}"]')
+        config.insert_json5("connect/timeout_ms", "2000")
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(net.folder / "certs" / "ca.pem")))
+    link = ZenohLink(net.client("quad1"), "quad1", service())
+    link.publish(accepted(1))
+    try:
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError:
+            return
+        heard = [r for r in session.get("quadid/**", timeout=1.0) if r.ok is not None]
+        session.close()  # type: ignore[no-untyped-call]
+        assert heard == []
+    finally:
+        link.close()
+
+
+def test_garbage_and_floods_are_counted_not_shown(net: Net) -> None:
+    fleet = Fleet(net.client("watch"))
+    rogue = zenoh.open(zenoh.Config.from_file(net.client("quad3")))
+    try:
+        time.sleep(0.3)
+        for payload in (b"\xff\xfe", b"[1, 2]", b"{" * 20000, b'{"a":' + b" " * 400_000 + b"1}", b"null"):
+            rogue.put("quadid/quad3/parameters", payload)
+        for k in range(2000):
+            rogue.put("quadid/quad3/health", json.dumps({"status": {"phase": f"\x1b[31m{k}", "reason": "<b>"}}))
+        assert until(
+            lambda: fleet.latest.get("quad3", {}).get("health", {}).get("status", {}).get("phase") == "\x1b[31m1999"
+        )
+        assert fleet.refused == 5
+        from rich.console import Console
+
+        console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+        console.print(table(snapshot(fleet)))
+        assert "\x1b[31m" not in console.export_text()
+    finally:
+        fleet.close()
+        rogue.close()  # type: ignore[no-untyped-call]
+
+
+def test_a_router_that_comes_late_is_found_and_a_wrong_configuration_told(tmp_path: Path) -> None:
+    port = free_port()
+    where = f"tcp/127.0.0.1:{port}"
+    link = ZenohLink(where, "quad1", service(), retry=0.2)
+    link.publish(accepted(1))
+    assert until(lambda: "Unable to connect" in link.problem)
+    with pytest.raises(ZenohError, match="Unable to connect"):
+        Fleet(where)
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([where]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config):
+        assert until(lambda: not link.problem)
+        fleet = Fleet(where)
+        assert until(lambda: "parameters" in fleet.latest.get("quad1", {}))
+        fleet.close()
+    link.close()
+    with pytest.raises(ZenohError, match="no Zenoh configuration"):
+        ZenohLink(str(tmp_path / "none.json5"), "quad1")
+    (tmp_path / "bad.json5").write_text("{ mode: ")
+    with pytest.raises(ZenohError, match="is no Zenoh configuration"):
+        ZenohLink(str(tmp_path / "bad.json5"), "quad1")
+
+
+def test_findings_cross_too(net: Net) -> None:
+    link, fleet = ZenohLink(net.client("quad2"), "quad2", service()), Fleet(net.client("watch"))
+    try:
+        time.sleep(0.3)
+        finding = OnlineFinding(
+            "mass_change", {"fraction": 0.15}, {"fraction": 0.01}, {"fraction": ""}, 3.0, 1.0, 0.0, (), "seen"
+        )
+        link.publish(Diagnosed(44.0, 40.0, 44.0, (finding,), "explained"))
+        assert until(lambda: "diagnosis" in fleet.latest.get("quad2", {}))
+        assert fleet.latest["quad2"]["diagnosis"]["findings"][0]["effect"] == "mass_change"
+    finally:
+        link.close()
+        fleet.close()
