@@ -64,9 +64,12 @@ demo: venv ## fly, identify and diagnose three flights, write the report
 
 # --- check
 
-.PHONY: test test-slow lint typecheck format
+.PHONY: test test-browser test-slow lint typecheck format
 test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and the browser's
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser and not slow"
+
+test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
+	$(BIN)/pytest -m browser tests/browser
 
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow

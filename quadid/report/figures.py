@@ -246,10 +246,12 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
         for name, value, role in rows[::-1]
     ]
     highest = max([v for _, v, _ in rows if v is not None and math.isfinite(v)], default=floor)
+    edge = {"type": "line", "x0": floor, "x1": floor, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
     layout = {
-        "xaxis": {"title": {"text": "squared error / noise on unseen data"}, "range": [0.9 * floor, 1.05 * highest]},
+        "xaxis": {"title": {"text": "error on unseen data (noise = 1)"}, "range": [0.0, 1.05 * highest]},
         "yaxis": {"type": "category"},
         "hovermode": "closest",
+        "shapes": [edge],
     }
     views = [{"label": "", "data": data, "layout": layout}]
     return {"id": identifier, "title": "What it is worth", "views": views, "height": 90 + 32 * len(rows)}

@@ -60,7 +60,7 @@ def parameter_row(
         "relative_to": None,
         **parameter,
         "margin": percent(relative_halfwidth(parameter)).replace(" ", "\u00a0"),
-        "reason": reason(parameter, stuck),
+        "reason": reason(parameter, stuck).replace(" %", "\u00a0%"),
     }
     if truth:
         row["truth"] = truth.get(parameter["name"])

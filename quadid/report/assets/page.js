@@ -5,6 +5,20 @@
   const chosen = new Map();
   const colour = (name) => getComputedStyle(root).getPropertyValue("--" + name).trim();
 
+  // Long rows of numbers travel as 16 bit integers; see packed() in page.py.
+  function unpacked(value) {
+    if (Array.isArray(value)) return value.map(unpacked);
+    if (value === null || typeof value !== "object") return value;
+    if (typeof value.i2 === "string") {
+      const raw = atob(value.i2), bytes = new DataView(Uint8Array.from(raw, (c) => c.charCodeAt(0)).buffer);
+      return Array.from({ length: raw.length / 2 }, (_, i) => {
+        const n = bytes.getInt16(2 * i, true);
+        return n === -32768 ? null : value.low + value.step * (n + 32767);
+      });
+    }
+    return Object.fromEntries(Object.entries(value).map(([key, inner]) => [key, unpacked(inner)]));
+  }
+
   function line(role) {
     if (role === "measured") return { color: colour(role), width: 2.4 };
     if (role === "before") return { color: colour(role), width: 1.2, dash: "dot" };
@@ -38,11 +52,13 @@
     for (const [key, value] of Object.entries(view.layout)) {
       layout[key] = /^[xy]axis/.test(key) ? Object.assign({}, axis, value) : value;
     }
+    // Copied, since Plotly would write into it, and dressed in the colour of its role.
+    layout.shapes = (view.layout.shapes || []).map(({ role, ...shape }) => ({ ...shape, line: { color: colour(role), width: 1.5, dash: "dash" } }));
     return layout;
   }
 
   function draw(box) {
-    const figure = figures[box.dataset.figure];
+    const figure = figures[box.dataset.figure] = unpacked(figures[box.dataset.figure]);
     const view = figure.views[chosen.get(figure.id) || 0];
     box.dataset.drawn = "yes";
     return Plotly.react(box, view.data.map((trace) => painted(trace, view)), layoutOf(view), { responsive: true, displaylogo: false, displayModeBar: false });
@@ -63,11 +79,23 @@
       const id = button.dataset.figure;
       chosen.set(id, Number(button.dataset.view));
       document.querySelectorAll("button[data-figure]").forEach((other) => {
-        if (other.dataset.figure === id) other.classList.toggle("on", other === button);
+        if (other.dataset.figure === id) other.setAttribute("aria-pressed", String(other === button));
       });
       draw(document.getElementById("plot-" + id));
     });
   });
+
+  // Zoom from the keyboard: the window of the time axis, all axes back to their own with 0.
+  const steps = { "+": [0.25, -0.25], "=": [0.25, -0.25], "-": [-0.5, 0.5], ArrowLeft: [-0.2, -0.2], ArrowRight: [0.2, 0.2] };
+  boxes().forEach((box) => box.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || !box.dataset.drawn) return;
+    if (event.key === "0") { draw(box); return event.preventDefault(); }
+    const step = steps[event.key];
+    if (!step) return;
+    const axis = box._fullLayout.xaxis, [low, high] = axis.range.map(Number), width = high - low;
+    Plotly.relayout(box, { "xaxis.range": [low + step[0] * width, high + step[1] * width] });
+    event.preventDefault();
+  }));
 
   const system = window.matchMedia("(prefers-color-scheme: dark)");
   let own = null;

@@ -1,0 +1,59 @@
+"""A headless Chromium, and the reports that it opens: one of made-up scores with hostile names, one of real work."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conftest import REPOSITORY, absent
+from tests.report.test_page import page, scored
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+SHOTS = REPOSITORY / "browser-out"
+"""Screenshots are kept here to be looked at."""
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Browser]:
+    """The system's Chromium (Debian package), driven by Playwright."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright (extra dev)")
+    binary = shutil.which("chromium") or shutil.which("chromium-browser")
+    if binary is None:
+        absent("no chromium: install Debian's package of that name (apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=binary, args=["--no-sandbox", "--disable-gpu"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def shots() -> Path:
+    """Folder of the screenshots."""
+    SHOTS.mkdir(exist_ok=True)
+    return SHOTS
+
+
+@pytest.fixture(scope="session")
+def hostile_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of logs whose names, topics and warnings try to run something."""
+    from tests.report.test_page import EVIL
+
+    file = tmp_path_factory.mktemp("hostile") / "report.html"
+    file.write_text(page([scored(EVIL), scored("b.csv", seed=1)]), encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="session")
+def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report that `quadid demo --quick` writes."""
+    from quadid_cli import demo, output
+
+    folder = tmp_path_factory.mktemp("demo")
+    shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
+    return output.write_text(folder / "report.html", demo.html(shown, 1))
