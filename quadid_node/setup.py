@@ -25,7 +25,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "identify = quadid_node.node:main",
+            "identify = quadid_node.identify:main",
             "replay = quadid_node.replay_node:main",
         ]
     },

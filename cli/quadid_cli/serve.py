@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -55,6 +54,9 @@ def serve(
     json: JsonTarget = None,
 ) -> None:
     """Identify a flying vehicle over MAVLink; tell parameters, findings and health as component 191."""
+    from quadid_node.stopping import Stop
+
+    stop = Stop()
     from quadid_node.mavlink_link import MavlinkLink
     from quadid_node.mavlink_wire import read_key
     from quadid_node.serve import Outlet, run
@@ -72,40 +74,24 @@ def serve(
     asked = {f"gate_{n}": v for n, v in parse_pairs(gate).items()}
     settings = session_settings(approval=approval, window=window, refit=refit, seed=seed, **asked)
     known = name or described.name
-    link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
-    store = Store(file or default_path(), known)
-    service = Service(described, settings, ProcessWorker(described), store)
-    stop = _Stop(seconds)
-    outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
-    if zenoh is not None:
-        from quadid_node.zenoh_link import ZenohLink
+    end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
+    with ExitStack() as opened:
+        link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
+        opened.callback(link.close)
+        store = Store(file or default_path(), known)
+        service = Service(described, settings, ProcessWorker(described), store)
+        opened.callback(service.close)
+        outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
+        if zenoh is not None:
+            from quadid_node.zenoh_link import ZenohLink
 
-        outlets.append(ZenohLink(zenoh, known, service))
-    try:
-        run(service, link, outlets, stop)
+            told = ZenohLink(zenoh, known, service)
+            opened.callback(told.close)
+            outlets.append(told)
+        opened.callback(stop.ignore_more)
+        run(service, link, outlets, lambda: stop() or time.monotonic() > end)
         result = summary(service, link, known)
-    finally:
-        for outlet in outlets:
-            getattr(outlet, "close", lambda: None)()
-        service.close()
-        link.close()
     output.write_json(result, json)
-
-
-class _Stop:
-    """Says when to stop: after a signal, or when the time is over."""
-
-    def __init__(self, seconds: float) -> None:
-        self._end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
-        self._told = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._tell)
-
-    def _tell(self, number: int, frame: FrameType | None) -> None:
-        self._told = True
-
-    def __call__(self) -> bool:
-        return self._told or time.monotonic() > self._end
 
 
 class _Console:

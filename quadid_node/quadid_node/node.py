@@ -1,29 +1,21 @@
-"""The ROS 2 lifecycle node `identify` (node name `quadid`): topics and services around one `Service`.
+"""The ROS 2 lifecycle node of `identify` (node name `quadid`): topics and services around one `Service`.
 
 Callbacks convert, call and publish; everything else is in `service` and in the core.
 """
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
@@ -52,9 +44,14 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 class IdentifyNode(LifecycleNode):
     """Identifies one vehicle from its topics and publishes the parameter sets that passed the gate."""
 
-    def __init__(self) -> None:
-        """Declares the parameters; everything else waits for `configure`."""
+    def __init__(self, stopping: Callable[[], bool] = lambda: False) -> None:
+        """Declares the parameters; everything else waits for `configure`.
+
+        Args:
+            stopping: says that the process is asked to end, so that nothing is waited for any more.
+        """
         super().__init__("quadid")
+        self._stopping = stopping
         for p in PARAMETERS:
             self.declare_parameter(p.name, p.default, _descriptor(p.default, p.description, p.span))
         self.add_on_set_parameters_callback(self._on_set)
@@ -66,7 +63,11 @@ class IdentifyNode(LifecycleNode):
         self._publishers_by_topic: dict[str, Any] = {}
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self._active = False
-        self._fit_began, self._fit_seconds = 0.0, float("nan")
+
+    @property
+    def warm(self) -> bool:
+        """Whether fits could begin at once."""
+        return self._service is not None and self._service.ready
 
     # --- life cycle
 
@@ -121,7 +122,7 @@ class IdentifyNode(LifecycleNode):
         self._hint = preset.motor_hint
         self._offer()
         deadline = time.monotonic() + WARM_UP_SECONDS
-        while not self._service.ready and time.monotonic() < deadline:
+        while not self._service.ready and time.monotonic() < deadline and not self._stopping():
             worker.poll_ready()
             time.sleep(0.02)
 
@@ -278,49 +279,3 @@ def _descriptor(default: Any, description: str, span: tuple[float, float] | None
     elif span is not None:
         descriptor.integer_range = [IntegerRange(from_value=int(span[0]), to_value=int(span[1]), step=0)]
     return descriptor
-
-
-def _start(node: IdentifyNode, tries: dict[str, int]) -> bool:
-    """Configures and activates; returns False when the node cannot be configured."""
-    if tries["configured"] == 0:
-        tries["configured"] = 1
-        if node.trigger_configure() != SUCCESS:
-            return False
-    if node.trigger_activate() == SUCCESS:
-        tries["active"] = 1
-    return True
-
-
-def main(args: list[str] | None = None) -> int:
-    """Runs the node until SIGINT or SIGTERM; returns the exit code: 0 done, 2 bad parameters."""
-    stop: list[int] = []
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.append(number)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    node = IdentifyNode()
-    executor = EventsExecutor()
-    executor.add_node(node)
-    code, tries = 0, {"configured": 0, "active": 0}
-    autostart = bool(node.get_parameter("autostart").value)
-    try:
-        while not stop and code == 0:
-            if autostart and not tries["active"] and not _start(node, tries):
-                code = 2
-            executor.spin_once(timeout_sec=0.2)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        with contextlib.suppress(Exception):
-            node.trigger_shutdown()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

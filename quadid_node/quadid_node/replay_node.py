@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import time
+from collections.abc import Callable
 from io import BytesIO
-from types import FrameType
 from typing import Any
 
 import rclpy
@@ -22,6 +21,7 @@ from quadid.errors import QuadidError
 from quadid.window import Recording
 from quadid_node.convert import message_class
 from quadid_node.playback import base_seconds
+from quadid_node.stopping import Stop
 
 QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CHECK_EVERY = 0.1
@@ -43,8 +43,8 @@ class Stopped(Exception):  # noqa: N818 - a signal asked for it, nothing is wron
 class TopicPlayer(TopicWriter):
     """Publishes what a `TopicWriter` would write, each message when its time has come."""
 
-    def __init__(self, node: Node, speed: float, stop: list[int]) -> None:
-        """Publishes through `node` until `stop` is filled, at `speed` times the log's pace; 0: as fast as possible."""
+    def __init__(self, node: Node, speed: float, stop: Callable[[], bool]) -> None:
+        """Publishes through `node` until `stop` says so, at `speed` times the log's pace; 0: as fast as possible."""
         super().__init__(BytesIO())
         self._node, self._speed, self._stop = node, speed, stop
         self._publishers: dict[str, Any] = {}
@@ -75,7 +75,7 @@ class TopicPlayer(TopicWriter):
             self._begin = (now, stamp_ns)
         due = self._begin[0] + ((stamp_ns - self._begin[1]) * 1e-9 / self._speed if self._speed > 0.0 else 0.0)
         while True:
-            if self._stop:
+            if self._stop():
                 raise Stopped
             left = due - time.monotonic()
             if left <= 0.0:
@@ -105,13 +105,7 @@ def parse(args: list[str]) -> argparse.Namespace:
 def main(args: list[str] | None = None) -> int:
     """Plays a log; returns the exit code: 0 done, 2 a log that cannot be read."""
     given = parse(remove_ros_args(args or sys.argv)[1:])
-    stop: list[int] = []
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.append(number)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    stop = Stop()
     try:
         recording = open_log(given.log, given.preset)
     except QuadidError as error:
@@ -128,6 +122,7 @@ def main(args: list[str] | None = None) -> int:
     except Stopped:
         pass
     finally:
+        stop.ignore_more()
         node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from quadid.online.fitting import warm_up
+from quadid.vehicle import Vehicle
 from tests.conftest import absent
 
 HERE = Path(__file__).resolve().parent
@@ -22,6 +24,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group("node"))
             if item.path.stem.startswith("test_ros"):
                 item.add_marker(pytest.mark.ros)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm_kernels() -> None:
+    """Compiles what fits need once: after a change of a kernel every niced fit process would do it for minutes."""
+    warm_up(Vehicle.shipped("pelican"))
 
 
 @pytest.fixture(scope="session")

@@ -80,7 +80,7 @@ def node(history: Path | str, namespace: str = "", **parameters: Any) -> Process
     given = {**QUICK, "history": str(history), **{k.replace("__", "."): v for k, v in parameters.items()}}
     arguments = [a for k, v in given.items() for a in ("-p", f"{k}:={str(v).lower() if isinstance(v, bool) else v}")]
     where = ["-r", f"__ns:=/{namespace}"] if namespace else []
-    return Process(sys.executable, "-m", "quadid_node.node", "--ros-args", *arguments, *where)
+    return Process(sys.executable, "-m", "quadid_node.identify", "--ros-args", *arguments, *where)
 
 
 def player(log: Path, speed: float = 1.0, namespace: str = "", *more: str) -> Process:

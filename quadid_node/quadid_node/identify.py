@@ -1,0 +1,76 @@
+"""`ros2 run quadid_node identify`: runs the node until SIGINT or SIGTERM, which it heeds while it still loads."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+from quadid_node.stopping import Stop
+
+if TYPE_CHECKING:
+    from quadid_node.node import IdentifyNode
+
+SPIN_SECONDS = 0.2
+"""Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
+
+
+class Starter:
+    """Configures and activates a node that has no lifecycle manager."""
+
+    def __init__(self, node: IdentifyNode) -> None:
+        self._node = node
+        self._configured = self._active = self._told = False
+
+    def step(self) -> bool:
+        """Does what can be done now; returns False when the node cannot be configured."""
+        from rclpy.lifecycle import TransitionCallbackReturn
+
+        success = TransitionCallbackReturn.SUCCESS
+        if self._active:
+            return True
+        if not self._configured:
+            self._configured = self._node.trigger_configure() == success
+            return self._configured
+        if self._node.warm:
+            self._active = self._node.trigger_activate() == success
+        elif not self._told:
+            self._told = True
+            self._node.get_logger().info("the fit process is warming up; a first start compiles for a minute or two")
+        return True
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node; returns the exit code: 0 done, 2 bad parameters."""
+    stop = Stop()
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.experimental.events_executor import EventsExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from quadid_node.node import IdentifyNode
+
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node = IdentifyNode(stop)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    code, starter = 0, Starter(node) if node.get_parameter("autostart").value else None
+    try:
+        while not stop() and code == 0:
+            if starter is not None and not starter.step():
+                code = 2
+            executor.spin_once(timeout_sec=SPIN_SECONDS)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        stop.ignore_more()
+        with contextlib.suppress(Exception):
+            node.trigger_shutdown()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,34 @@
+"""SIGINT and SIGTERM: noted from the first moment on, ignored while everything is put away."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """Says whether the process was asked to end."""
+
+    def __init__(self) -> None:
+        """Takes the signals over."""
+        self._asked = False
+        for number in _SIGNALS:
+            signal.signal(number, self._on_signal)
+
+    def __call__(self) -> bool:
+        """True once a signal has come."""
+        return self._asked
+
+    def ignore_more(self) -> None:
+        """Lets further signals change nothing any more.
+
+        `ros2 launch` and impatient people send a second one: it must not interrupt what is being stored, nor the
+        interpreter's own end, in which Python puts the deadly default handlers back for all but ignored signals.
+        """
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
