@@ -1,8 +1,10 @@
 """Does the fit tell the truth?  Errors against the Cramer-Rao bound, coverage of intervals, bias with noise, status.
 
-    python -m studies.truth --seeds 1000 --out docs/results
+    python -m studies.truth --out docs/results
+    python -m studies.truth --parts noise --out docs/results
 
-Each seed is a new individual Pelican, a new 60 s flight with all axes moving, and a poor initial guess.
+Each seed is a new individual Pelican, a new 60 s flight with all axes moving, and a poor initial guess.  A part that is
+run alone replaces its own section of the page and leaves the others.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ from quadid.identify.spectrum import shaped_noise
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
+from studies.page import put_section
 
 FloatArray = NDArray[np.float64]
 SEGMENT = 1.0
+NOISE_SCALES = (0.3, 1.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -117,33 +121,69 @@ def table(outcomes: list[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def main() -> None:
-    """Command line of the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=1000)
-    parser.add_argument("--few", type=int, default=20, help="seeds of the noise and status parts")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", default="")
-    options = parser.parse_args()
-    text = ["# Truth: efficiency, coverage, bias, status", "", f"`python -m studies.truth --seeds {options.seeds}`", ""]
-    main_part = study([(s, "excited", 60.0, 1.0) for s in range(options.seeds)], options.processes)
-    text += [f"## {options.seeds} excited flights of 60 s", "", table(main_part), ""]
-    for scale in (0.3, 3.0):
-        part = study([(10_000 + s, "excited", 60.0, scale) for s in range(options.few)], options.processes)
-        text += [f"## Noise × {scale}, {options.few} flights", "", table(part), ""]
+def excited(seeds: int, processes: int) -> str:
+    """Section on efficiency and coverage."""
+    part = study([(s, "excited", 60.0, 1.0) for s in range(seeds)], processes)
+    return f"## {seeds} excited flights of 60 s\n\n{table(part)}"
+
+
+def noise_levels(seeds: int, processes: int) -> str:
+    """Section on bias: the same vehicles and flights at three noise levels of the sensors.
+
+    In a closed loop the inputs answer the noise, which biases a plain regression more the noisier the sensors are.
+    """
+    text = [f"## Bias with the noise level: {seeds} flights of 60 s, each flown at three noise levels"]
+    parts = {x: study([(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
+    text += ["", "Mean error as a share of the stated standard deviation (± its standard error).", ""]
+    text += ["| parameter | " + " | ".join(f"noise × {x:g}" for x in NOISE_SCALES) + " |"]
+    text += ["|---" * (len(NOISE_SCALES) + 1) + "|"]
+    shares = {x: np.array([o.error / o.sigma for o in part]) for x, part in parts.items()}
+    for j, name in enumerate(NOMINAL_NAMES):
+        cells = [f"{np.mean(z[:, j]):+.3f} ± {np.std(z[:, j]) / np.sqrt(len(z)):.3f}" for z in shares.values()]
+        text.append(f"| {name} | " + " | ".join(cells) + " |")
+    for x, part in parts.items():
+        text += ["", f"### Noise × {x:g}", "", table(part)]
+    return "\n".join(text)
+
+
+def status(seeds: int, processes: int) -> str:
+    """Section on what is claimed where flights do not move enough."""
+    text = []
     for profile in ("hover", "one_axis", "roll_pitch"):
-        part = study([(20_000 + s, profile, 60.0, 1.0) for s in range(options.few)], options.processes)
-        text += [f"## Status, {profile}, {options.few} flights of 60 s", ""]
-        text += ["| parameter | status: flights | bound % |", "|---|---|---|"]
+        part = study([(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes)
+        text += [
+            f"### {profile}, {seeds} flights of 60 s",
+            "",
+            "| parameter | status: flights | bound % |",
+            "|---|---|---|",
+        ]
         for j, name in enumerate(NOMINAL_NAMES):
             names = [o.status[j] for o in part]
             counts = ", ".join(f"{s}: {names.count(s)}" for s in sorted(set(names)))
             text.append(f"| {name} | {counts} | {100 * np.median([o.bound[j] for o in part]):.2f} |")
         text.append("")
-    print("\n".join(text))
-    if options.out:
-        Path(options.out).mkdir(parents=True, exist_ok=True)
-        (Path(options.out) / "truth.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+    return "\n".join(["## Status", "", *text]).rstrip()
+
+
+PARTS = {"excited": excited, "noise": noise_levels, "status": status}
+
+
+def main() -> None:
+    """Command line of the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--seeds", type=int, default=1000, help="flights of the part 'excited'")
+    parser.add_argument("--noise-seeds", type=int, default=200, help="flights a noise level")
+    parser.add_argument("--few", type=int, default=20, help="flights a profile of the part 'status'")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--out", default="")
+    options = parser.parse_args()
+    counts = {"excited": options.seeds, "noise": options.noise_seeds, "status": options.few}
+    for name in options.parts.split(","):
+        text = PARTS[name](counts[name], options.processes)
+        print(text, flush=True)
+        if options.out:
+            put_section(Path(options.out) / "truth.md", "Truth: efficiency, coverage, bias, status", name, text)
 
 
 if __name__ == "__main__":

@@ -124,17 +124,28 @@ def run(
         target: the vehicle file to write.
         advance: told how far the fit is.
     """
-    from quadid.identify.result import fitted_vehicle, identify_result
+    from quadid.identify.result import bound_by_file, fitted_vehicle, identify_result, withheld
     from quadid_cli.output import write_text
 
     begin = time.perf_counter()
     fit = search(optimizer, [w for log in train for w in log.windows], vehicle, seed, advance)
+    fit = bound_by_file(withheld(fit, out_of_reach(train)))
     seconds = time.perf_counter() - begin
     sets = [scored(log, "train", fit) for log in train] + [scored(log, "validate", fit) for log in held]
     text = vehicle_header(train) + fitted_vehicle(fit).to_yaml()
     warnings = [text for log in (*train, *held) for text in log.warnings]
     result = identify_result(fit, optimizer, seed, seconds, sets, str(write_text(target, text)), warnings)
     return Identified(result, fit, sets, [*train, *held])
+
+
+def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
+    """Parameters that no log can tell, because a channel is missing or too slow, each with the reason."""
+    from quadid.inspection.outlook import parameter_outlook
+    from quadid.inspection.timing import channel_facts
+
+    outlooks = [parameter_outlook(channel_facts(log.recording)) for log in logs]
+    each = [{o.parameter: o.reason for o in outlook if not o.possible} for outlook in outlooks]
+    return {name: each[0][name] for name in each[0] if all(name in one for one in each)} if each else {}
 
 
 def scored(log: Log, role: str, fit: Fit) -> ScoredSet:

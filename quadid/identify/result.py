@@ -6,19 +6,23 @@ Numbers stay Python floats; NaN and infinities mean "no answer" and become null 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from quadid.identify.fit import Fit
 from quadid.identify.horizon import QUANTITIES, HorizonScore
 from quadid.identify.score import SetScore
+from quadid.identify.uncertainty import Z95
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status, impossible_inertia
 from quadid.vehicle import ParameterPrior, Vehicle
 
 JsonDict = dict[str, Any]
 
+_UNKNOWN = Status.PRIOR_DOMINATED
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 
@@ -109,6 +113,52 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
     return [
         f"no rigid body has these moments of inertia: {why}; check mass, rotor positions and units in the vehicle file"
     ]
+
+
+def withheld(fit: Fit, reasons: Mapping[str, str]) -> Fit:
+    """The fit without what these data cannot tell: such parameters keep the vehicle file's value and say nothing.
+
+    Args:
+        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
+        reasons: why, by parameter, in words.
+
+    Returns:
+        The fit with the status ``prior_dominated``, the prior's interval and a warning for every name in `reasons`.
+    """
+    names = [n for n in fit.parameters.names if n in reasons]
+    if not names:
+        return fit
+    layout = Layout(fit.vehicle)
+    theta, covariance = fit.theta.copy(), np.array(fit.parameters.covariance)
+    rows = []
+    for j, p in enumerate(fit.parameters):
+        if p.name in reasons:
+            spread = float(fit.uncertainty.prior_sigma[j])
+            theta[layout.entry(p.name).index] = p.initial
+            covariance[j, :], covariance[:, j] = 0.0, 0.0
+            covariance[j, j] = (spread * p.initial) ** 2
+            ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
+            p = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, status=_UNKNOWN)
+        rows.append(p)
+    why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
+    told = [f"{who}: the vehicle file's values stand, because {reason}" for reason, who in why.items() if who]
+    kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
+    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*told, *kept))
+
+
+def bound_by_file(fit: Fit) -> Fit:
+    """The fit with ``prior_dominated`` for every parameter that rests on a bound: that value is the file's, not data's.
+
+    The data may well push against the bound; the fit's warnings name it.
+    """
+
+    def honest(p: Parameter) -> Parameter:
+        low, high = p.bounds
+        inside = low * (1.0 + 1e-9) < p.value < high * (1.0 - 1e-9)
+        return p if inside or p.name not in NOMINAL_NAMES else replace(p, status=_UNKNOWN, relative_to=None)
+
+    parameters = ParameterSet(tuple(honest(p) for p in fit.parameters), np.array(fit.parameters.covariance))
+    return replace(fit, parameters=parameters)
 
 
 def answered(parameters: ParameterSet) -> bool:

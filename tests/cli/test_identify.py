@@ -162,3 +162,32 @@ def test_no_velocity_needed_for_rates(inside: Cli, flights: Flights, tmp_path: P
         "velocity": None,
         "rotation": None,
     }
+
+
+def test_a_rotor_signal_too_slow_for_inertias_tells_thrust_alone(inside: Cli, data_dir: Path, tmp_path: Path) -> None:
+    """Ten motor commands a second: thrust yes, inertia no."""
+    vehicle = Path(__file__).parents[2] / "studies" / "vehicles" / "ascend.yaml"
+    log = data_dir / "px4" / "ascend_cubeorange_test.ulg"
+    run = inside("identify", log, "--vehicle", vehicle, "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+    status = {p["name"]: p["status"] for p in run.data["parameters"]}
+    assert status.pop("b") == "identified"
+    assert set(status.values()) == {"prior_dominated"}
+    for p in run.data["parameters"][1:]:
+        assert p["value"] == p["initial"]
+        assert p["ci95"][0] < 0.5 * p["value"]
+    assert any("d, J_xx, J_yy, J_zz, J_r: the vehicle file's values stand" in w for w in run.data["warnings"])
+    assert "rotor signal at 10 Hz is too slow, 30 Hz needed" in run.err
+
+
+def test_what_rests_on_a_bound_is_not_identified(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    pelican = Vehicle.shipped("pelican")
+    narrow = {**pelican.parameters}
+    value = 3.0 * flights.train_flight.truth.parameters.as_dict()["J_xx"]
+    narrow["J_xx"] = narrow["J_xx"].model_copy(update={"initial": value, "bounds": (0.7 * value, 1.5 * value)})
+    file = tmp_path / "narrow.yaml"
+    file.write_text(pelican.model_copy(update={"parameters": narrow}).to_yaml(), encoding="utf-8")
+    run = inside("identify", flights.train, "--vehicle", file, "--out", tmp_path, "--json", "-")
+    by_name = {p["name"]: p for p in run.data["parameters"]}
+    assert by_name["J_xx"]["status"] == "prior_dominated"
+    assert any(w.startswith("J_xx = ") and "rests on its bound" in w for w in run.data["warnings"])
