@@ -2,13 +2,14 @@
 
 The rules of resampling are those of logs (`quadid.tracks`): no lag is invented, gaps are not bridged.  Rows leave in
 blocks once every channel had `SETTLE` seconds to arrive, so the order in which messages of different topics come in
-changes nothing.
+changes nothing.  Which samples a block is made of is settled when samples arrive, not when somebody asks for rows: a
+fit that keeps the reader busy changes nothing either, not even for samples that come later than that.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,6 +57,21 @@ class Rows:
     problem: str = ""
 
 
+@dataclass(frozen=True)
+class _Due:
+    """What became possible at one moment: a block of rows, or a new beginning of the stream.
+
+    Attributes:
+        first: first point of the grid [s].
+        row: number of the block's first row; -1: a new beginning.
+        arrived: samples that had come by then, by line.
+    """
+
+    first: float
+    row: int
+    arrived: tuple[int, ...]
+
+
 class _Line:
     """Samples of one channel, sorted by time."""
 
@@ -64,13 +80,27 @@ class _Line:
         self.values = np.empty((0, columns))
         self.waiting_t: list[float] = []
         self.waiting: list[tuple[float, ...]] = []
+        self.arrived = 0
 
-    def settle(self, oldest: float) -> tuple[int, int]:
-        """Sorts waiting samples in; returns how many were too late (before `oldest`) and how many were duplicates."""
-        if not self.waiting_t:
+    def add(self, t: float, values: tuple[float, ...]) -> None:
+        """Takes a sample in the order of arrival."""
+        self.waiting_t.append(t)
+        self.waiting.append(values)
+        self.arrived += 1
+
+    def restart(self, arrived: int) -> None:
+        """Drops the first `arrived` samples that ever came."""
+        count = self._count(arrived)
+        del self.waiting_t[:count], self.waiting[:count]
+        self.t, self.values = self.t[:0], self.values[:0]
+
+    def settle(self, oldest: float, arrived: int) -> tuple[int, int]:
+        """Sorts in what is among the first `arrived` samples; returns how many of them were too late and doubles."""
+        count = self._count(arrived)
+        if not count:
             return 0, 0
-        t, values = np.array(self.waiting_t), np.array(self.waiting)
-        self.waiting_t, self.waiting = [], []
+        t, values = np.array(self.waiting_t[:count]), np.array(self.waiting[:count])
+        del self.waiting_t[:count], self.waiting[:count]
         in_time = t >= oldest
         late = len(t) - int(np.count_nonzero(in_time))
         t, values = np.concatenate([self.t, t[in_time]]), np.concatenate([self.values, values[in_time]])
@@ -84,6 +114,10 @@ class _Line:
             t, values = t[keep], values[keep]
         self.t, self.values = t, values
         return late, doubles
+
+    def _count(self, arrived: int) -> int:
+        """Waiting samples among the first `arrived`."""
+        return len(self.waiting) - (self.arrived - arrived)
 
     def forget(self, before: float) -> None:
         """Drops samples before a time [s]."""
@@ -121,7 +155,9 @@ class Buffer:
         rotors = len(vehicle.rotors)
         self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
         self._lines = {name: _Line(count) for name, count in self._columns.items()}
-        self._anchor: float | None = None
+        self._due: deque[_Due] = deque()
+        self._first = math.inf
+        self._next = math.nan
         self._row = 0
         self._steps_seen = 0
         self._fresh = True
@@ -150,52 +186,66 @@ class Buffer:
         if len(line.waiting_t) >= MOST_SAMPLES:
             self.faults[f"{name}: flood"] += 1
             return
-        line.waiting_t.append(t)
-        line.waiting.append(values)
+        self._advance(name, t)
+        line.add(t, values)
+        self._note_due()
         self.counts[name] += 1
         if t > self.last.get(name, -math.inf):
             self.last[name] = t
 
     def next_rows(self) -> Rows | None:
         """The next block of rows, or None until enough has arrived."""
+        while self._due:
+            due = self._due.popleft()
+            if due.row < 0:
+                self._fresh = True
+                for line, arrived in zip(self._lines.values(), due.arrived, strict=True):
+                    line.restart(arrived)
+                continue
+            at: FloatArray = due.first + self._step * np.arange(due.row, due.row + BLOCK, dtype=np.float64)
+            self._settle(float(at[0]), due.arrived)
+            rows = self._grid(at)
+            self._fresh = False
+            for line in self._lines.values():
+                line.forget(float(at[0]) - HISTORY)
+            return rows
+        return None
+
+    def _advance(self, name: str, t: float) -> None:
+        """Begins anew after a step of the clock; finds the first gyro sample, on which the first grid point is put.
+
+        A log that is on the grid then passes bit for bit.
+        """
         if len(self.time.steps) > self._steps_seen:
             self._steps_seen = len(self.time.steps)
-            self._restart(self.time.steps[-1])
-        if self._anchor is None and not self._set_anchor():
-            return None
-        assert self._anchor is not None
-        at: FloatArray = self._anchor + self._step * np.arange(self._row, self._row + BLOCK, dtype=np.float64)
-        if self.time.newest < at[-1] + SETTLE:
-            return None
-        self._settle(float(at[0]))
-        rows = self._grid(at)
-        self._row += BLOCK
-        self._fresh = False
-        for line in self._lines.values():
-            line.forget(float(at[0]) - HISTORY)
-        return rows
+            self._first, self._next = math.inf, math.nan
+            self._due.append(_Due(self.time.steps[-1], -1, self._arrived()))
+        if math.isnan(self._next) and name == "gyro" and t < self._first:
+            self._first = t
 
-    def _restart(self, start: float) -> None:
-        """Begins anew after a step of the clock: samples before it are done with."""
-        self._anchor, self._row, self._fresh = None, 0, True
-        for line in self._lines.values():
-            first = next((i for i, t in enumerate(line.waiting_t) if t >= start), len(line.waiting_t))
-            del line.waiting_t[:first], line.waiting[:first]
-            line.t, line.values = line.t[:0], line.values[:0]
+    def _note_due(self) -> None:
+        """Notes the blocks of rows that can be made of what has arrived."""
+        if math.isnan(self._next):
+            if self.time.newest < self._first + SETTLE:
+                return
+            self._row = 0
+            self._next = self._last_row_settled()
+        while self.time.newest >= self._next:
+            self._due.append(_Due(self._first, self._row, self._arrived()))
+            self._row += BLOCK
+            self._next = self._last_row_settled()
 
-    def _set_anchor(self) -> bool:
-        """Puts the first grid point on the first sample of the gyro, so that a log on the grid passes bit for bit."""
-        if not self.time.newest > -math.inf or not self._lines["gyro"].waiting_t:
-            return False
-        first = min(self._lines["gyro"].waiting_t)
-        if self.time.newest < first + SETTLE:
-            return False
-        self._anchor, self._row = first, 0
-        return True
+    def _last_row_settled(self) -> float:
+        """When the next block may leave [s]."""
+        return self._first + self._step * (self._row + BLOCK - 1) + SETTLE
 
-    def _settle(self, start: float) -> None:
-        for name, line in self._lines.items():
-            late, doubles = line.settle(start - HISTORY if self._fresh else start - SETTLE)
+    def _arrived(self) -> tuple[int, ...]:
+        return tuple(line.arrived for line in self._lines.values())
+
+    def _settle(self, start: float, arrived: tuple[int, ...]) -> None:
+        oldest = start - HISTORY if self._fresh else start - SETTLE
+        for (name, line), count in zip(self._lines.items(), arrived, strict=True):
+            late, doubles = line.settle(oldest, count)
             if late:
                 self.faults[f"{name}: late"] += late
             if doubles:

@@ -79,6 +79,31 @@ def test_order_of_arrival_changes_nothing(seed: int, delay: float) -> None:
     assert not buffer.faults
 
 
+@given(st.integers(0, 2**32), st.sampled_from([1, 7, 50, 10_000]))
+@settings(max_examples=12, deadline=None)
+def test_when_rows_are_asked_for_changes_nothing_not_even_for_late_samples_and_a_reboot(seed: int, every: int) -> None:
+    rng = np.random.default_rng(seed)
+    first = samples(flight(4.0).recording, 100.0)
+    delay = {name: rng.uniform(0.0, 1.2) for name in ("attitude", "rotor_speed", "accel")}  # beyond SETTLE as well
+    arrived = sorted(first, key=lambda s: s.t + delay.get(s.channel, 0.0) + rng.exponential(0.05))
+    arrived += samples(flight(4.0).recording, 3.0)
+    prompt, seen = run(arrived)
+    lazy = Buffer(PELICAN)
+    rows: list[Rows] = []
+    for k, sample in enumerate(arrived):
+        lazy.push(sample)
+        if k % every == 0:
+            rows += taken(lazy)
+    rows += taken(lazy)
+    assert same(rows, prompt)
+    assert lazy.faults == seen.faults
+    assert any(r.fresh for r in rows[1:])
+
+
+def taken(buffer: Buffer) -> list[Rows]:
+    return list(iter(buffer.next_rows, None))
+
+
 def test_duplicates_are_dropped_and_counted() -> None:
     stream = samples(flight(4.0).recording)
     doubled = [s for sample in stream for s in (sample, sample)]
