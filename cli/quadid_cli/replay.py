@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,9 +14,10 @@ from quadid_cli.options import JsonTarget, Preset, Seed, VehicleName
 
 if TYPE_CHECKING:
     from quadid_node.messages import Clock
+    from quadid_node.recorder import Beginning
     from quadid_node.service import Output, Service
 
-    from quadid.window import Recording
+    from quadid.window import Recording, Sample
     from quadid_cli.terminal import Advance
 
 BATCH = 200
@@ -44,6 +45,14 @@ def replay(
         str,
         typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05; see docs/online.md."),
     ] = "",
+    as_recorded: Annotated[
+        bool,
+        typer.Option(
+            "--as-recorded",
+            help="LOG was recorded by the node (record:=F.mcap): its settings, its start, its order of arrival; "
+            "gives the numbers of that run bit for bit.",
+        ),
+    ] = False,
     candidates: Annotated[
         bool, typer.Option("--candidates", help="Every estimate in the JSON, not only sets.")
     ] = False,
@@ -53,6 +62,7 @@ def replay(
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
     from quadid_node.messages import Clock
+    from quadid_node.playback import arrivals, stream
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
@@ -67,10 +77,17 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(rate=rate, window=window, refit=refit, approval=approval, seed=seed, **asked)
-    recording = open_log(log, preset)
-    service, clock = Service(described, settings, InlineWorker()), Clock()
+    recording, clock = open_log(log, preset), Clock()
+    if as_recorded:
+        beginning = _beginning(Path(log), described.name)
+        described = beginning.vehicle
+        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored)
+        samples = arrivals(Path(log), beginning.source, len(described.rotors), clock)
+    else:
+        service = Service(described, settings, InlineWorker())
+        samples = stream(recording, clock)
     with terminal.progress() as advance:
-        outputs = play(recording, service, clock, pace, advance)
+        outputs = play(recording, samples, service, pace, advance)
     result = summary(recording, service, outputs, clock, candidates)
     if out is not None:
         write_outputs(out, outputs, described.name, clock)
@@ -93,25 +110,37 @@ def _pace(speed: str) -> float:
     return pace
 
 
-def play(recording: Recording, service: Service, clock: Clock, pace: float, advance: Advance) -> list[Output]:
+def _beginning(log: Path, vehicle: str) -> Beginning:
+    """What the session of a node's recording began with; raises ReplayError when there is none, or of another one."""
+    from quadid_node.recorder import read_beginning
+
+    found = read_beginning(log)
+    if found is None:
+        raise ReplayError(f"{log.name} was not recorded by the node", fix="leave --as-recorded out")
+    if found.vehicle.name != vehicle:
+        raise ReplayError(f"{log.name} was recorded of '{found.vehicle.name}', not '{vehicle}'", fix="change --vehicle")
+    return found
+
+
+def play(
+    recording: Recording, samples: Iterable[Sample], service: Service, pace: float, advance: Advance
+) -> list[Output]:
     """Plays a recording into a service.
 
     Args:
         recording: the log.
+        samples: its samples, in the order to play them.
         service: with an inline worker.
-        clock: of the stamps.
         pace: factor of real time; 0 for as fast as possible.
         advance: told how far it is.
 
     Returns:
         Everything the service put out, in order.
     """
-    from quadid_node.playback import stream
-
     total = sum(len(c.t) for c in recording.channels.values())
     outputs: list[Output] = []
     begin = first = None
-    for count, sample in enumerate(stream(recording, clock)):
+    for count, sample in enumerate(samples):
         if pace > 0.0:
             if begin is None or first is None:
                 begin, first = time.monotonic(), sample.t

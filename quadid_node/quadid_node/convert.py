@@ -43,6 +43,14 @@ def message_class(name: str) -> Any:
         raise MessageTypeError(f"message type {name} cannot be used ({error})", fix=fix) from error
 
 
+def deserializer(name: str) -> Callable[[bytes], Any]:
+    """ROS' own decoder of ``package/Type``; raises MessageTypeError."""
+    from rclpy.serialization import deserialize_message
+
+    cls = message_class(name)
+    return lambda data: deserialize_message(data, cls)
+
+
 class Decoder:
     """Turns the serialized messages of one topic into samples.
 
@@ -50,7 +58,9 @@ class Decoder:
         failed: messages that could not be decoded.
     """
 
-    def __init__(self, entry: Input, clock: Clock, chooser: Chooser, rotors: int) -> None:
+    def __init__(
+        self, entry: Input, clock: Clock, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any]
+    ) -> None:  # fmt: skip
         """Prepares for one input.
 
         Args:
@@ -58,18 +68,13 @@ class Decoder:
             clock: of the stamps.
             chooser: shared by all topics.
             rotors: number of rotors; surplus motor outputs are left out.
+            decode: serialized bytes to a message of the type; see `deserializer`.
         """
-        from rclpy.serialization import deserialize_message
-
         kind = TYPES[entry.type]
-        cls = message_class(entry.type)
         self._signals: Callable[[Blocks, Any], Signals] = kind.signals
         self._ranks = dict(entry.channels)
         self._clock, self._chooser, self._rotors = clock, chooser, rotors
         self.failed = 0
-
-        def decode(data: bytes) -> Any:
-            return deserialize_message(data, cls)
 
         if kind.stamp is None:
             self._read = BlockReader(decode, kind.blocks, kind.extra).read

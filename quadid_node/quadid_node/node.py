@@ -23,9 +23,10 @@ from quadid.online import Diagnosed, Event, Publish
 from quadid.online.ledger import Answer
 from quadid_node import messages
 from quadid_node.chooser import Chooser
-from quadid_node.convert import Decoder, best_ranks, message_class, to_message
+from quadid_node.convert import Decoder, best_ranks, deserializer, message_class, to_message
 from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, read_vehicle, vehicle_id
-from quadid_node.presets import Source, source
+from quadid_node.presets import Input, Source, source
+from quadid_node.recorder import Beginning, Recorder
 from quadid_node.service import Output, Service
 from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker
@@ -56,6 +57,7 @@ class IdentifyNode(LifecycleNode):
             self.declare_parameter(p.name, p.default, _descriptor(p.default, p.description, p.span))
         self.add_on_set_parameters_callback(self._on_set)
         self._service: Service | None = None
+        self._recorder: Recorder | None = None
         self._decoders: dict[str, Decoder] = {}
         self._notes: dict[str, str] = {}
         self._paused = False
@@ -119,6 +121,9 @@ class IdentifyNode(LifecycleNode):
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
         worker = ProcessWorker(vehicle, values["worker_memory"])
         self._service = Service(vehicle, settings, worker, store)
+        if values["record"]:
+            beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
+            self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
         self._hint = preset.motor_hint
         self._offer()
         deadline = time.monotonic() + WARM_UP_SECONDS
@@ -129,14 +134,15 @@ class IdentifyNode(LifecycleNode):
     def _subscribe(self, preset: Source, rotors: int) -> None:
         chooser = Chooser(best_ranks(preset.inputs))
         for entry in preset.inputs:
-            decoder = Decoder(entry, self._stamps, chooser, rotors)
+            decoder = Decoder(entry, self._stamps, chooser, rotors, deserializer(entry.type))
             topic = self.resolve_topic_name(entry.topic)
             events = SubscriptionEventCallbacks(
                 incompatible_qos=lambda event, t=topic: self._note(t, "its publisher's QoS does not match"),
                 incompatible_type=lambda event, t=topic: self._note(t, "its publisher uses another message type"),
             )
             subscription = self.create_subscription(
-                message_class(entry.type), entry.topic, lambda data, d=decoder: self._on_message(d, data), SENSOR_QOS,
+                message_class(entry.type), entry.topic, lambda data, d=decoder, e=entry: self._on_message(d, e, data),
+                SENSOR_QOS,
                 event_callbacks=events, raw=True,
             )  # fmt: skip
             self._decoders[topic] = decoder
@@ -168,11 +174,16 @@ class IdentifyNode(LifecycleNode):
         if self._service is not None:
             self._service.close()
             self._service = None
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None
 
     # --- callbacks
 
-    def _on_message(self, decoder: Decoder, data: bytes) -> None:
+    def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
         if self._active and not self._paused and self._service is not None:
+            if self._recorder is not None:
+                self._recorder.take(entry.topic, entry.type.replace("/", "/msg/"), data)
             for sample in decoder.samples(data):
                 self._service.push(sample)
 

@@ -1,14 +1,25 @@
-"""A log as the stream that it once was: samples in time order, with the stamps a live service would have seen."""
+"""A log as the stream that it once was, with the stamps a live service would have seen.
+
+Logs in general are played in time order; a recording of the node itself in the order in which the messages came.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+from mcap_ros2._dynamic import generate_dynamic
+from quadid_replay.mcap_messages import type_name
+from quadid_replay.mcap_records import McapFile
 
+from quadid.errors import LogError
 from quadid.window import Recording, Sample
+from quadid_node.chooser import Chooser
+from quadid_node.convert import Decoder, best_ranks
 from quadid_node.messages import Clock
+from quadid_node.presets import source
 
 _BASE = re.compile(r"times count from UNIX time (\d+) s")
 
@@ -40,3 +51,33 @@ def stream(recording: Recording, clock: Clock) -> Iterator[Sample]:
         channel = recording.channels[names[i]]
         ns = round(float(channel.t[row]) * 1e9) + base
         yield Sample(clock.seconds(ns), names[i], tuple(channel.values[row].tolist()))
+
+
+def arrivals(path: Path, preset: str, rotors: int, clock: Clock) -> Iterator[Sample]:
+    """Yields the samples of a node's recording as the node's session got them: the same numbers in the same order.
+
+    Args:
+        path: the recording.
+        preset: whose topic names and types it holds.
+        rotors: of the vehicle.
+        clock: of the stamps.
+
+    Raises:
+        LogError: a message definition that cannot be used.
+    """
+    file, inputs = McapFile(path), source(preset).inputs
+    chooser = Chooser(best_ranks(inputs))
+    decoders = {}
+    for number, topic in file.topics.items():
+        entry = next((e for e in inputs if e.topic == topic.name and e.type == type_name(topic.type)), None)
+        if entry is None:
+            continue
+        try:
+            decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+        except Exception as error:
+            raise LogError(
+                f"{path.name}: the definition of {topic.type} is damaged ({type(error).__name__})"
+            ) from error
+        decoders[number] = Decoder(entry, clock, chooser, rotors, decode)
+    for number, _, data in file.messages(decoders.keys()):
+        yield from decoders[number].samples(data)

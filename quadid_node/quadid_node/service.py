@@ -57,12 +57,13 @@ class Service:
 
     Attributes:
         vehicle: as given.
+        restored: what an earlier run had left.
         session: the session.
     """
 
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings, worker: Worker, store: Store | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = time.monotonic, restored: Restored | None = None,
     ) -> None:  # fmt: skip
         """Starts where the last run of this vehicle ended.
 
@@ -72,9 +73,11 @@ class Service:
             worker: does the fits.
             store: history; None for none.
             clock: seconds, monotonic; only rates and silences are measured with it.
+            restored: what an earlier run had left; default: what the history says.
         """
-        restored = store.restore() if store is not None else Restored(None, 1)
-        self.vehicle = vehicle
+        if restored is None:
+            restored = store.restore() if store is not None else Restored(None, 1)
+        self.vehicle, self.restored = vehicle, restored
         self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
         self._worker, self._store, self._clock = worker, store, clock
         self._arrived: dict[str, float] = {}

@@ -23,12 +23,13 @@ class TopicWriter:
 
     Args:
         file: path, or a binary stream that stays open.
+        metadata: records by name, for `quadid_replay.mcap_metadata`; they stand at the beginning.
 
     Raises:
         LogError: the file cannot be written.
     """
 
-    def __init__(self, file: str | Path | BinaryIO) -> None:
+    def __init__(self, file: str | Path | BinaryIO, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
         self._owned = open_for_writing(file) if isinstance(file, str | Path) else None
         self._writer = Writer(
             self._owned or file,  # type: ignore[arg-type]
@@ -37,6 +38,9 @@ class TopicWriter:
             enable_crcs=True,
         )
         self._writer.start(profile="ros2", library="quadid")
+        for name, data in (metadata or {}).items():
+            self._writer.add_metadata(name, dict(data))
+        self._definitions: dict[str, str] = {}
         self._encoders: dict[str, Callable[[Any], bytes]] = {}
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -73,6 +77,10 @@ class TopicWriter:
         self._sequence[channel] = sequence + 1
         self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
 
+    def define(self, kind: str, text: str) -> None:
+        """Gives the definition of a type that `quadid_replay.schemas` does not hold (form ros2msg)."""
+        self._definitions[kind] = text
+
     def encoder(self, kind: str) -> Callable[[Any], bytes]:
         """Returns the function that makes CDR of a message of this type."""
         if kind not in self._encoders:
@@ -93,7 +101,8 @@ class TopicWriter:
 
     def _schema(self, kind: str) -> int:
         if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", _definition(kind).encode())
+            text = self._definitions.get(kind) or _definition(kind)
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
         return self._schemas[kind]
 
     def __enter__(self) -> TopicWriter:

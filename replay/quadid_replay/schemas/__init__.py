@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import lru_cache
 from importlib import resources
 
@@ -34,11 +35,16 @@ def schema_text(name: str) -> str:
     Raises:
         KeyError: no such definition here.
     """
+    return whole_text(name, _definition)
+
+
+def whole_text(name: str, read: Callable[[str, str], str]) -> str:
+    """Definition of a message and of all it depends on; `read` gives the text of one by package and type."""
     parts: list[str] = []
     waiting, seen = [_split(name)], {_split(name)}
     while waiting:
         package, kind = waiting.pop(0)
-        text = _definition(package, kind)
+        text = read(package, kind)
         parts.append(text if not parts else f"{_RULE}\nMSG: {package}/{kind}\n{text}")
         for line in text.splitlines():
             match = _FIELD.match(line)

@@ -1,0 +1,108 @@
+"""Records what the node takes in, so that a replay repeats the run bit for bit.
+
+Other recorders hear a stream of their own: DDS may lose a message on the way to them and not on the way here, and their
+order of arrival is another.  This one writes the messages that the session was given, in that order, and in front of
+them what the session began with.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from quadid_replay import TopicWriter
+from quadid_replay.mcap_metadata import read_metadata
+from quadid_replay.schemas import has_definition, whole_text
+
+from quadid.errors import LogError, QuadidError
+from quadid.online import OnlineSet, SessionSettings
+from quadid.vehicle import Vehicle
+from quadid_node.codec import set_from_dict, set_to_dict
+from quadid_node.presets import Input
+from quadid_node.store import Restored
+
+RECORD = "quadid.session"
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a session began with: vehicle, settings, preset of its topics, and what an earlier run had left."""
+
+    vehicle: Vehicle
+    settings: SessionSettings
+    source: str
+    restored: Restored
+
+
+class Recorder:
+    """An MCAP file of what arrives."""
+
+    def __init__(self, path: Path, beginning: Beginning, inputs: Sequence[Input]) -> None:
+        """Begins a recording of `inputs`; raises LogError when it cannot be written or a type has no definition."""
+        self._writer = TopicWriter(path, {RECORD: _to_strings(beginning)})
+        self._last = 0
+        for entry in inputs:
+            kind = entry.type.replace("/", "/msg/")
+            if not has_definition(kind):
+                self._writer.define(kind, whole_text(kind, installed_definition))
+
+    def take(self, topic: str, kind: str, data: bytes) -> None:
+        """Writes a message; its log time never runs back, so that every reader keeps the order of arrival."""
+        self._last = max(time.time_ns(), self._last + 1)
+        self._writer.write_cdr(topic, kind, data, self._last)
+
+    def close(self) -> None:
+        """Writes the end of the file."""
+        self._writer.close()
+
+
+def installed_definition(package: str, kind: str) -> str:
+    """Text of a message definition of an installed ROS package; raises LogError when there is none."""
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        text = (Path(get_package_share_directory(package)) / "msg" / f"{kind}.msg").read_text(encoding="utf-8")
+    except (PackageNotFoundError, OSError, UnicodeDecodeError) as error:
+        fix = f"install the package {package} with its .msg files"
+        raise LogError(f"no definition of {package}/{kind} to record", fix=fix) from error
+    return text if text.endswith("\n") else text + "\n"
+
+
+def read_beginning(path: Path) -> Beginning | None:
+    """What the session of a recording began with; None for a file that no `Recorder` wrote.
+
+    Raises:
+        LogError: its record is damaged.
+    """
+    found = read_metadata(path).get(RECORD)
+    if found is None:
+        return None
+    try:
+        left = json.loads(found["restored"])
+        restored = Restored(_set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]))
+        settings = SessionSettings.model_validate_json(found["settings"])
+        return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
+    except (KeyError, TypeError, ValueError, QuadidError) as error:
+        raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error
+
+
+def _to_strings(beginning: Beginning) -> Mapping[str, str]:
+    left = beginning.restored
+    restored = {
+        "item": set_to_dict(left.item) if left.item is not None else None,
+        "next_sequence": left.next_sequence,
+        "baseline": set_to_dict(left.baseline) if left.baseline is not None else None,
+    }
+    return {
+        "vehicle": beginning.vehicle.to_yaml(),
+        "settings": beginning.settings.model_dump_json(),
+        "source": beginning.source,
+        "restored": json.dumps(restored),
+    }
+
+
+def _set(data: object) -> OnlineSet | None:
+    return set_from_dict(data) if isinstance(data, Mapping) else None

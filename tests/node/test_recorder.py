@@ -1,0 +1,84 @@
+"""A node's own recording: what it begins with comes back exactly, and messages come back in the order of arrival."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quadid_node.messages import Clock
+from quadid_node.playback import arrivals, stream
+from quadid_node.presets import source
+from quadid_node.recorder import RECORD, Beginning, Recorder, read_beginning
+from quadid_node.store import Restored
+from quadid_replay import TopicWriter, open_log, write_mcap
+from quadid_replay.mcap_metadata import read_metadata
+from quadid_replay.mcap_records import McapFile
+
+from quadid.errors import LogError
+from quadid.online import SessionSettings
+from quadid.vehicle import Vehicle
+from tests.online.driving import flight
+from tests.online.test_gate import TRUE, online_set
+
+PELICAN = Vehicle.shipped("pelican")
+INPUTS = source("canonical").inputs
+EPOCH_NS = 1_700_000_000 * 10**9
+
+
+def beginning() -> Beginning:
+    last = replace(online_set(TRUE), sequence=4)
+    return Beginning(PELICAN, SessionSettings(window=5.0, seed=7), "canonical", Restored(last, 5, last))
+
+
+def messages(path: Path) -> list[tuple[str, str, bytes]]:
+    file = McapFile(path)
+    topics = file.topics
+    return [(topics[n].name, topics[n].type, data) for n, _, data in file.messages(topics.keys())]
+
+
+def test_what_a_session_began_with_comes_back_exactly(tmp_path: Path) -> None:
+    path, written = tmp_path / "r.mcap", beginning()
+    Recorder(path, written, INPUTS).close()
+    found = read_beginning(path)
+    assert found is not None
+    assert (found.vehicle, found.settings, found.source) == (written.vehicle, written.settings, written.source)
+    assert found.restored.next_sequence == 5
+    assert found.restored.item is not None
+    assert written.restored.item is not None
+    assert [p.value for p in found.restored.item.parameters] == [p.value for p in written.restored.item.parameters]
+    assert np.array_equal(found.restored.item.parameters.covariance, written.restored.item.parameters.covariance), (
+        "to the last bit"
+    )
+
+
+def test_messages_come_back_in_the_order_of_arrival(tmp_path: Path) -> None:
+    log, path = tmp_path / "log.mcap", tmp_path / "r.mcap"
+    write_mcap(log, flight(4.0).recording, EPOCH_NS)
+    rng = np.random.default_rng(1)
+    given = messages(log)
+    shuffled = [given[i] for i in np.argsort(np.arange(len(given)) + rng.uniform(0.0, 60.0, len(given)))]
+    recorder = Recorder(path, beginning(), INPUTS)
+    for topic, kind, data in shuffled:
+        recorder.take(topic, kind, data)
+    recorder.close()
+    assert messages(path) == shuffled
+    clock = Clock()
+    got = list(arrivals(path, "canonical", 4, clock))
+    sorted_ones = list(stream(open_log(str(log)), Clock()))
+    assert sorted(got, key=lambda s: (s.channel, s.t)) == sorted(sorted_ones, key=lambda s: (s.channel, s.t))
+    assert got != sorted(got, key=lambda s: s.t)
+
+
+def test_other_files_have_no_beginning_and_damage_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "plain.mcap"
+    write_mcap(path, flight(4.0).recording)
+    assert read_beginning(path) is None
+    assert read_metadata(path) == {}
+    (tmp_path / "no.mcap").write_bytes(b"no MCAP")
+    assert read_beginning(tmp_path / "no.mcap") is None
+    with TopicWriter(path, {RECORD: {"vehicle": "x"}}):
+        pass
+    with pytest.raises(LogError, match="cannot be read"):
+        read_beginning(path)
