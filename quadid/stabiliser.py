@@ -92,6 +92,56 @@ def rotation_of(roll: float, pitch: float, yaw: float, out: FloatArray) -> None:
 
 
 @_kernel
+def steer(
+    gains: FloatArray,
+    mixer: FloatArray,
+    wanted: FloatArray,
+    throttle: float,
+    attitude: FloatArray,
+    rate: FloatArray,
+    dt: float,
+    integral: FloatArray,
+    torque: FloatArray,
+    command: FloatArray,
+) -> None:
+    """One step of the stabiliser towards a wanted rotation matrix, in place; spares the caller's inner loop memory.
+
+    Args:
+        gains: `pack_gains`.
+        mixer: `mixer_matrix`.
+        wanted: rotation matrix, body to world, shape (3, 3).
+        throttle: 0..1 (fraction of the thrust at `max_speed`).
+        attitude: measured rotation matrix, body to world, shape (3, 3).
+        rate: measured body rates [rad/s].
+        dt: time since the last step [s].
+        integral: integral torques [N m], shape (3,); updated.
+        torque: torques [N m], shape (3,); written.
+        command: rotor speeds [rad/s], shape (n,); written.
+    """
+    rotors = mixer.shape[0]
+    ceiling = gains[MAX_SPEED] * gains[MAX_SPEED]
+    floor = gains[MIN_SPEED] * gains[MIN_SPEED]
+    thrust = throttle * ceiling * gains[THRUST_COEFFICIENT] * rotors
+    for axis in range(3):
+        # rotation error in body axes: half the vee of R'Rd - Rd'R
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        error = 0.0
+        for k in range(3):
+            error += 0.5 * (attitude[k, j] * wanted[k, i] - attitude[k, i] * wanted[k, j])
+        limit = gains[YAW_LIMIT] if axis == 2 else gains[TILT_LIMIT]
+        wish = min(max(gains[ROLL_P + axis] * error, -limit), limit)
+        miss = wish - rate[axis]
+        # against wind-up: enough for any trim, such as a weak rotor or a CG off centre
+        bound = gains[YAW_TORQUE] if axis == 2 else 4.0 * gains[ROLL_RATE_P + axis]
+        integral[axis] = min(max(integral[axis] + gains[ROLL_RATE_I + axis] * miss * dt, -bound), bound)
+        torque[axis] = gains[ROLL_RATE_P + axis] * miss + integral[axis]
+    torque[2] = min(max(torque[2], -gains[YAW_TORQUE]), gains[YAW_TORQUE])
+    for i in range(rotors):
+        square = mixer[i, 0] * thrust + mixer[i, 1] * torque[0] + mixer[i, 2] * torque[1] + mixer[i, 3] * torque[2]
+        command[i] = np.sqrt(min(max(square, floor), ceiling))
+
+
+@_kernel
 def stabilise(
     gains: FloatArray,
     mixer: FloatArray,
@@ -114,30 +164,9 @@ def stabilise(
         integral: integral torques [N m], shape (3,); updated.
         command: rotor speeds [rad/s], shape (n,); written.
     """
-    wanted = np.empty((3, 3))
+    wanted, torque = np.empty((3, 3)), np.empty(3)
     rotation_of(reference[0], reference[1], reference[2], wanted)
-    rotors = mixer.shape[0]
-    ceiling = gains[MAX_SPEED] * gains[MAX_SPEED]
-    floor = gains[MIN_SPEED] * gains[MIN_SPEED]
-    thrust = reference[3] * ceiling * gains[THRUST_COEFFICIENT] * rotors
-    torque = np.empty(3)
-    for axis in range(3):
-        # rotation error in body axes: half the vee of R'Rd - Rd'R
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        error = 0.0
-        for k in range(3):
-            error += 0.5 * (attitude[k, j] * wanted[k, i] - attitude[k, i] * wanted[k, j])
-        limit = gains[YAW_LIMIT] if axis == 2 else gains[TILT_LIMIT]
-        wish = min(max(gains[ROLL_P + axis] * error, -limit), limit)
-        miss = wish - rate[axis]
-        # against wind-up: enough for any trim, such as a weak rotor or a CG off centre
-        bound = gains[YAW_TORQUE] if axis == 2 else 4.0 * gains[ROLL_RATE_P + axis]
-        integral[axis] = min(max(integral[axis] + gains[ROLL_RATE_I + axis] * miss * dt, -bound), bound)
-        torque[axis] = gains[ROLL_RATE_P + axis] * miss + integral[axis]
-    torque[2] = min(max(torque[2], -gains[YAW_TORQUE]), gains[YAW_TORQUE])
-    for i in range(rotors):
-        square = mixer[i, 0] * thrust + mixer[i, 1] * torque[0] + mixer[i, 2] * torque[1] + mixer[i, 3] * torque[2]
-        command[i] = np.sqrt(min(max(square, floor), ceiling))
+    steer(gains, mixer, wanted, reference[3], attitude, rate, dt, integral, torque, command)
 
 
 def stabiliser_step(

@@ -30,6 +30,7 @@ from quadid_cli.searching import OPTIMIZERS, check_optimizer, search
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
     from quadid.identify.result import ScoredSet
+    from quadid.identify.stabiliser_gains import Autopilot
     from quadid.vehicle import Vehicle
     from quadid_cli.loading import Log
     from quadid_cli.terminal import Advance
@@ -125,13 +126,15 @@ def run(
         advance: told how far the fit is.
     """
     from quadid.identify.result import bound_by_file, fitted_vehicle, identify_result, withheld
+    from quadid.identify.stabiliser_gains import find_autopilot
     from quadid_cli.output import write_text
 
     begin = time.perf_counter()
     fit = search(optimizer, [w for log in train for w in log.windows], vehicle, seed, advance)
     fit = bound_by_file(withheld(fit, out_of_reach(train)))
     seconds = time.perf_counter() - begin
-    sets = [scored(log, "train", fit) for log in train] + [scored(log, "validate", fit) for log in held]
+    autopilot = find_autopilot([w for log in train for w in log.windows], vehicle)
+    sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
     text = vehicle_header(train) + fitted_vehicle(fit).to_yaml()
     warnings = [text for log in (*train, *held) for text in log.warnings]
     result = identify_result(fit, optimizer, seed, seconds, sets, str(write_text(target, text)), warnings)
@@ -148,15 +151,18 @@ def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
     return {name: each[0][name] for name in each[0] if all(name in one for one in each)} if each else {}
 
 
-def scored(log: Log, role: str, fit: Fit) -> ScoredSet:
-    """Scores the initial guess and the fit on one log."""
+def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> ScoredSet:
+    """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
+    from quadid.identify.closed_loop import paper_score
     from quadid.identify.result import ScoredSet
     from quadid.identify.score import mse_score
     from quadid.model.layout import Layout
 
     initial = Layout(fit.vehicle).initial(fit.vehicle)
     before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (initial, fit.theta))
-    return ScoredSet(log.recording.name, role, before, after)
+    flown = [paper_score(log.windows, fit.vehicle, theta, autopilot) for theta in (initial, fit.theta)]
+    paper = None if flown[0] is None or flown[1] is None else (flown[0].mse, flown[1].mse)
+    return ScoredSet(log.recording.name, role, before, after, paper)
 
 
 def vehicle_header(logs: Sequence[Log]) -> str:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 OPTIMIZERS = (
     "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
+    "pso_algorithm_1",
 )  # fmt: skip
 SHORTEST = 1.5
 """Shortest window that holds one segment of a fit, with its lead [s]."""

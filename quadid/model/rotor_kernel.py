@@ -131,7 +131,7 @@ def _turn_held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-
 
 
 @nb.njit(**jit)
-def _turn_delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+def turn_delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of held input that switches within the step."""
     lane_kernel()
     for lane in range(LANES):
@@ -236,7 +236,7 @@ def rotors_step(
         if plain:
             _turn_held(u[k, r], x, y, spin, r, inv, keep, rot, s)
         elif held:
-            _turn_delayed(x, y, spin, r, inv, keep, rot, s)
+            turn_delayed(x, y, spin, r, inv, keep, rot, s)
         else:
             _turn_linear(x, y, spin, r, inv, keep, rot, s)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from quadid.baselines.comparison import METHODS
-from tests.cli.conftest import Cli, Flights, one_line
+from tests.cli.conftest import Cli, Flights, one_line, table, write_table
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +29,7 @@ def test_every_method_of_the_contract_is_there_with_its_score_and_cost(compared:
         assert len(m["mse"]["validate"]) == 1
         assert m["evaluations"] >= 1
         assert m["seconds"] > 0.0
+        assert (m["mse_paper"] is None) == (m["name"] in ("cva", "moesp"))
 
 
 def test_who_wins_on_a_flight_that_the_model_describes_fully(compared: dict[str, Any]) -> None:
@@ -60,3 +62,25 @@ def test_random_methods_run_once_a_seed_and_never_overdraw_their_budget(compared
 def test_an_unknown_method_is_refused_with_the_nearest_name(inside: Cli, flights: Flights) -> None:
     line = one_line(inside("compare", flights.train, "--vehicle", "pelican", "--method", "cma-es"), 2)
     assert "cma_es" in line
+
+
+def test_on_the_papers_objective_quasi_newton_and_the_swarm_meet(quadid: Cli, flights: Flights) -> None:
+    done = quadid(
+        "compare", flights.train, "--vehicle", "pelican", "--objective", "closed_loop", "--budget", "400",
+        "--method", "initial", "--method", "quasi_newton", "--method", "pso_polish", "--seeds", "1", "--json", "-",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    cost = {m["name"]: m["cost"] for m in done.data["methods"]}
+    assert cost["pso_polish"] <= cost["quasi_newton"] * 1.001 < cost["initial"]
+    for m in done.data["methods"]:
+        assert m["mse_paper"]["train"] == pytest.approx(m["cost"], rel=1e-6)
+
+
+def test_the_papers_objective_needs_references(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    kept = [i for i, name in enumerate(names) if name not in ("phi_ref", "theta_ref", "psi_ref", "throttle")]
+    log = write_table(tmp_path / "bare.csv", [names[i] for i in kept], rows[:, kept])
+    line = one_line(
+        inside("compare", log, "--vehicle", "pelican", "--objective", "closed_loop", "--method", "initial"), 3
+    )
+    assert "stabiliser is not known" in line

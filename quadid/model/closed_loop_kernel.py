@@ -1,0 +1,185 @@
+"""The model in closed loop: the stabiliser turns the model's own motion and the pilot's references into rotor input.
+
+Rotors, body and sensors are those of `quadid.model.rollout_kernel`; the control law is `quadid.stabiliser`.  Each lane
+flies its own trajectory, so rotors are stepped lane by lane from what each lane's stabiliser commanded.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.model.kernel import body_constants, flight_factors, step_core, step_full
+from quadid.model.rollout_kernel import Flight, Needs
+from quadid.model.rotor_kernel import rotor_constants, turn_delayed
+
+# isort: off
+from quadid.model.rows import (
+    A_G, A_S2, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NOW, R_PAST, R_SPEED, ROTOR,
+    S_FX, S_P, S_QW, X_P, X_QW,
+)  # fmt: skip
+from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
+
+# isort: on
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
+from quadid.stabiliser import rotation_of, steer
+
+FloatArray = NDArray[np.float64]
+
+OUTPUTS = 10
+"""Rates 3, quaternion 4, mean specific force 3, as the sensors would read them."""
+HISTORY = 256
+"""Commands that are remembered; bounds the delay, in steps of the stabiliser."""
+
+
+@nb.njit(**jit)
+def _see(lane: int, tilted: bool, s: FloatArray, attitude: FloatArray, rate: FloatArray) -> None:
+    """Writes what one lane's stabiliser sees: rotation matrix (3, 3) with the AHRS error, rate (3,) of the gyro."""
+    w, x, y, z = s[X_QW + lane], s[X_QW + LANES + lane], s[X_QW + 2 * LANES + lane], s[X_QW + 3 * LANES + lane]
+    if tilted:
+        a, b, c, d = s[E_QW + lane], s[E_QW + LANES + lane], s[E_QW + 2 * LANES + lane], s[E_QW + 3 * LANES + lane]
+        w, x, y, z = (
+            a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
+        )  # fmt: skip
+    attitude[0, 0], attitude[0, 1] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z)
+    attitude[0, 2], attitude[1, 0] = 2.0 * (x * z + w * y), 2.0 * (x * y + w * z)
+    attitude[1, 1], attitude[1, 2] = 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    attitude[2, 0], attitude[2, 1] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
+    attitude[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    p, q, r = s[X_P + lane], s[X_P + LANES + lane], s[X_P + 2 * LANES + lane]
+    for i in range(3):
+        row = C_R + 3 * i * LANES + lane
+        seen = s[row] * p + s[row + LANES] * q + s[row + 2 * LANES] * r
+        rate[i] = seen * s[C_GS + i * LANES + lane] + s[C_GB + i * LANES + lane]
+
+
+@nb.njit(**jit)
+def _rotors(step: int, geometry: FloatArray, dt: float, sent: FloatArray, rot: FloatArray, s: FloatArray) -> None:
+    """Advances all rotors over one step of the stabiliser, from the commands each lane has sent."""
+    inv = 2.0 / dt
+    for r in range(len(geometry)):
+        for lane in range(LANES):
+            shift = min(int(s[C_SHIFT + lane]), HISTORY - 2)
+            rot[r, R_NOW + lane] = sent[(step - shift) % HISTORY, r, lane]
+            rot[r, R_PAST + lane] = sent[(step - shift - 1) % HISTORY, r, lane]
+        keep = 0.0 if r == 0 else 1.0
+        turn_delayed(geometry[r, 0], geometry[r, 1], geometry[r, 2], r, inv, keep, rot, s)
+
+
+@nb.njit(**jit)
+def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatArray) -> None:
+    """Adds a half step's force, at `place`, to the mean over the first or second half of its row; (2, 3, LANES)."""
+    part, share = (0 if half < halves else 1), 1.0 / halves
+    for i in range(3):
+        for lane in range(LANES):
+            force[part, i, lane] += share * s[place + i * LANES + lane]
+
+
+@nb.njit(**allocating)
+def _fly(
+    references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
+    flight: Flight, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray,
+) -> None:  # fmt: skip
+    """The loop over rows and steps of `fly_closed_loop`, with its work space."""
+    rotors, dt = len(geometry), flight.dt / substeps
+    sent, command = np.zeros((HISTORY, rotors, LANES)), np.zeros(rotors)
+    integral, attitude, rate = np.zeros((LANES, 3)), np.zeros((3, 3)), np.zeros(3)
+    wanted, torque = np.zeros((3, 3)), np.zeros(3)
+    force, last, kept = np.zeros((2, 3, LANES)), np.zeros((3, LANES)), np.zeros((7, LANES))
+    for k in range(len(references)):
+        last[:] = force[1]
+        force[:] = 0.0
+        rotation_of(references[k, 0], references[k, 1], references[k, 2], wanted)
+        throttle = references[k, 3]
+        for sub in range(substeps):
+            step = k * substeps + sub
+            for lane in range(lanes):
+                _see(lane, need.ahrs, s, attitude, rate)
+                steer(gains, mixer, wanted, throttle, attitude, rate, dt, integral[lane], torque, command)
+                for r in range(rotors):
+                    sent[step % HISTORY, r, lane] = command[r]
+            for lane in range(lanes, LANES):
+                sent[step % HISTORY, :, lane] = sent[step % HISTORY, :, lanes - 1]
+            if step == 0:  # as if the first command had acted for ever
+                sent[1:] = sent[0]
+                rot[:, R_SPEED : R_SPEED + LANES] = sent[0]
+            _rotors(step, geometry, dt, sent, rot, s)
+            if need.factors:
+                flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
+            if need.full:
+                step_full(dt, s)
+            else:
+                step_core(dt, s)
+            if need.ahrs:
+                step_tilt_error(dt, s)
+                tilt_attitude(s)
+            _keep_half(2 * sub, substeps, F1_X, force, s)
+            _keep_half(2 * sub + 1, substeps, F2_X, force, s)
+            if sub == 0:
+                for i in range(7):
+                    kept[i] = s[S_QW + i * LANES : S_QW + (i + 1) * LANES]
+        if k == 0:
+            last[:] = force[0]
+        for i in range(3):
+            s[S_P + i * LANES : S_P + (i + 1) * LANES] = kept[4 + i]
+            # The accelerometer averages over one sample centred on t_k.
+            s[S_FX + i * LANES : S_FX + (i + 1) * LANES] = 0.5 * (last[i] + force[0, i])
+        if need.imu_static:
+            distort_imu(s)
+        for i in range(3):
+            out[k, i] = s[S_P + i * LANES : S_P + (i + 1) * LANES]
+            out[k, 7 + i] = s[S_FX + i * LANES : S_FX + (i + 1) * LANES]
+        out[k, 3:7] = kept[:4]
+
+
+@nb.njit(**allocating)
+def _fly_closed_loop(
+    references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
+    flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Flies one block of lanes through a window.
+
+    Args:
+        references: roll, pitch, yaw [rad], throttle 0..1 of each row, held over it, (n, 4).
+        gains: see `quadid.stabiliser.pack_gains`.
+        mixer: see `quadid.stabiliser.mixer_matrix`.
+        substeps: runs of the stabiliser a row.
+        lanes: how many of the block's lanes are wanted.
+        geometry: (rotors, 3): x, y [m], spin.
+        flight: numbers of the window.
+        theta: parameter vectors (LANES, size).
+        need: which parts of the model any lane needs.
+        x0: state at the first row (13,).
+        out: (n, OUTPUTS, LANES), written: rates, quaternion, mean specific force at each row.
+    """
+    rotors, dt = len(geometry), flight.dt / substeps
+    s = cache_aligned(N_ROWS * LANES)
+    s[:] = 0.0
+    s[A_S2 : A_S2 + 2 * HALF] = 0.0
+    s[A_G : A_G + 2 * LANES] = 1.0
+    s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
+    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    rot[:] = 0.0
+    body_constants(theta, flight.mass, rotors, flight.reach, s)
+    sensor_constants(theta, dt, s)
+    rotor_constants(theta, dt, rot, s)
+    for i in range(N_STATE):
+        s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
+    s[E_QW : E_QW + LANES] = 1.0
+    _fly(references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot)
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def fly_closed_loop(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _fly_closed_loop(*arguments)
+
+    return fly_closed_loop
+
+
+fly_closed_loop = _on_disk(SOURCES)
