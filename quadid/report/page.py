@@ -49,14 +49,14 @@ def render(page: JsonDict) -> str:
 
 _EMPTY: dict[str, Any] = {
     "subtitle": "", "verdict": None, "parameters": [], "parameter_figure": None, "diagnoses": [], "sets": [],
-    "excitation": None, "quality": [], "noise": [], "warnings": [], "provenance": [],
+    "sections": [], "excitation": None, "quality": [], "noise": [], "warnings": [], "provenance": [],
 }  # fmt: skip
 
 
 def all_figures(page: JsonDict) -> dict[str, Any]:
     """Every figure of the page by its identifier."""
     found = [page.get("parameter_figure")]
-    parts = list(page.get("sets", ()))
+    parts = [*page.get("sets", ()), *page.get("sections", ())]
     for diagnosis in page.get("diagnoses", ()):
         parts += [*diagnosis["findings"], *diagnosis["logs"]]
     for part in parts:

@@ -26,7 +26,11 @@
     return { color: colour(role), width: 1.3 };
   }
 
+  // Vehicles of a fleet: colours that colour-blind eyes tell apart (Okabe and Ito), of middling lightness.
+  const units = ["#0b78c4", "#d55e00", "#00916b", "#b8629a", "#8a7a00", "#3f9fd8", "#a05a2c", "#6a6fd0", "#5c8a2e", "#c0392b", "#00838f", "#7f7f7f"];
+
   function marker(role) {
+    if (role.startsWith("unit")) return { color: units[Number(role.slice(4)) % units.length], size: 6 };
     const symbols = { before: "line-ns-open", after: "circle", truth: "x-thin-open" };
     return { color: colour(role), size: role === "after" ? 9 : 14, symbol: symbols[role] || "circle", line: { width: 2, color: colour(role) } };
   }
@@ -35,6 +39,7 @@
     const out = Object.assign(view.x && !trace.x ? { x: view.x } : {}, trace);
     if ((trace.mode || "").includes("lines")) out.line = line(trace.role);
     if ((trace.mode || "").includes("markers")) out.marker = marker(trace.role);
+    if (trace.error_y) out.error_y = Object.assign({ color: out.marker.color, thickness: 1.2, width: 0 }, trace.error_y);
     if (trace.error_x) out.error_x = Object.assign({ color: colour(trace.role), thickness: 2, width: 5 }, trace.error_x);
     if (trace.type === "bar") out.marker = { color: colour(trace.role) };
     return out;

@@ -1,0 +1,141 @@
+"""`quadid fleet`: identifies a folder of logs in parallel, and says what they tell together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from quadid_cli.identify import GRID
+from quadid_cli.options import JsonTarget, OutFolder, Seed
+
+if TYPE_CHECKING:
+    from quadid_cli.fleet_folder import Found
+    from quadid_cli.fleet_store import Store
+    from quadid_cli.fleet_work import Job
+    from quadid_cli.terminal import Advance
+
+
+def fleet(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of logs, told by content; one vehicle a folder.")
+    ],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle", metavar="V", help="Shipped name or YAML file for folders without a vehicle.yaml of their own."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDR", help="A Dask scheduler (tcp://…); default: own workers."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", min=1, help="Own workers; default one a core.")
+    ] = None,
+    memory: Annotated[
+        str, typer.Option("--memory", metavar="SIZE", help="Memory that one own worker may take.")
+    ] = "2GiB",
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Identify all logs anew, also those that an earlier run has done.")
+    ] = False,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = GRID,
+    seed: Seed = 1,
+    json: JsonTarget = None,
+    out: OutFolder = Path("fleet-out"),
+) -> None:
+    """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on.
+
+    Example: quadid fleet logs --vehicle pelican --workers 4 --out fleet-out
+    """
+    from quadid_cli import fleet_folder, loading, output, terminal
+    from quadid_cli.fleet_store import open_store
+
+    output.check_file(json, "--json")
+    target = output.out_folder(out)
+    default = None if vehicle is None else loading.load_vehicle(vehicle).to_yaml()
+    found = fleet_folder.find_jobs(folder.resolve(), default, rate, seed, diagnose, target)
+    begin = time.perf_counter()
+    with open_store(target / "fleet.sqlite") as store:
+        store.keep({job.name for job in found.jobs})
+        waiting = list(found.jobs) if again else outstanding(found.jobs, store)
+        with terminal.progress() as advance:
+            work(waiting, store, scheduler, workers, memory, advance)
+        result = conclude(store, found, target, len(waiting), time.perf_counter() - begin)
+    output.write_json(result, json)
+    show(result, quiet=json == "-")
+
+
+def outstanding(jobs: Sequence[Job], store: Store) -> list[Job]:
+    """Jobs whose file, vehicle or settings differ from what the stored result was made from, or that have none."""
+    ended = store.ended()
+    return [job for job in jobs if ended.get(job.name) != (job.size, job.modified, job.key)]
+
+
+def work(
+    jobs: Sequence[Job], store: Store, scheduler: str | None, workers: int | None, memory: str, advance: Advance
+) -> None:
+    """Runs jobs and stores each outcome as it comes."""
+    if not jobs:
+        return
+    from quadid_cli.fleet_cluster import cluster, results
+
+    count = min(workers, len(jobs)) if workers is not None else None
+    advance("start workers", 0.0)
+    with cluster(scheduler, count, memory) as client:
+        for done, row in enumerate(results(client, jobs), 1):
+            store.put(row)
+            advance(f"{done} of {len(jobs)} logs", done / len(jobs))
+
+
+def conclude(store: Store, found: Found, target: Path, worked: int, seconds: float) -> dict[str, Any]:
+    """Writes Parquet files and the report; returns the result as JSON has it."""
+    from quadid.report.fleet_page import fleet_page
+    from quadid.report.fleet_summary import summarise
+    from quadid.report.page import render
+    from quadid_cli.output import write_text
+    from quadid_cli.reporting import provenance
+
+    logs, parameters, findings = (store.rows(table) for table in ("logs", "parameters", "findings"))
+    summary = summarise(logs, parameters, findings)
+    page = fleet_page(summary, logs, parameters, provenance([]), "Report of a fleet")
+    files = [target / "fleet.sqlite", *store.write_parquet(target)]
+    return {
+        "schema": "quadid.fleet/1", "logs": len(logs), "worked": worked, "seconds": seconds, **summary,
+        "other_files": list(found.others), "files": [str(f) for f in files],
+        "report": str(write_text(target / "fleet.html", render(page))),
+    }  # fmt: skip
+
+
+def show(result: dict[str, Any], quiet: bool) -> None:
+    """Prints counts, vehicles, reasons of failures, and where the files are."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from quadid.report.fleet_page import fleet_verdict
+    from quadid_cli import tables, terminal
+
+    console = terminal.console(quiet)
+    table = Table(title="Vehicles")
+    for heading in ("vehicle", "logs", "answers", "parameter", "median", "unit", "spread"):
+        table.add_column(heading, justify="right" if heading in ("logs", "answers", "median", "spread") else "left")
+    for unit in result["units"]:
+        for i, p in enumerate(unit["parameters"] or [None]):
+            head = (Text(unit["unit"]), str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
+            tail = ("", "", "", "") if p is None else (
+                p["parameter"], tables.number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
+            )  # fmt: skip
+            table.add_row(*head, *tail)
+    console.print(table)
+    tables.print_verdict(console, fleet_verdict(result))
+    for reason in result["reasons"][:10]:
+        console.print(f"{reason['logs']} {reason['status']}: {reason['reason']}", soft_wrap=True)
+    console.print(f"{result['worked']} of {result['logs']} logs worked on in {result['seconds']:.1f} s")
+    for file in (*result["files"], result["report"]):
+        console.print(f"Written: {file}", soft_wrap=True)

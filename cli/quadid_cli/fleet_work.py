@@ -1,0 +1,141 @@
+"""What is done to one log of a fleet, wherever a worker runs: plain data in, plain data out, never an exception."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import LogError, NotIdentifiableError, QuadidError
+
+if TYPE_CHECKING:
+    from quadid.identify.fit import Fit
+    from quadid.vehicle import Vehicle
+    from quadid_cli.loading import Log
+
+Row = dict[str, Any]
+EARLIEST = 946_684_800.0
+"""Times before the year 2000 are seconds since boot, not dates [s]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log to identify.
+
+    Attributes:
+        path: absolute; every worker must see it there.
+        name: relative to the folder of the fleet.
+        unit: which vehicle of the fleet it belongs to.
+        vehicle: text of its vehicle file.
+        size, modified: of the file [bytes], [ns]; with `key` they tell whether a stored result is still good.
+        key: hash of everything else that decides the result.
+        rate: of the grid [Hz]; seed: of the search; diagnose: name what the simulation gets wrong too.
+    """
+
+    path: str
+    name: str
+    unit: str
+    vehicle: str
+    size: int
+    modified: int
+    key: str
+    rate: float
+    seed: int
+    diagnose: bool
+
+
+def identify_one(job: Job) -> Row:
+    """Identifies one log.
+
+    Returns:
+        ``status`` ``done``, ``refused`` (the data cannot support an answer), ``unreadable`` or ``failed`` (a defect
+        of this program), ``reason``, and what was found; nothing is raised, so that no log can stop the others.
+    """
+    begin = time.perf_counter()
+    row = blank(job)
+    try:
+        row |= {"status": "done", "reason": "", **_identified(job)}
+    except NotIdentifiableError as error:
+        row |= {"status": "refused", "reason": _line(error)}
+    except (QuadidError, OSError) as error:
+        row |= {"status": "unreadable", "reason": _line(error)}
+    except Exception as error:  # noqa: BLE001 - one log's defect is reported in its row and must not stop the rest
+        row |= {"status": "failed", "reason": f"{type(error).__name__}: {_line(error)}"}
+    return {**row, "took": time.perf_counter() - begin, "worker": os.getpid()}
+
+
+def blank(job: Job) -> Row:
+    """The row of a log of which nothing is known yet but its file."""
+    return {
+        "name": job.name, "unit": job.unit, "size": job.size, "modified": job.modified, "key": job.key,
+        "sha256": None, "started": 1e-9 * job.modified, "dated_by": "file", "format": None, "seconds": None,
+        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "warnings": [],
+    }  # fmt: skip
+
+
+def _identified(job: Job) -> Row:
+    from quadid.identify.result import answered
+    from quadid.identify.score import mse_score
+    from quadid.model.layout import Layout
+    from quadid.vehicle import Vehicle
+    from quadid_cli.identify import out_of_reach
+    from quadid_cli.loading import load_log
+    from quadid_cli.searching import search
+
+    vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
+    if Path(job.path).stat().st_size == 0:
+        raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
+    log = load_log(job.path, vehicle, job.rate)
+    fit = _bounded(search("pso_polish", log.windows, vehicle, job.seed, lambda stage, share: None), out_of_reach([log]))
+    if not answered(fit.parameters):
+        raise NotIdentifiableError("the data say nothing about any parameter", "a flight that moves about all axes")
+    initial = Layout(vehicle).initial(vehicle)
+    before, after = (mse_score(log.windows, vehicle, theta, fit.noise).mse for theta in (initial, fit.theta))
+    row: Row = {
+        "vehicle": vehicle.name,
+        "sha256": log.recording.sha256,
+        "format": log.recording.format,
+        "seconds": log.grid.seconds_used,
+        "mse_initial": before,
+        "mse_fitted": after,
+        "parameters": [
+            {"parameter": p.name, "unit": p.unit, "value": p.value, "low": p.ci95[0], "high": p.ci95[1],
+             "status": p.status.value}
+            for p in fit.parameters
+        ],
+        "warnings": log.warnings,
+        **_when(log),
+    }  # fmt: skip
+    return row | (_diagnosed(job, log, vehicle) if job.diagnose else {})
+
+
+def _bounded(fit: Fit, missing: dict[str, str]) -> Fit:
+    from quadid.identify.result import bound_by_file, withheld
+
+    return bound_by_file(withheld(fit, missing))
+
+
+def _when(log: Log) -> Row:
+    """Date of the flight, where the log's clock knows dates."""
+    first = min((float(c.t[0]) for c in log.recording.channels.values() if len(c.t)), default=0.0)
+    return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
+
+
+def _diagnosed(job: Job, log: Log, vehicle: Vehicle) -> Row:
+    from quadid.diagnose import diagnose
+
+    found, _ = diagnose(log.windows, vehicle, (), job.seed)
+    findings = [
+        {"effect": f.effect, "confident": f.confident, "parameter": p.name, "unit": p.unit, "value": p.value,
+         "low": p.ci95[0], "high": p.ci95[1], "mse_before": f.gain.mse_before, "mse_after": f.gain.mse_after}
+        for f in found.findings
+        for p in f.parameters
+    ]  # fmt: skip
+    return {"verdict": found.verdict.value, "findings": findings}
+
+
+def _line(error: Exception) -> str:
+    joined = " ".join(str(error).split())
+    return "".join(c if c.isprintable() else "?" for c in joined)[:500]

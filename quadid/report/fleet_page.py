@@ -1,0 +1,177 @@
+"""The report of a fleet: verdict, parameters over time, drift, outliers, common findings, what was not usable."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from quadid.report.figures import trace
+from quadid.report.page import number
+from quadid.report.verdict import Level, Verdict, percent
+
+JsonDict = Mapping[str, Any]
+
+MOST_UNITS = 12
+"""Vehicles in one figure."""
+MOST_POINTS = 20_000
+"""Flights that all figures together show; of more, every n-th."""
+MOST_ROWS = 200
+"""Rows of one table; the database has all."""
+
+
+def fleet_page(
+    summary: JsonDict, logs: Sequence[JsonDict], parameters: Sequence[JsonDict], provenance: Sequence[JsonDict],
+    title: str,
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page from `quadid.report.fleet_summary.summarise` and the rows it was made from."""
+    return {
+        "title": title,
+        "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
+        "verdict": asdict(fleet_verdict(summary)),
+        "sections": [s for s in (
+            _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary), _common(summary),
+            _unusable(summary),
+        ) if s is not None],
+        "provenance": provenance,
+    }  # fmt: skip
+
+
+def fleet_verdict(summary: JsonDict) -> Verdict:
+    """How many logs gave an answer, and what needs attention."""
+    counts = summary["counts"]
+    total, done = sum(counts.values()), counts.get("done", 0)
+    level: Level = "good" if done == total else "fair" if done >= 0.5 * total else "poor"
+    headline = f"{done} of {total} logs gave parameters."
+    words = (
+        ("refused", "cannot support an answer"),
+        ("unreadable", "cannot be read or used"),
+        ("failed", "stopped this program"),
+    )
+    details = [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+    details += [
+        f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
+        f"in {d['days']:.3g} days."
+        for d in summary["drifts"][:3]
+    ]
+    steps = []
+    if summary["drifts"]:
+        steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
+    if summary["outliers"]:
+        log = summary["outliers"][0]["log"]
+        steps.append(f"Look at the flight that stands out most: `quadid diagnose {log}`.")
+    if counts.get("refused") or counts.get("unreadable"):
+        steps.append("`quadid inspect LOG` says what an unusable log lacks and how to log it.")
+    if counts.get("failed"):
+        steps.append("Failures of this program are worth a bug report: the last table names the logs.")
+    if not steps:
+        steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
+    return Verdict(level, headline, tuple(details), tuple(steps))
+
+
+def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:
+    started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
+    rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
+    figures = [f for name in dict.fromkeys(p["parameter"] for p in rows) if (f := _one_figure(name, rows, started))]
+    if not figures:
+        return None
+    intro = "Every flight with its 95 % interval; a vehicle is a folder."
+    return {"id": "over-time", "title": "Parameters over time", "intro": intro, "figures": figures, "tables": []}
+
+
+def _one_figure(
+    name: str, rows: Sequence[JsonDict], started: Mapping[str, tuple[float, str]]
+) -> dict[str, Any] | None:  # fmt: skip
+    mine = sorted((p for p in rows if p["parameter"] == name), key=lambda p: started[p["log"]][0])
+    units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
+    data = []
+    for i, unit in enumerate(sorted(units)[:MOST_UNITS]):
+        own = [p for p in mine if started[p["log"]][1] == unit]
+        own = own[:: max(1, math.ceil(len(own) * len(units) * 6 / MOST_POINTS))]
+        value = np.array([p["value"] for p in own])
+        upper = np.array([_gap(p["high"], p["value"]) for p in own])
+        lower = np.array([_gap(p["value"], p["low"]) for p in own])
+        dates = [_date(started[p["log"]][0]) for p in own]
+        bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
+        line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
+        data.append({**line, "x": dates})
+    if not data:
+        return None
+    layout = {
+        "xaxis": {"type": "date"}, "yaxis": {"title": {"text": f"{name} [{mine[0]['unit']}]"}}, "hovermode": "closest",
+        "showlegend": True,
+    }  # fmt: skip
+    views = [{"label": "", "data": data, "layout": layout}]
+    return {"id": f"fleet-{name}", "title": name, "views": views, "height": 280}
+
+
+def _gap(high: float | None, low: float | None) -> float:
+    return 0.0 if high is None or low is None or not math.isfinite(high - low) else max(high - low, 0.0)
+
+
+def _date(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], intro: str = "") -> Any:
+    if not rows:
+        return None
+    more = f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
+    table = {"head": list(head), "rows": [list(r) for r in rows[:MOST_ROWS]]}
+    return {"id": identifier, "title": title, "intro": f"{intro}{more}".strip(), "figures": [], "tables": [table]}
+
+
+def _units(summary: JsonDict) -> Any:
+    rows = [
+        (unit["unit"], f"{unit['done']} of {unit['logs']}", p["parameter"], number(p["median"]), p["unit"],
+         percent(p["spread"]), str(p["flights"]))
+        for unit in summary["units"]
+        for p in unit["parameters"]
+    ]  # fmt: skip
+    head = ("Vehicle", "Logs with an answer", "Parameter", "Median", "Unit", "Spread between flights", "Flights")
+    return _section("vehicles", "Vehicles", head, rows, "Spread: robust standard deviation over the median.")
+
+
+def _drifts(summary: JsonDict) -> Any:
+    rows = [
+        (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
+         f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
+         str(d["flights"]))
+        for d in summary["drifts"]
+    ]  # fmt: skip
+    head = ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights")
+    intro = "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."
+    return _section("drift", "Drift", head, rows, intro)
+
+
+def _outliers(summary: JsonDict) -> Any:
+    rows = [
+        (o["log"], o["parameter"], f"{number(o['value'])} {o['unit_of_value']}", number(o["median"]),
+         number(o["deviations"], 2))
+        for o in summary["outliers"]
+    ]  # fmt: skip
+    head = ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations")
+    return _section("outliers", "Flights that stand out", head, rows, "In robust standard deviations of the vehicle.")
+
+
+def _common(summary: JsonDict) -> Any:
+    rows = [
+        (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
+         f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
+         f"{number(c['lowest'])} … {number(c['highest'])}")
+        for c in summary["common"]
+    ]  # fmt: skip
+    head = ("Vehicle", "Finding", "Flights", "Median", "Range")
+    return _section("common", "What the simulation gets wrong, flight after flight", head, rows)
+
+
+def _unusable(summary: JsonDict) -> Any:
+    rows = [
+        (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
+        for r in summary["reasons"]
+    ]
+    return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)

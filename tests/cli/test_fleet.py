@@ -1,0 +1,158 @@
+"""`quadid fleet` on a real local cluster: bad logs among good ones, going on, files that others read."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from quadid_cli.fleet_cluster import ClusterError, cluster, results
+from quadid_cli.fleet_folder import find_jobs
+from quadid_cli.fleet_store import open_store
+from quadid_cli.fleet_work import Job, Row, identify_one
+from quadid_replay import write_csv, write_mcap
+
+from quadid.errors import LogError, VehicleError
+from quadid.flight import fly
+from quadid.vehicle import Vehicle
+from tests.cli.conftest import Cli, one_line
+
+DAY_NS = 86_400 * 10**9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two vehicles with good flights, and everything that a folder of logs may hold beside them."""
+    root = tmp_path_factory.mktemp("logs")
+    pelican = Vehicle.shipped("pelican")
+    for i in range(4):
+        place = root / ("alpha" if i < 2 else "beta")
+        place.mkdir(exist_ok=True)
+        recording = fly(pelican, seconds=15.0, seed=40 + i).recording
+        path = place / f"flight{i}.{'mcap' if i % 2 else 'csv'}"
+        (write_mcap if i % 2 else write_csv)(path, recording)
+        os.utime(path, ns=((100 + i) * DAY_NS, (100 + i) * DAY_NS))
+    (root / "beta" / "vehicle.yaml").write_text(pelican.to_yaml(), encoding="utf-8")
+    good = (root / "alpha" / "flight1.mcap").read_bytes()
+    (root / "alpha" / "cut.mcap").write_bytes(good[:100])
+    (root / "alpha" / "empty.bin").write_bytes(b"")
+    (root / "alpha" / "noise.ulg").write_bytes(os.urandom(1000))
+    (root / "README.txt").write_text("not a log", encoding="utf-8")
+    write_csv(root / "alpha" / "short.csv", fly(pelican, seconds=1.0, seed=9).recording)
+    return root
+
+
+@pytest.fixture(scope="module")
+def ran(quadid: Cli, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """The result of one run over the folder."""
+    out = tmp_path_factory.mktemp("out")
+    run = quadid("fleet", folder, "--vehicle", "pelican", "--workers", "2", "--out", out, "--json", "-")
+    assert run.code == 0, run.err
+    return run.data, out
+
+
+def test_bad_logs_cost_only_themselves(ran: tuple[dict[str, Any], Path]) -> None:
+    result, _ = ran
+    assert result["schema"] == "quadid.fleet/1"
+    assert result["logs"] == result["worked"] == 8
+    assert result["counts"]["done"] == 4
+    assert sum(result["counts"].values()) == 8
+    assert "failed" not in result["counts"]
+    lost = {name for r in result["reasons"] for name in r["names"]}
+    assert lost == {"alpha/cut.mcap", "alpha/empty.bin", "alpha/noise.ulg", "alpha/short.csv"}
+    assert result["other_files"] == ["README.txt", "beta/vehicle.yaml"]
+
+
+def test_every_vehicle_has_its_parameters(ran: tuple[dict[str, Any], Path]) -> None:
+    result, _ = ran
+    assert [u["unit"] for u in result["units"]] == ["alpha", "beta"]
+    for unit in result["units"]:
+        b = next(p for p in unit["parameters"] if p["parameter"] == "b")
+        assert b["flights"] == 2
+        assert b["median"] == pytest.approx(2.33e-5, rel=0.01)
+
+
+def test_sqlite_and_parquet_hold_the_same_rows(ran: tuple[dict[str, Any], Path]) -> None:
+    _, out = ran
+    connection = sqlite3.connect(out / "fleet.sqlite")
+    for table in ("logs", "parameters", "findings"):
+        (count,) = connection.execute(f"SELECT count(*) FROM {table}").fetchone()
+        assert pq.read_table(out / f"fleet.{table}.parquet").num_rows == count
+    connection.close()
+    logs = {row["name"]: row for row in pq.read_table(out / "fleet.logs.parquet").to_pylist()}
+    assert logs["alpha/flight1.mcap"]["mse_fitted"] < 1.3
+    assert len(logs["alpha/flight1.mcap"]["sha256"]) == 64
+    assert "empty file" in logs["alpha/empty.bin"]["reason"]
+
+
+def test_a_second_run_does_only_what_is_new(
+    quadid: Cli, folder: Path, ran: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    _, out = ran
+    copy, own = tmp_path / "logs", tmp_path / "out"
+    shutil.copytree(folder, copy)
+    shutil.copytree(out, own)
+    (copy / "alpha" / "noise.ulg").unlink()
+    shutil.copy2(copy / "alpha" / "flight0.csv", copy / "alpha" / "new.csv")
+    run = quadid("fleet", copy, "--vehicle", "pelican", "--workers", "1", "--out", own, "--json", own / "r.json")
+    assert run.code == 0, run.err
+    result = json.loads((own / "r.json").read_text(encoding="utf-8"))
+    assert (result["worked"], result["logs"]) == (1, 8)
+    assert "1 of 8 logs worked on" in run.out
+    assert "noise.ulg" not in (own / "fleet.html").read_text(encoding="utf-8")
+
+
+def test_outcomes_are_stored_as_they_come_so_that_a_killed_run_goes_on(folder: Path, tmp_path: Path) -> None:
+    jobs = find_jobs(folder, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False).jobs
+    empty = next(j for j in jobs if j.name.endswith("empty.bin"))
+    with open_store(tmp_path / "fleet.sqlite") as store:
+        store.put(identify_one(empty))
+        with open_store(tmp_path / "fleet.sqlite") as other:  # before the first is closed
+            assert other.ended() == {empty.name: (0, empty.modified, empty.key)}
+
+
+def test_a_log_that_kills_its_worker_is_reported_and_the_rest_goes_on(folder: Path) -> None:
+    jobs = find_jobs(folder, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False).jobs[:5]
+
+    def deadly(job: Job) -> Row:
+        import os
+
+        if job.name.endswith("empty.bin"):
+            os._exit(1)
+        return {"name": job.name, "status": "done"}
+
+    with cluster(None, 2, "1GiB") as client:
+        rows = {row["name"]: row for row in results(client, jobs, deadly)}
+    assert len(rows) == 5
+    lost = [row for row in rows.values() if row["status"] != "done"]
+    assert [row["name"] for row in lost] == ["alpha/empty.bin"]
+    assert "worker died" in lost[0]["reason"]
+
+
+def test_a_cluster_that_is_already_there(folder: Path) -> None:
+    from distributed import LocalCluster
+
+    jobs = find_jobs(folder, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False).jobs[:2]
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as there,
+        cluster(there.scheduler_address, None, "") as client,
+    ):
+        rows = list(results(client, jobs))
+    assert {row["status"] for row in rows} <= {"done", "unreadable"}
+    assert len(rows) == 2
+
+
+def test_what_cannot_start_says_why(inside: Cli, folder: Path, tmp_path: Path) -> None:
+    one_line(inside("fleet", tmp_path / "absent", "--vehicle", "pelican", "--out", tmp_path), 2)
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(LogError, match="no flight log below"):
+        find_jobs(tmp_path / "bare", None, 50.0, 1, False)
+    with pytest.raises(VehicleError, match=r"vehicle\.yaml"):
+        find_jobs(folder, None, 50.0, 1, False)
+    with pytest.raises(ClusterError, match="no Dask scheduler answers"), cluster("tcp://127.0.0.1:9", None, ""):
+        pass

@@ -1,0 +1,89 @@
+"""What many flights say together: drift and outliers are found where they are, and not where they are not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadid.report.fleet_page import fleet_page, fleet_verdict
+from quadid.report.fleet_summary import DAY, summarise
+from quadid.report.page import render
+from tests.report.test_page import EVIL
+
+
+def rows(values: dict[str, np.ndarray], sigma: float = 0.01) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Logs, one a day for each vehicle, and the parameter b of each, relative to 2e-5."""
+    logs, parameters = [], []
+    for unit, series in values.items():
+        for i, value in enumerate(2e-5 * series):
+            name = f"{unit}/{i}.csv"
+            logs.append({
+                "name": name, "unit": unit, "status": "done", "reason": "", "started": 1.6e9 + i * DAY, "verdict": None,
+            })  # fmt: skip
+            half = 1.96 * sigma * 2e-5
+            parameters.append({
+                "log": name, "parameter": "b", "unit": "N s^2/rad^2", "value": value, "low": value - half,
+                "high": value + half, "status": "identified",
+            })  # fmt: skip
+    return logs, parameters
+
+
+def test_drift_is_found_with_its_size_and_only_there() -> None:
+    rng = np.random.default_rng(3)
+    still = 1.0 + 0.01 * rng.standard_normal(60)
+    worn = 1.0 - 0.002 * np.arange(60) + 0.01 * rng.standard_normal(60)
+    summary = summarise(*rows({"still": still, "worn": worn}), [])
+    (drift,) = summary["drifts"]
+    assert (drift["unit"], drift["parameter"], drift["flights"]) == ("worn", "b", 60)
+    low, high = drift["ci95"]
+    assert low < -0.002 / 0.941 < high
+    assert drift["change"] == pytest.approx(-0.002 * 59 / 0.941, rel=0.15)
+
+
+def test_false_alarms_of_drift_and_outliers_are_rare() -> None:
+    rng = np.random.default_rng(4)
+    drifts = outliers = 0
+    for _ in range(60):
+        summary = summarise(*rows({"a": 1.0 + 0.01 * rng.standard_normal(25)}), [])
+        drifts += len(summary["drifts"])
+        outliers += len(summary["outliers"])
+    assert drifts <= 3
+    assert outliers <= 3
+
+
+def test_one_flight_far_off_stands_out() -> None:
+    series = 1.0 + 0.01 * np.random.default_rng(5).standard_normal(20)
+    series[7] = 1.3
+    summary = summarise(*rows({"a": series}), [])
+    assert [o["log"] for o in summary["outliers"]] == ["a/7.csv"]
+    assert summary["outliers"][0]["deviations"] > 10.0
+
+
+def test_common_findings_count_flights_not_numbers() -> None:
+    logs, parameters = rows({"a": np.ones(5)})
+    for log in logs:
+        log["verdict"] = "explained"
+    findings = [
+        {"log": f"a/{i}.csv", "effect": "rotor_drag", "confident": 1, "parameter": k, "unit": "1/s", "value": 0.3 + i}
+        for i in range(3)
+        for k in ("k_x", "k_y")
+    ]
+    (common,) = summarise(logs, parameters, findings)["common"]
+    assert (common["effect"], common["flights"], common["of"], common["median"]) == ("rotor_drag", 3, 5, 1.3)
+
+
+def test_the_page_is_safe_and_says_what_to_do() -> None:
+    logs, parameters = rows({EVIL: np.ones(6)})
+    bad = {"name": f"{EVIL}/x.bin", "unit": EVIL, "status": "unreadable", "reason": EVIL, "started": 0.0}
+    logs.append({**bad, "verdict": None})
+    summary = summarise(logs, parameters, [])
+    verdict = fleet_verdict(summary)
+    assert verdict.headline == "6 of 7 logs gave parameters."
+    assert any("quadid inspect" in step for step in verdict.next_steps)
+    html = render(fleet_page(summary, logs, parameters, [], EVIL))
+    assert "<script>alert(1)" not in html
+    assert len(html) < 6_000_000
+    for part in ("Parameters over time", "Vehicles", "Logs without an answer"):
+        assert part in html
