@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -114,7 +113,7 @@ def _gap(high: float | None, low: float | None) -> float:
 
 
 def _date(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return str(np.datetime_as_string(np.datetime64(round(seconds), "s"))).replace("T", " ")
 
 
 def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], intro: str = "") -> Any:
