@@ -151,6 +151,7 @@ def html(shown: Shown, seed: int) -> str:
         diagnosis_part(
             shown.hidden.result, shown.hidden.sets[-1:], "hidden", _HIDDEN_SECTION,
             f"This vehicle flew with {_hidden_words()}, which the model does not know of.",
+            shown.hidden.maps(),
         ),
     ]  # fmt: skip
     return render(page)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from quadid.diagnose.pipeline import Workings
     from quadid.identify.noise import NoiseModel
     from quadid.identify.result import ScoredSet
+    from quadid.report.residual_maps import ResidualMap
     from quadid.vehicle import Vehicle
     from quadid_cli.loading import Log
     from quadid_cli.terminal import Advance
@@ -41,12 +42,29 @@ class Diagnosed:
         sets: logs scored without and with the findings.
         noise: estimated sensor noise.
         logs: as loaded, diagnosed ones first.
+        vehicle: nominal vehicle.
+        workings: everything that led to the result.
     """
 
     result: dict[str, Any]
     sets: list[ScoredSet]
     noise: NoiseModel
     logs: list[Log]
+    vehicle: Vehicle
+    workings: Workings
+
+    def maps(self) -> dict[str, ResidualMap]:
+        """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
+        from quadid.report.residual_maps import residual_map
+
+        count = sum(s.role == "train" for s in self.sets)
+        windows = [w for log in self.logs[:count] for w in log.windows]
+        model = self.workings.search.model
+        drawn = {
+            c.effect: residual_map(windows, self.vehicle, model.theta, c.effect, c.names, self.noise)
+            for c in model.causes
+        }
+        return {effect: one for effect, one in drawn.items() if one is not None}
 
 
 def diagnose(
@@ -111,7 +129,7 @@ def run(
     sets = [
         scored(log, role, vehicle, workings) for role, part in (("train", train), ("validate", held)) for log in part
     ]
-    return Diagnosed(result, sets, workings.decisive.noise, [*train, *held])
+    return Diagnosed(result, sets, workings.decisive.noise, [*train, *held], vehicle, workings)
 
 
 def extended_path(folder: Path, name: str, extended: bool, given: str) -> Path:

@@ -51,7 +51,8 @@ def diagnose_html(done: Diagnosed, vehicle: str, seed: int) -> str:
         {"name": "vehicle file", "value": done.result["vehicle_file"]},
     ]
     logs = [quality(log) for log in done.logs]
-    return render(diagnose_page(done.result, vehicle, done.sets, done.noise, logs, rows, done.result["warnings"]))
+    warnings = done.result["warnings"]
+    return render(diagnose_page(done.result, vehicle, done.sets, done.noise, logs, rows, warnings, done.maps()))
 
 
 def quality(log: Log) -> dict[str, Any]:

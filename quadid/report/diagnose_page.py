@@ -11,7 +11,9 @@ from quadid.identify.result import ScoredSet
 from quadid.report.advice import ADVICE
 from quadid.report.figures import MODELS, MOST_LOGS, channel_figures, error_figure, gain_figure
 from quadid.report.identify_page import noise_rows
-from quadid.report.verdict import Level, Verdict
+from quadid.report.page import number
+from quadid.report.residual_maps import ResidualMap, map_figure
+from quadid.report.verdict import Level, Verdict, percent
 
 JsonDict = Mapping[str, Any]
 
@@ -64,8 +66,9 @@ def _next_steps(result: JsonDict) -> tuple[str, ...]:
 
 
 def diagnosis_part(
-    result: JsonDict, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = ""
-) -> dict[str, Any]:
+    result: JsonDict, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
+    maps: Mapping[str, ResidualMap] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """A diagnosis as part of a page: verdict, findings, pictures.
 
     Args:
@@ -74,15 +77,10 @@ def diagnosis_part(
         prefix: makes identifiers of figures unique on the page.
         title: heading, where a page holds several.
         intro: sentence below it.
+        maps: what each cause looks like in the residual, by name of the effect.
     """
-    floor = result["validation"]["noise_floor"]
     findings = [
-        {
-            **finding,
-            "title": finding["effect"].replace("_", " "),
-            "advice": ADVICE.get(finding["effect"], ""),
-            "figures": [gain_figure(finding, floor, f"{prefix}-gain{i}")],
-        }
+        finding_part(finding, result["validation"]["noise_floor"], f"{prefix}-{i}", (maps or {}).get(finding["effect"]))
         for i, finding in enumerate(result["findings"])
     ]
     pictured = list(sets)[:MOST_LOGS] if findings else []
@@ -102,17 +100,87 @@ def diagnosis_part(
         "intro": intro,
         "verdict": asdict(diagnose_verdict(result)),
         "findings": findings,
-        "unexplained": result["unexplained"],
+        "remains": remaining(result, sets),
         "logs": logs,
     }
 
 
+def finding_part(finding: JsonDict, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
+    """One cause: its picture, its worth with interval, the look-alikes that lost.
+
+    Args:
+        finding: of the form ``quadid.diagnose/1``.
+        floor: noise floor in the measure of the gains.
+        identifier: makes identifiers of figures unique.
+        seen: the cause in the residual, where the flight shows it.
+    """
+    name, gain = finding["effect"].replace("_", " "), finding["gain"]
+    low, high = gain.get("ci95", (None, None))
+    worth = [
+        f"The error on unseen data falls by {_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
+    ]
+    if low is not None and high is not None:
+        worth.append(f" (95 % interval {low:.3g} to {high:.3g})")
+    if finding["p_value"] is not None:
+        worth.append(f"; chance of that without {name}: {number(max(finding['p_value'], 1e-300), 2)}")
+    rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
+    return {
+        **finding,
+        "title": name,
+        "advice": ADVICE.get(finding["effect"], ""),
+        "worth": "".join(worth) + ".",
+        "noise": _noise_sentence(gain, floor, name),
+        "rivals": f"Look-alikes in its place, which lost, with the error they leave: {', '.join(rivals)}."
+        if rivals else "No other cause of the catalogue came near it.",
+        "carry": "It belongs to this flight, not to the vehicle: another flight has its own." if finding.get("per_log")
+        else "",
+        "figures": [
+            *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
+            gain_figure(finding, floor, f"{identifier}-gain"),
+        ],
+    }  # fmt: skip
+
+
+def _less(before: float | None, after: float | None) -> float | None:
+    return None if before is None or after is None else before - after
+
+
+def _noise_sentence(gain: JsonDict, floor: float, name: str) -> str:
+    """How much of the error is sensor noise that no model removes, without and with the cause."""
+    shares = [min(floor / v, 1.0) if v else None for v in (gain["mse_before"], gain["mse_after"])]
+    if None in shares:
+        return ""
+    without, having = (percent(s) for s in shares if s is not None)
+    return (
+        f"Share of the error that is sensor noise, which no model can remove: {without} without {name}, {having} with."
+    )
+
+
+def remaining(result: JsonDict, sets: Sequence[ScoredSet]) -> dict[str, Any]:
+    """What is left: by channel, and what it follows."""
+    channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
+    rows = [
+        {
+            "channel": name,
+            "share": percent(share),
+            "rmse": channels[name].rmse if name in channels else None,
+            "unit": channels[name].unit if name in channels else "",
+        }
+        for name, share in sorted(result["unexplained"].items(), key=lambda item: -item[1])
+    ]
+    follows = [
+        f"the {f['acts_on']} follows {f['signal'].rstrip(',')} ({percent(f['share'])} of the noise)"
+        for f in result.get("unexplained_follows", ())
+    ]
+    return {"rows": rows, "follows": follows}
+
+
 def diagnose_page(
     result: JsonDict, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[JsonDict],
-    provenance: Sequence[JsonDict], warnings: Sequence[str] = (),
+    provenance: Sequence[JsonDict], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
-    part = diagnosis_part(result, sets)
+    part = diagnosis_part(result, sets, maps=maps)
     fitted, held = (sum(s.role == role for s in sets) for role in ("train", "validate"))
     return {
         "title": f"Diagnosis of {vehicle}",

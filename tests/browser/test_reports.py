@@ -91,7 +91,7 @@ def test_lines_of_every_trace_are_on_the_picture(chromium: Browser, demo_page: P
         page = one.page
         assert page.locator("#plot-log0-rates .scatterlayer .js-line").count() == 9
         assert page.locator("#plot-parameters .points path").count() >= 18
-        assert page.locator("#plot-hidden-gain0 .bars path").count() >= 2
+        assert page.locator("#plot-hidden-0-gain .bars path").count() >= 2
 
 
 def test_tabs_and_zoom_by_mouse_and_by_keyboard(chromium: Browser, demo_page: Path) -> None:

@@ -211,7 +211,10 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
         "0.05",
         "a controller that knows it",
         "What it is worth",
-        "p 2 %",
+        "2 %",
+        "95 % interval 1.9 to 2.2",
+        "32 % without motor lag",
+        "command delay (1.3)",
         "sits in: p",
     ):
         assert expected in reader.text

@@ -39,11 +39,14 @@
     const out = Object.assign(view.x && !trace.x ? { x: view.x } : {}, trace);
     if ((trace.mode || "").includes("lines")) out.line = line(trace.role);
     if ((trace.mode || "").includes("markers")) out.marker = marker(trace.role);
+    if ((trace.mode || "") === "lines+markers") Object.assign(out.marker, { symbol: trace.role === "before" ? "circle-open" : "circle", size: 7 });
     if (trace.error_y) out.error_y = Object.assign({ color: out.marker.color, thickness: 1.2, width: 0 }, trace.error_y);
     if (trace.error_x) out.error_x = Object.assign({ color: colour(trace.role), thickness: 2, width: 5 }, trace.error_x);
     if (trace.type === "bar") out.marker = { color: colour(trace.role) };
     return out;
   }
+
+  const raised = (text) => text.replace(/\^(\d)/g, (_, digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[Number(digit)]);
 
   function layoutOf(view) {
     const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), automargin: true };
@@ -56,6 +59,7 @@
     };
     for (const [key, value] of Object.entries(view.layout)) {
       layout[key] = /^[xy]axis/.test(key) ? Object.assign({}, axis, value) : value;
+      if (value && value.title) layout[key].title = { text: raised(value.title.text) };
     }
     // Copied, since Plotly would write into it, and dressed in the colour of its role.
     layout.shapes = (view.layout.shapes || []).map(({ role, ...shape }) => ({ ...shape, line: { color: colour(role), width: 1.5, dash: "dash" } }));

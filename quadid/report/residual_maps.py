@@ -1,0 +1,289 @@
+"""What a cause looks like in the residual: binned against the quantity it depends on, with the cause and without.
+
+A cause leaves a shape: a lag an error in step with the angular acceleration, drag one in step with speed, a failing
+battery one in step with time.  Every effect lists the few pairs of channel and quantity where its equation puts it; the
+pair where switching it off shows most is drawn.  Flat at zero is what a complete model leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.noise import NoiseModel
+from quadid.identify.score import SCORE_SECONDS, covering, settle_states
+from quadid.identify.shooting import Shooting
+from quadid.model.layout import NEVER, Layout
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.report.figures import trace
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+Mode = Literal["value", "slope"]
+
+BINS = 24
+SLOPE_SECONDS = 0.1
+"""Span over which a residual's rate of change is taken [s]."""
+MOST_SECONDS = 300.0
+"""Flight that a map is made of, at most [s]."""
+P, Q, R, PHI, THETA, PSI, AX, AY, AZ = range(9)
+_TIMES = (("value", AZ, "time"), ("slope", P, "time"), ("slope", Q, "time"), ("slope", R, "time"))
+_LATE = (("value", P, "p_dot"), ("value", Q, "q_dot"), ("value", R, "r_dot"))
+_CORNER = (("slope", P, "thrust"), ("slope", Q, "thrust"), ("slope", R, "thrust"), ("slope", P, "time"))
+_AIR = (("value", AX, "v_x"), ("value", AY, "v_y"), ("value", AX, "time"), ("value", AY, "time"))
+PAIRS: dict[str, tuple[tuple[str, int, str], ...]] = {
+    "motor_lag": (*_LATE, ("value", AZ, "thrust_rate")),
+    "command_delay": (*_LATE, ("value", AZ, "thrust_rate")),
+    "imu_lag": (*_LATE, ("value", AZ, "thrust_rate")),
+    "attitude_delay": (("value", PHI, "p"), ("value", THETA, "q"), ("value", PSI, "r")),
+    "rotor_drag": _AIR,
+    "parasitic_drag": (*_AIR, ("value", AZ, "v_z")),
+    "wind": (*_AIR, ("value", AX, "heading"), ("value", AY, "heading")),
+    "rotor_drag_moment": (("slope", Q, "v_x"), ("slope", P, "v_y"), ("slope", P, "time"), ("slope", Q, "time")),
+    "rate_damping": (("slope", P, "p"), ("slope", Q, "q")),
+    "axial_inflow": (("value", AZ, "v_z"), ("value", AZ, "thrust"), ("value", AZ, "time")),
+    "weak_rotor": _CORNER,
+    "cg_offset": _CORNER,
+    "mass_change": _TIMES,
+    "thrust_drop": _TIMES,
+    "battery_sag": _TIMES,
+    "thrust_curve": (("value", AZ, "rotor_speed"), ("slope", P, "rotor_speed")),
+    "product_of_inertia": tuple(
+        ("slope", c, s) for c, s in ((P, "q_dot"), (P, "r_dot"), (Q, "p_dot"), (Q, "r_dot"), (R, "p_dot"), (R, "q_dot"))
+    ),
+    "rotor_spin_up": (("slope", R, "spin_rate"),),
+    "gyro_bias": tuple(("value", c, "time") for c in (P, Q, R, PHI, THETA, PSI)),
+    "accel_bias": tuple(("value", c, "time") for c in (AX, AY, AZ)),
+    "gyro_scale": (("value", P, "p"), ("value", Q, "q"), ("value", R, "r")),
+    "imu_misalignment": (
+        ("value", AX, "thrust"), ("value", AY, "thrust"), ("value", P, "q"), ("value", P, "r"), ("value", Q, "r"),
+        ("value", Q, "p"), ("value", R, "p"), ("value", R, "q"),
+    ),
+    "imu_lever_arm": tuple(("value", c, s) for c in (AX, AY, AZ) for s in ("p_dot", "q_dot", "r_dot")),
+    "ahrs_acceleration_error": (("value", PHI, "time"), ("value", THETA, "time"), ("value", THETA, "v_x")),
+    "ground_effect": (("value", AZ, "height"), ("value", AZ, "time")),
+}  # fmt: skip
+"""Where each effect shows: how the residual is taken, its channel, and the quantity it is drawn against."""
+_NAMES = {
+    "time": ("time", "s"), "p": ("roll rate", "rad/s"), "q": ("pitch rate", "rad/s"), "r": ("yaw rate", "rad/s"),
+    "p_dot": ("roll acceleration", "rad/s^2"), "q_dot": ("pitch acceleration", "rad/s^2"),
+    "r_dot": ("yaw acceleration", "rad/s^2"), "v_x": ("forward speed", "m/s"), "v_y": ("speed to the right", "m/s"),
+    "v_z": ("downward speed", "m/s"), "thrust": ("thrust over its mean", ""), "heading": ("heading", "rad"),
+    "thrust_rate": ("rate of change of thrust over its mean", "1/s"), "rotor_speed": ("mean rotor speed", "rad/s"),
+    "spin_rate": ("rate of change of the summed rotor speed", "rad/s^2"), "height": ("height", "m"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ResidualMap:
+    """Mean residual (measured less simulated) in bins of a quantity.
+
+    Attributes:
+        channel, unit: what is off.
+        against, against_unit: what it is drawn against.
+        x: middle of the bins, shape (bins,).
+        before, after: mean residual without and with the cause, shape (bins,).
+        before_error, after_error: 95 % half-widths from the spread between stretches of 1 s.
+        seen: chi-square by which the bins differ from zero without the cause, less that with it.
+    """
+
+    channel: str
+    unit: str
+    against: str
+    against_unit: str
+    x: FloatArray
+    before: FloatArray
+    after: FloatArray
+    before_error: FloatArray
+    after_error: FloatArray
+    seen: float
+
+
+def residual_map(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, effect: str, names: Sequence[str],
+    noise: NoiseModel | None = None,
+) -> ResidualMap | None:  # fmt: skip
+    """Residual with a cause and with it switched off, all else unchanged, where it shows most.
+
+    Args:
+        windows: flight; its first `MOST_SECONDS` are used.
+        vehicle: geometry and mass.
+        theta: full parameter vector with the cause, shape (size,).
+        effect: name of the cause.
+        names: its entries of the vector, as ``motor_lag.tau``.
+        noise: sensor noise.
+
+    Returns:
+        The map, or None where the flight lacks the channels.
+    """
+    shooting = Shooting(_first(windows), vehicle, SCORE_SECONDS)
+    if not shooting.rollouts or effect not in PAIRS:
+        return None
+    shooting.noise = covering(noise, shooting.channels, vehicle)
+    after = _residuals(shooting, theta)
+    signals = _signals(shooting, after)
+    shooting.restore({})
+    before = _residuals(shooting, switched_off(shooting.layout, theta, effect, names))
+    drawn = [
+        _binned(shooting, before, after, mode, channel, quantity, signals[quantity])
+        for mode, channel, quantity in PAIRS[effect]
+        if quantity in signals
+    ]
+    return max((m for m in drawn if m is not None), key=lambda m: m.seen, default=None)
+
+
+def switched_off(layout: Layout, theta: FloatArray, effect: str, names: Sequence[str]) -> FloatArray:
+    """The vector with one cause at neutral."""
+    out = theta.copy()
+    for name in names:
+        entry = layout.entry(name)
+        out[entry.index] = entry.neutral
+    if f"{effect}.time" in layout.entries:
+        out[layout.entry(f"{effect}.time").index] = NEVER
+    return out
+
+
+def _first(windows: Sequence[Window]) -> list[Window]:
+    out, left = list[Window](), MOST_SECONDS
+    for window in windows:
+        rows = int(left / window.dt)
+        if rows < round(2.0 * SCORE_SECONDS / window.dt):
+            break
+        out.append(window if len(window) <= rows else window.slice(0, rows))
+        left -= len(out[-1]) * window.dt
+    return out
+
+
+def _residuals(shooting: Shooting, theta: FloatArray) -> FloatArray:
+    """Measured less simulated, (segments, length, channels); NaN where not measured."""
+    lin = settle_states(shooting, theta)
+    return np.where(lin.weights > 0.0, -lin.residuals, np.nan)
+
+
+def _signals(shooting: Shooting, residual: FloatArray) -> dict[str, FloatArray]:
+    """Quantities at the samples of all segments, (segments, length); rates are simulated ones, free of gyro noise."""
+    parts: list[dict[str, FloatArray]] = []
+    place = 0
+    for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
+        rows = segments.starts[:, None] + np.arange(segments.length)
+        mine = residual[place : place + len(rows)]
+        place += len(rows)
+        parts.append(_of_window(rollout.window, rows, rollout.measured[rows][..., :3] - mine[..., :3], shooting))
+    shared = set.intersection(*(set(p) for p in parts))
+    return {name: np.concatenate([p[name] for p in parts]) for name in shared}
+
+
+def _of_window(window: Window, rows: NDArray[np.intp], rates: FloatArray, shooting: Shooting) -> dict[str, FloatArray]:
+    dt, speed = window.dt, window.rotor_speed
+    square = np.mean(speed**2, axis=1)
+    spins = np.array([rotor.spin for rotor in shooting.vehicle.rotors], dtype=np.float64)
+    start = window.log_span[0] if np.isfinite(window.log_span[0]) else window.t0
+    level = square / square.mean()
+    out = {
+        "time": window.t[rows] - start,
+        "thrust": level[rows],
+        "thrust_rate": np.gradient(level, dt)[rows],
+        "rotor_speed": speed.mean(axis=1)[rows],
+        "spin_rate": np.gradient(speed @ spins, dt)[rows],
+    }
+    for i, name in enumerate("pqr"):
+        out[name] = rates[..., i]
+        out[f"{name}_dot"] = np.gradient(rates[..., i], dt, axis=1)
+    if window.attitude is not None:
+        out |= _in_the_air(window, rows)
+    if window.position is not None:
+        out["height"] = -window.position[rows, 2]
+    return out
+
+
+def _in_the_air(window: Window, rows: NDArray[np.intp]) -> dict[str, FloatArray]:
+    """Heading, and body velocity where velocity is measured."""
+    assert window.attitude is not None
+    w, x, y, z = window.attitude[rows].transpose(2, 0, 1)
+    out = {"heading": np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))}
+    if window.velocity is not None:
+        v = window.velocity[rows]
+        u = np.stack([x, y, z], axis=-1)
+        # World to body: the inverse rotation, v + 2 u x (u x v - w v).
+        body = v + 2.0 * np.cross(u, np.cross(u, v) - w[..., None] * v)
+        out |= {"v_x": body[..., 0], "v_y": body[..., 1], "v_z": body[..., 2]}
+    return out
+
+
+def _binned(
+    shooting: Shooting, before: FloatArray, after: FloatArray, mode: str, channel: int, quantity: str,
+    signal: FloatArray,
+) -> ResidualMap | None:  # fmt: skip
+    if channel >= before.shape[2]:
+        return None
+    both = [before[..., channel], after[..., channel]]
+    if mode == "slope":
+        k = max(round(SLOPE_SECONDS / shooting.dt), 1)
+        both = [(r[:, k:] - r[:, :-k]) / (k * shooting.dt) for r in both]
+        total = np.cumsum(np.concatenate([np.zeros((len(signal), 1)), signal], axis=1), axis=1)
+        signal = (total[:, k:-1] - total[:, : -k - 1]) / k
+    good = np.isfinite(both[0]) & np.isfinite(both[1]) & np.isfinite(signal)
+    if np.count_nonzero(good) < 20 * BINS or np.ptp(signal[good]) <= 0.0:
+        return None
+    values = signal[good]
+    spread = np.linspace(values.min(), values.max(), BINS + 1)
+    edges = spread if quantity == "time" else np.quantile(values, np.linspace(0.0, 1.0, BINS + 1))
+    label = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, BINS - 1)
+    x = np.array([np.mean(signal[good & (label == i)]) if (good & (label == i)).any() else np.nan for i in range(BINS)])
+    (mean_b, error_b), (mean_a, error_a) = (_means(r, label, good) for r in both)
+    told = np.isfinite(error_b) & np.isfinite(error_a) & (error_b > 0.0) & (error_a > 0.0)
+    if np.count_nonzero(told) < BINS // 2:
+        return None
+    seen = float(np.sum((mean_b[told] / error_a[told]) ** 2 - (mean_a[told] / error_a[told]) ** 2))
+    name, unit = CHANNEL_NAMES[channel], CHANNEL_UNITS[channel]
+    if mode == "slope":
+        name, unit = f"d{name}/dt", f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+    return ResidualMap(
+        name, unit, *_NAMES[quantity], x[told], mean_b[told], mean_a[told], error_b[told], error_a[told], seen
+    )
+
+
+def _means(values: FloatArray, label: NDArray[np.intp], good: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Mean of each bin, and its 95 % half-width from the means of the stretches, which are nearly independent."""
+    segment = np.broadcast_to(np.arange(len(values))[:, None], values.shape)
+    key = (segment * BINS + label)[good]
+    size = len(values) * BINS
+    count = np.bincount(key, minlength=size).reshape(-1, BINS)
+    total = np.bincount(key, weights=values[good], minlength=size).reshape(-1, BINS)
+    samples = count.sum(axis=0)
+    stretches = np.count_nonzero(count, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = total.sum(axis=0) / samples
+        scatter = np.sum((total - count * mean) ** 2, axis=0) / samples**2
+        error = 1.96 * np.sqrt(scatter * stretches / np.maximum(stretches - 1, 1))
+    return mean, np.where(stretches >= 4, error, np.nan)
+
+
+def map_figure(found: ResidualMap, identifier: str, title: str) -> dict[str, Any]:
+    """The picture of a cause: residual against its quantity, with the cause in the model and with it switched off."""
+    data = []
+    for role, name, mean, error in (
+        ("before", f"without {title}", found.before, found.before_error),
+        ("after", f"with {title}", found.after, found.after_error),
+    ):
+        bars = {"type": "data", "array": error.tolist()}
+        data.append(trace(role, name, found.x, mean, mode="lines+markers", error_y=bars, showlegend=True))
+    unit = f" [{found.against_unit}]" if found.against_unit else ""
+    layout = {
+        "xaxis": {"title": {"text": f"{found.against}{unit}"}},
+        "yaxis": {"title": {"text": f"{found.channel} [{found.unit}]"}, "zeroline": True},
+        "hovermode": "closest",
+        "shapes": [{"type": "line", "x0": 0, "x1": 1, "xref": "paper", "y0": 0, "y1": 0, "role": "floor"}],
+    }
+    return {
+        "id": identifier,
+        "title": "What it looks like",
+        "caption": f"mean of measured less simulated {found.channel} against {found.against}; flat at zero is right",
+        "views": [{"label": "", "data": data, "layout": layout}],
+        "height": 280,
+    }
