@@ -83,16 +83,18 @@ def diagnose(
 ) -> None:
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
     from quadid_cli import loading, output, terminal
+    from quadid_cli.reporting import explained
 
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = loading.load_vehicle(vehicle)
     folder = output.out_folder(out)
     hertz = GRID if rate is None else rate
-    train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
-    held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
-    with terminal.progress() as advance:
-        done = run(described, train, held, seed, folder, vehicle, advance)
+    with explained(report, f"Diagnosis of {described.name}", [*logs, *(validate or [])], described, preset):
+        train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
+        held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
+        with terminal.progress() as advance:
+            done = run(described, train, held, seed, folder, vehicle, advance)
     if report is not None:
         from quadid_cli.reporting import diagnose_html
 

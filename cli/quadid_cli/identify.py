@@ -75,6 +75,7 @@ def identify(
 ) -> None:
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid_cli import loading, output, terminal
+    from quadid_cli.reporting import explained
 
     check_optimizer(optimizer)
     output.check_file(json, "--json")
@@ -82,10 +83,11 @@ def identify(
     described = loading.load_vehicle(vehicle)
     target = fitted_path(output.out_folder(out), described, vehicle)
     hertz = GRID if rate is None else rate
-    train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
-    held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
-    with terminal.progress() as advance:
-        done = run(described, train, held, optimizer, seed, target, advance)
+    with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
+        train = loading.load_logs(logs, described, hertz, start, stop, preset, unchecked)
+        held = loading.load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
+        with terminal.progress() as advance:
+            done = run(described, train, held, optimizer, seed, target, advance)
     if report is not None:
         done.result["report"] = str(report.absolute())
         write_report(report, done)

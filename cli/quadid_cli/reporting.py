@@ -7,15 +7,24 @@ import importlib.metadata
 import platform
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from quadid.errors import QuadidError
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
     from quadid.identify.result import ScoredSet
+    from quadid.inspection import Inspection
+    from quadid.vehicle import Vehicle
+    from quadid.window import Recording
     from quadid_cli.diagnose import Diagnosed
     from quadid_cli.loading import Log
 
+_LONGEST = 120.0
+"""Excitation is computed from this much flight at most [s]."""
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
@@ -38,7 +47,75 @@ def identify_html(
         },
         {"name": "vehicle file", "value": result["vehicle_file"]},
     ]
-    return render(identify_page(result, sets, fit.noise, [quality(log) for log in logs], rows, truth))
+    page = identify_page(result, sets, fit.noise, [quality(log) for log in logs], rows, truth)
+    page["excitation"] = told(fit, [log for log, s in zip(logs, sets, strict=True) if s.role == "train"])
+    return render(page)
+
+
+def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
+    """What the fitted logs can tell about each parameter, from `_LONGEST` s of them at most."""
+    from quadid.identify.excitation import excitation
+    from quadid.report.excitation_part import excitation_part
+
+    windows, seconds = [], 0.0
+    for window in (w for log in logs for w in log.windows):
+        rows = int((_LONGEST - seconds) / window.dt)
+        if rows < 2.0 / window.dt:
+            break
+        windows.append(window if len(window) <= rows else window.slice(0, rows))
+        seconds += len(windows[-1]) * window.dt
+    return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
+
+
+@contextmanager
+def explained(
+    report: Path | None, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str
+) -> Iterator[None]:  # fmt: skip
+    """When the block fails for want of good data, the report says why and shows the data; the error goes on.
+
+    Args:
+        report: file to write; None for none.
+        what: what was asked for, for the title.
+        texts: logs as given on the command line.
+        vehicle: its description.
+        preset: topic names of ROS logs.
+    """
+    try:
+        yield
+    except QuadidError as error:
+        if report is not None:
+            from quadid_cli.output import write_text
+            from quadid_cli.terminal import warn
+
+            file = write_text(report, failure_html(error, what, texts, vehicle, preset))
+            warn([f"no answer; why, and the data as they are: {file}"])
+        raise
+
+
+def failure_html(error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str) -> str:
+    """The HTML report of an attempt that failed."""
+    from quadid_replay import open_log
+
+    from quadid.inspection import inspect
+    from quadid.report.failure_page import failure_page
+    from quadid.report.page import render
+    from quadid_cli.loading import parse_cut
+
+    rows = provenance([])
+    read: list[tuple[Recording, Inspection | None]] = []
+    for text in texts:
+        try:
+            recording = open_log(parse_cut(text).path, preset)
+        except (QuadidError, OSError) as unreadable:
+            rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
+            continue
+        rows.append({"name": text, "value": f"sha256 {recording.sha256 or 'unknown'}"})
+        try:
+            read.append((recording, inspect(recording, vehicle)))
+        except QuadidError as unclear:
+            rows.append({"name": f"{text}, inspection", "value": str(unclear)})
+            read.append((recording, None))
+    return render(failure_page(what, error.found, error.fix, read, rows, error.allowed))
 
 
 def diagnose_html(done: Diagnosed, vehicle: str, seed: int) -> str:

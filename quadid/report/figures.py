@@ -73,7 +73,7 @@ def channel_figures(
     """
     series = scored.fitted.series
     share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + DETAIL_POINTS)))
-    whole = _thinned(series.measured, int(share * WHOLE_POINTS))
+    whole = thinned(series.measured, int(share * WHOLE_POINTS))
     detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
     out = []
     for key, (title, channels) in GROUPS.items():
@@ -128,7 +128,7 @@ def _focus(measured: FloatArray) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _thinned(values: FloatArray, points: int) -> NDArray[np.intp]:
+def thinned(values: FloatArray, points: int) -> NDArray[np.intp]:
     """Rows that keep the peaks: of each bin the rows where the liveliest channel is smallest and largest."""
     n = len(values)
     if n <= points:

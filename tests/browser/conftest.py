@@ -57,3 +57,45 @@ def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
     return output.write_text(folder / "report.html", demo.html(shown, 1))
+
+
+@pytest.fixture(scope="session")
+def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a flight that could not be used."""
+    from dataclasses import replace
+
+    from quadid_cli.reporting import failure_html
+    from quadid_replay import write_csv
+
+    from quadid.errors import LogError
+    from quadid.flight import fly
+    from quadid.vehicle import Vehicle
+
+    pelican = Vehicle.shipped("pelican")
+    folder = tmp_path_factory.mktemp("failure")
+    recording = fly(pelican, seconds=20.0, seed=1).recording
+    gyro = recording.channels["gyro"]
+    wrong = replace(recording, channels={**recording.channels, "gyro": replace(gyro, values=57.3 * gyro.values)})
+    write_csv(folder / "degrees.csv", wrong)
+    error = LogError("degrees.csv: the gyro does not agree with the attitude", fix="give rad/s")
+    file = folder / "report.html"
+    file.write_text(failure_html(error, "Identification", [str(folder / "degrees.csv")], pelican, "auto"))
+    return file
+
+
+@pytest.fixture(scope="session")
+def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a fleet of two vehicles, one of which wears."""
+    import numpy as np
+
+    from quadid.report.fleet_page import fleet_page as build
+    from quadid.report.fleet_summary import summarise
+    from quadid.report.page import render
+    from tests.report.test_fleet_page import rows
+
+    rng = np.random.default_rng(1)
+    worn = 1.0 - 0.002 * np.arange(60)
+    logs, parameters = rows({n: s + 0.01 * rng.standard_normal(60) for n, s in (("one", np.ones(60)), ("two", worn))})
+    file = tmp_path_factory.mktemp("fleet") / "fleet.html"
+    file.write_text(render(build(summarise(logs, parameters, []), logs, parameters, [], "Report of a fleet")))
+    return file

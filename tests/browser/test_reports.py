@@ -211,6 +211,20 @@ def test_hostile_names_in_a_log_stay_text(chromium: Browser, hostile_page: Path,
         assert one.complaints == []
 
 
+@pytest.mark.parametrize("name", ["failure_page", "fleet_page"])
+@pytest.mark.parametrize("width", [390, 1440])
+def test_the_other_reports_too(
+    chromium: Browser, request: pytest.FixtureRequest, shots: Path, name: str, width: int
+) -> None:  # fmt: skip
+    file: Path = request.getfixturevalue(name)
+    with opened(chromium, file, width) as one:
+        one.unfold()
+        one.page.screenshot(path=shots / f"{name}-{width}-light.png", full_page=True)
+        assert one.page.locator(".plot").count() >= 1
+        assert one.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert one.complaints == []
+
+
 def test_an_injected_script_is_refused_by_the_policy(chromium: Browser, hostile_page: Path, tmp_path: Path) -> None:
     text = hostile_page.read_text(encoding="utf-8")
     file = tmp_path / "tampered.html"

@@ -19,15 +19,16 @@
     return Object.fromEntries(Object.entries(value).map(([key, inner]) => [key, unpacked(inner)]));
   }
 
+  // Vehicles of a fleet, columns of a raw channel: colours that colour-blind eyes tell apart (Okabe and Ito), of middling lightness.
+  const units = ["#0b78c4", "#d55e00", "#00916b", "#b8629a", "#8a7a00", "#3f9fd8", "#a05a2c", "#6a6fd0", "#5c8a2e", "#c0392b", "#00838f", "#7f7f7f"];
+
   function line(role) {
+    if (role.startsWith("unit")) return { color: units[Number(role.slice(4)) % units.length], width: 1.2 };
     if (role === "measured") return { color: colour(role), width: 2.4 };
     if (role === "before") return { color: colour(role), width: 1.2, dash: "dot" };
     if (role === "floor") return { color: colour(role), width: 1, dash: "dash" };
     return { color: colour(role), width: 1.3 };
   }
-
-  // Vehicles of a fleet: colours that colour-blind eyes tell apart (Okabe and Ito), of middling lightness.
-  const units = ["#0b78c4", "#d55e00", "#00916b", "#b8629a", "#8a7a00", "#3f9fd8", "#a05a2c", "#6a6fd0", "#5c8a2e", "#c0392b", "#00838f", "#7f7f7f"];
 
   function marker(role) {
     if (role.startsWith("unit")) return { color: units[Number(role.slice(4)) % units.length], size: 6 };

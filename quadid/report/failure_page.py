@@ -1,0 +1,98 @@
+"""The page when there is no answer: why, what to do, and the data as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from quadid.inspection import Inspection
+from quadid.report.figures import WHOLE_POINTS, short, thinned
+from quadid.report.verdict import Verdict
+from quadid.window import CHANNELS, Channel, Recording
+
+JsonDict = Mapping[str, Any]
+
+MOST_FIGURES = 30
+_WORDS = {"ok": "fine", "warning": "doubtful", "error": "wrong", "unknown": "not checked"}
+
+
+def failure_page(
+    what: str, why: str, fix: str, logs: Sequence[tuple[Recording, Inspection | None]],
+    provenance: Sequence[JsonDict], allowed: str = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page.
+
+    Args:
+        what: what was asked for, for the title.
+        why: what was found.
+        fix: what to do.
+        logs: what could be read, with its inspection.
+        provenance: rows of name and value.
+        allowed: what would have been valid.
+    """
+    steps = [text for text in (fix[:1].upper() + fix[1:], *_missing(logs)) if text]
+    details = (f"Needed: {allowed}.",) if allowed else ()
+    verdict = Verdict("poor", f"No answer: {why}.", details, tuple(steps or ["`quadid inspect LOG` says more."]))
+    sections: list[dict[str, Any]] = []
+    for i, (recording, inspection) in enumerate(logs):
+        sections.append(_data(recording, i))
+        if inspection is not None:
+            sections.append(_checks(recording, inspection, i))
+    return {
+        "title": f"{what}: no answer",
+        "subtitle": "Nothing was identified. What the logs hold is shown as it was read.",
+        "verdict": asdict(verdict),
+        "sections": sections,
+        "provenance": provenance,
+    }
+
+
+def _missing(logs: Sequence[tuple[Recording, Inspection | None]]) -> list[str]:
+    found = [m for _, inspection in logs if inspection is not None for m in inspection.missing]
+    return [f"{m.channel}: {m.why}. To get it: {m.how}." for m in dict.fromkeys(found)]
+
+
+def _data(recording: Recording, number: int) -> dict[str, Any]:
+    figures = [
+        _figure(name, channel, f"raw{number}-{i}")
+        for i, (name, channel) in enumerate(recording.channels.items())
+        if len(channel.t) > 1 and i < MOST_FIGURES
+    ]
+    intro = f"{recording.format}, {len(recording.channels)} channels."
+    if recording.warnings:
+        intro += " Notes: " + "; ".join(recording.warnings) + "."
+    return {"id": f"raw{number}", "title": recording.name, "intro": intro, "figures": figures, "tables": []}
+
+
+def _figure(name: str, channel: Channel, identifier: str) -> dict[str, Any]:
+    values = channel.values.reshape(len(channel.t), -1)
+    rows = thinned(values, WHOLE_POINTS)
+    data = [
+        {
+            "role": f"unit{i}", "name": f"{name} {i + 1}", "type": "scatter", "mode": "lines",
+            "y": short(np.asarray(values[rows, i], dtype=np.float64)),
+        }
+        for i in range(values.shape[1])
+    ]  # fmt: skip
+    layout = {
+        "xaxis": {"title": {"text": "time [s]"}},
+        "yaxis": {"title": {"text": f"[{CHANNELS[name][1]}]"}},
+    }
+    t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
+    views = [{"label": "", "x": t, "data": data, "layout": layout}]
+    return {"id": identifier, "title": name.replace("_", " "), "views": views, "height": 220}
+
+
+def _checks(recording: Recording, inspection: Inspection, number: int) -> dict[str, Any]:
+    rows = [[c.name.replace("_", " "), _WORDS[c.verdict.value], c.message, c.fix or "–"] for c in inspection.checks]
+    outlook = [[o.parameter, "yes" if o.possible else "no", o.reason] for o in inspection.parameters]
+    return {
+        "id": f"checks{number}", "title": f"What {recording.name} allows", "intro": "", "figures": [],
+        "tables": [
+            {"head": ["Check", "Result", "Found", "What to do"], "rows": rows},
+            {"head": ["Parameter", "Possible", "Why"], "rows": outlook},
+        ],
+    }  # fmt: skip
