@@ -79,11 +79,16 @@ def _figure(name: str, channel: Channel, identifier: str) -> dict[str, Any]:
     ]  # fmt: skip
     layout = {
         "xaxis": {"title": {"text": "time [s]"}},
-        "yaxis": {"title": {"text": f"[{CHANNELS[name][1]}]"}},
     }
     t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
     views = [{"label": "", "x": t, "data": data, "layout": layout}]
-    return {"id": identifier, "title": name.replace("_", " "), "views": views, "height": 220}
+    return {
+        "id": identifier,
+        "title": name.replace("_", " "),
+        "caption": CHANNELS[name][1],
+        "views": views,
+        "height": 220,
+    }
 
 
 def _checks(recording: Recording, inspection: Inspection, number: int) -> dict[str, Any]:

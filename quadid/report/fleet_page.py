@@ -11,6 +11,7 @@ import numpy as np
 
 from quadid.report.figures import trace
 from quadid.report.page import number
+from quadid.report.page import unit as unit_text
 from quadid.report.verdict import Level, Verdict, percent
 
 JsonDict = Mapping[str, Any]
@@ -126,7 +127,7 @@ def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Se
 
 def _units(summary: JsonDict) -> Any:
     rows = [
-        (unit["unit"], f"{unit['done']} of {unit['logs']}", p["parameter"], number(p["median"]), p["unit"],
+        (unit["unit"], f"{unit['done']} of {unit['logs']}", p["parameter"], number(p["median"]), unit_text(p["unit"]),
          percent(p["spread"]), str(p["flights"]))
         for unit in summary["units"]
         for p in unit["parameters"]
@@ -149,7 +150,7 @@ def _drifts(summary: JsonDict) -> Any:
 
 def _outliers(summary: JsonDict) -> Any:
     rows = [
-        (o["log"], o["parameter"], f"{number(o['value'])} {o['unit_of_value']}", number(o["median"]),
+        (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
          number(o["deviations"], 2))
         for o in summary["outliers"]
     ]  # fmt: skip
