@@ -62,6 +62,13 @@ messages: $(MESSAGES) ## ... and ROS 2 Jazzy with quadid_msgs
 demo: venv ## fly, identify and diagnose three flights, write the report
 	$(BIN)/quadid demo --out demo-out
 
+.PHONY: reproduce
+reproduce: venv ## the paper's tables and figures, into docs/results
+	$(BIN)/quadid reproduce --out reproduce-out
+	mkdir -p docs/results/paper
+	cp reproduce-out/paper.md docs/results/
+	cp reproduce-out/paper/*.png docs/results/paper/
+
 # --- check
 
 .PHONY: test test-browser test-slow lint typecheck format
@@ -93,5 +100,5 @@ format: $(DEV) ## let ruff put files into the common form
 
 .PHONY: clean
 clean: ## remove the environment, caches and what commands wrote
-	rm -rf $(VENV) build install log dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo-out
+	rm -rf $(VENV) build install log dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo-out reproduce-out
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
