@@ -13,7 +13,7 @@ from quadid_cli.options import JsonTarget, OutFolder, VehicleName
 def export(
     vehicle: VehicleName,
     form: Annotated[
-        str, typer.Option("--format", metavar="F", help="yaml, px4, ardupilot, gazebo or rotorpy.")
+        str, typer.Option("--format", metavar="F", help="yaml, px4, ardupilot, gazebo, rotorpy or agilicious.")
     ] = "yaml",
     json: JsonTarget = None,
     out: OutFolder = Path(),

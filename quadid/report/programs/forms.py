@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from quadid.errors import ParameterError, nearest
+from quadid.report.programs.agilicious import agilicious
 from quadid.report.programs.ardupilot import ardupilot_frame, ardupilot_parameters
 from quadid.report.programs.facts import Facts
 from quadid.report.programs.gazebo import gazebo
@@ -10,7 +11,7 @@ from quadid.report.programs.px4 import px4
 from quadid.report.programs.rotorpy import rotorpy
 from quadid.vehicle import Vehicle
 
-FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy")
+FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy", "agilicious")
 
 
 def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
@@ -38,4 +39,6 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
         return {".sdf": gazebo(facts)}
     if form == "rotorpy":
         return {"_params.py": rotorpy(facts)}
+    if form == "agilicious":
+        return {".agilicious.yaml": agilicious(facts)}
     raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))

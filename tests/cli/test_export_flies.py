@@ -1,0 +1,155 @@
+"""Exports flown or read back by others: RotorPy flies the exported vehicle as our own simulation does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from quadid.errors import ParameterError
+from quadid.report.programs import export
+from quadid.vehicle import GRAVITY, Vehicle
+from tests.model.simulate import held, simulate, state
+
+FloatArray = NDArray[np.float64]
+DT, STEPS = 0.02, 100
+TO_FLU = np.array([1.0, -1.0, -1.0])
+NOMINAL = ("b", "d", "J_xx", "J_yy", "J_zz")
+
+
+@dataclass(frozen=True)
+class Flown:
+    """Rates and velocities after every step, FRD and NED."""
+
+    rate: FloatArray
+    velocity: FloatArray
+
+
+def speeds(vehicle: Vehicle, seed: int = 2) -> FloatArray:
+    """Held rotor speeds that turn the vehicle about all axes, shape (steps, rotors)."""
+    rng = np.random.default_rng(seed)
+    steps = rng.uniform(-0.03, 0.03, (STEPS // 10, len(vehicle.rotors)))
+    return np.asarray(vehicle.hover_speed() * (1.0 + np.repeat(steps, 10, axis=0)))
+
+
+def ours(vehicle: Vehicle, effects: dict[str, Any], rows: FloatArray) -> Flown:
+    """Our own simulation from rest at level; RotorPy knows no rotor inertia, so J_r is left out."""
+    values: dict[str, float] = {n: vehicle.parameters[n].initial for n in NOMINAL} | {"J_r": 0.0}
+    values |= {f"{effect}.{key}": v for effect, numbers in effects.items() for key, v in numbers.items()}
+    # Row 0 is where the simulation starts, and steady, so that a rotor lag has settled.
+    before = np.full((1, rows.shape[1]), rows[0])
+    out = simulate(vehicle, values, held(np.concatenate([before, rows]), DT), state())
+    return Flown(out.rate, out.velocity)
+
+
+def theirs(vehicle: Vehicle, rows: FloatArray) -> Flown:
+    """RotorPy flying the exported dictionary, same inputs, in our frames."""
+    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy (extra dev)")
+    space: dict[str, Any] = {}
+    exec(export(vehicle, "rotorpy", "test")["_params.py"], space)
+    at = {
+        "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3),
+        "wind": np.zeros(3), "rotor_speeds": rows[0].copy(),
+    }  # fmt: skip
+    flier = multirotor.Multirotor(
+        space["quad_params"], at, integrator_kwargs={"method": "RK45", "rtol": 1e-9, "atol": 1e-10}
+    )
+    rate, velocity = [], []
+    for row in np.concatenate([rows[:1], rows]):
+        at = flier.step(at, {"cmd_motor_speeds": row}, DT)
+        rate.append(at["w"] * TO_FLU)
+        # NWU world of RotorPy to NED: y and z over.
+        velocity.append(at["v"] * TO_FLU)
+    return Flown(np.array(rate), np.array(velocity))
+
+
+def with_effects(effects: dict[str, Any]) -> Vehicle:
+    """A Pelican with effects and a full rotor speed far away."""
+    pelican = Vehicle.shipped("pelican")
+    return pelican.model_copy(update={"effects": effects})
+
+
+CASES: dict[str, tuple[dict[str, Any], float]] = {
+    # RotorPy divides by the motor's time constant: the shortest that an export writes is 1 ms.
+    "nominal": ({}, 5e-3),
+    "centre of gravity and products of inertia": (
+        {"cg_offset": {"x": 0.006, "y": -0.004}, "product_of_inertia": {"J_xy": 5e-4, "J_xz": 2e-4, "J_yz": -3e-4}},
+        5e-3,
+    ),
+    "motor lag": ({"motor_lag": {"tau": 0.04}}, 1e-2),
+    # RotorPy lets the drag act at every hub, with the hub's own motion; ours at the centre.
+    "rotor drag": ({"rotor_drag": {"k_x": 0.3, "k_y": 0.3}}, 3e-2),
+}
+
+
+@pytest.mark.parametrize("case", list(CASES))
+def test_rotorpy_flies_the_exported_vehicle_as_we_do(case: str) -> None:
+    effects, tolerance = CASES[case]
+    vehicle = with_effects(effects)
+    rows = speeds(vehicle)
+    own, other = ours(vehicle, effects, rows), theirs(vehicle, rows)
+    n = min(len(own.rate), len(other.rate))
+    for a, b in ((own.rate, other.rate), (own.velocity, other.velocity)):
+        size = float(np.abs(a[:n]).max())
+        assert size > 0.3
+        assert float(np.abs(a[:n] - b[:n]).max()) < tolerance * size
+
+
+def test_agilicious_yaml_holds_the_same_physics() -> None:
+    cross = Vehicle.shipped("pelican_x").model_copy(
+        update={"effects": {"motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}}}
+    )
+    q = yaml.safe_load(export(cross, "agilicious", "test")[".agilicious.yaml"])
+    b, d = cross.parameters["b"].initial, cross.parameters["d"].initial
+    assert q["mass"] == cross.mass
+    assert q["thrust_map"] == pytest.approx([b, 0.0, 0.0])
+    assert q["kappa"] * q["thrust_map"][0] == pytest.approx(d)
+    assert q["motor_tau"] == 0.03
+    assert q["aero_coeff_1"] == pytest.approx([0.3 * cross.mass, 0.2 * cross.mass, 0.0])
+    assert q["inertia"] == pytest.approx([cross.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")])
+    # Its own allocation: moments of the thrusts T in the order fr, bl, br, fl.
+    t = np.array([1.0, 2.0, 3.0, 4.0])
+    places = np.array([q[f"tbm_{n}"] for n in ("fr", "bl", "br", "fl")])
+    moment = np.array([places[:, 1] @ t, -places[:, 0] @ t, q["kappa"] * (np.array([-1.0, -1.0, 1.0, 1.0]) @ t)])
+    mine = np.zeros(3)
+    for place, thrust in zip(places, t, strict=True):
+        i = int(np.argmin(np.linalg.norm(cross.rotor_positions * TO_FLU - place, axis=1)))
+        force = np.array([0.0, 0.0, -thrust])
+        mine += np.cross(cross.rotor_positions[i], force)
+        mine[2] += cross.spins[i] * d / b * thrust
+    np.testing.assert_allclose(moment * TO_FLU, mine, rtol=1e-7)
+
+
+def test_agilicious_refuses_what_it_cannot_hold() -> None:
+    with pytest.raises(ParameterError, match="not one in each quadrant"):
+        export(Vehicle.shipped("pelican"), "agilicious", "x")
+    cross = Vehicle.shipped("pelican_x")
+    turned = cross.model_copy(update={"rotors": tuple(r.model_copy(update={"spin": -r.spin}) for r in cross.rotors)})
+    with pytest.raises(ParameterError, match="turn the other way"):
+        export(turned, "agilicious", "x")
+
+
+def test_quadid_yaml_reads_back_as_the_same_vehicle() -> None:
+    vehicle = with_effects({"motor_lag": {"tau": 0.04}})
+    assert Vehicle.from_yaml(export(vehicle, "yaml", "x")[".yaml"]) == vehicle
+
+
+def test_parameter_files_are_read_by_the_ground_station_libraries(tmp_path: Path) -> None:
+    from pymavlink.mavparm import MAVParmDict
+
+    pelican = Vehicle.shipped("pelican")
+    known = pelican.model_copy(
+        update={"command": pelican.command.model_copy(update={"kind": "normalized", "max_speed": 800.0})}
+    )
+    hover = pelican.mass * GRAVITY / (4 * pelican.parameters["b"].initial * 800.0**2)
+    file = tmp_path / "x.param"
+    file.write_text(export(known, "ardupilot", "x")[".param"], encoding="utf-8")
+    read = MAVParmDict()
+    assert read.load(str(file))
+    assert read["MOT_THST_HOVER"] == pytest.approx(hover, rel=1e-4)
+    assert read["MOT_THST_EXPO"] == 1.0
