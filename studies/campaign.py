@@ -225,9 +225,15 @@ def _line(g: Graded) -> str:
 def run_many(todo: Sequence[Case], processes: int = 2) -> list[Graded]:
     """Runs cases in worker processes, in order."""
     if processes <= 1:
-        return [run(c) for c in todo]
+        return [_said(run(c)) for c in todo]
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        return list(pool.imap(run, todo, chunksize=1))
+        return [_said(g) for g in pool.imap(run, todo, chunksize=1)]
+
+
+def _said(g: Graded) -> Graded:
+    """Prints one case as it is done."""
+    print("   ", "right" if right(g) else "WRONG", f"{g.seconds:.1f} s", _line(g), flush=True)
+    return g
 
 
 def main() -> None:
@@ -245,9 +251,6 @@ def main() -> None:
         graded = run_many(todo, options.processes)
         good = sum(right(g) for g in graded)
         print(f"{group}: {good} of {len(graded)} right", flush=True)
-        for g in graded:
-            if not right(g):
-                print("   ", _line(g), flush=True)
         everything += [asdict(g) for g in graded]
     if options.out:
         Path(options.out).mkdir(parents=True, exist_ok=True)

@@ -14,6 +14,7 @@ from quadid.effects import EFFECTS
 from quadid.identify.shooting import Shooting
 from quadid.identify.uncertainty import Z95, uncertainty
 
+MOST_ALTERNATIVES = 4
 TIME_SIGMA = 0.1
 """Standard deviation [s] given to a change time, the resolution of its scan."""
 
@@ -73,12 +74,17 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
 
 
 def _alternatives(search: Search, cause: Candidate) -> tuple[Alternative, ...]:
-    """Other causes refitted in the round that accepted `cause`, on the same blocks."""
+    """Other causes refitted in place of `cause` on the same blocks, each effect once, best first."""
+    found: dict[str, Alternative] = {}
     for step in search.rounds:
-        if step.accepted is not None and step.accepted.candidate.label == cause.label:
-            losers: list[Trial] = [t for t in step.trials if t.candidate.effect != cause.effect and t.gain.total > 0.0]
-            losers.sort(key=lambda t: -t.gain.total)
-            return tuple(
-                Alternative(t.candidate.effect, float(t.model.held_out.sum()) / t.model.rows) for t in losers[:4]
-            )
-    return ()
+        if step.accepted is None or step.accepted.candidate.label != cause.label:
+            continue
+        losers: list[Trial] = [t for t in step.trials if t.candidate.effect != cause.effect and t.gain.total > 0.0]
+        losers.sort(key=lambda t: -t.gain.total)
+        for t in losers:
+            found.setdefault(t.candidate.effect, Alternative(t.candidate.effect, _mse(t)))
+    return tuple(sorted(found.values(), key=lambda a: a.mse_after)[:MOST_ALTERNATIVES])
+
+
+def _mse(trial: Trial) -> float:
+    return float(trial.model.held_out.sum()) / trial.model.rows

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, held_out_deviance
 from quadid.diagnose.candidates import Candidate
-from quadid.identify.polish import Polished, Prior, default_prior, polish
+from quadid.identify.polish import Polished, Prior, bounded_step, default_prior, polish, prior_terms
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.identify.uncertainty import score_products
 from quadid.parameters import NOMINAL_NAMES
@@ -87,47 +87,85 @@ def free_names(causes: tuple[Candidate, ...]) -> list[str]:
 
 def fit_model(
     shooting: Shooting, theta: FloatArray, causes: tuple[Candidate, ...], states: States | None = None,
-    iterations: int = 6, robust: bool = False,
+    iterations: int = 6, tolerance: float = 0.05,
 ) -> Model:  # fmt: skip
-    """Fits the model with `causes` from `theta` and `states`."""
+    """Fits the model with `causes` from `theta` and `states`; `iterations` and `tolerance` as in `polish`."""
     if states is not None:
         shooting.restore(states)
     free = shooting.free(free_names(causes))
-    result = polish(shooting, theta, free, iterations=iterations, robust=robust, tolerance=0.05)
+    result = polish(shooting, theta, free, iterations=iterations, tolerance=tolerance)
     return as_model(shooting, result, free, causes)
 
 
-def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
-    """Wraps a polish result with its held-out deviance."""
-    prior = default_prior(shooting, free)
+def as_model(
+    shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...], prior: Prior | None = None
+) -> Model:
+    """Wraps a polish result with its held-out deviance; `prior` as in the polish, weak by default."""
+    prior = prior or default_prior(shooting, free)
     held_out = held_out_deviance(result.lin, 1.0 / prior.sigma**2, block_labels(result.lin))
     return Model(causes, free, prior, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
 
 
-def extend(shooting: Shooting, model: Model, candidate: Candidate, iterations: int = 6, far: bool = False) -> Model:
-    """Refits `model` with `candidate` added, from each of its starts; returns the best.
+@dataclass(frozen=True)
+class Sketch:
+    """Where one Gauss-Newton step from a start would lead.
+
+    Attributes:
+        theta: full vector after the step.
+        drop: predicted fall of the deviance.
+    """
+
+    theta: FloatArray
+    drop: float
+
+
+def sketch(shooting: Shooting, model: Model, candidate: Candidate, far: bool = False) -> Sketch:
+    """Predicts what `model` with `candidate` would gain, by one linearisation at each of its starts; the best one.
 
     Args:
         shooting: the problem.
         model: what to extend.
         candidate: the cause to add.
-        iterations: linearisations a start may spend.
         far: also start from the vehicle file's nominal parameters, because without the cause the nominal ones may have
             been driven far away.
     """
-    causes = (*model.causes, candidate)
+    free = shooting.free(free_names((*model.causes, candidate)))
+    prior = default_prior(shooting, free)
     thetas = [model.theta]
     if far:
         nominal = shooting.layout.initial(shooting.vehicle)
         thetas.append(np.concatenate([nominal[: len(NOMINAL_NAMES)], model.theta[len(NOMINAL_NAMES) :]]))
-    best: Model | None = None
+    best: Sketch | None = None
     for base in thetas:
         for start in candidate.starts or ((),):
             theta = base.copy()
             if start:
                 theta[shooting.free(list(candidate.names)).index] = start
-            trial = replace(fit_model(shooting, theta, causes, model.states, iterations), worth=model.worth)
-            if best is None or trial.deviance < best.deviance:
+            shooting.restore(model.states)
+            lin = shooting.linearise(theta, free)
+            precision, pull, cost = prior_terms(free, prior, theta)
+            h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
+            z = bounded_step(free, theta, h, g)
+            deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
+            trial = Sketch(free.move(theta, z), model.deviance - deviance)
+            if best is None or trial.drop > best.drop:
                 best = trial
     assert best is not None
     return best
+
+
+def extend(
+    shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | None = None, iterations: int = 6
+) -> Model:
+    """Refits `model` with `candidate` added, from `start` or where its sketch leads.
+
+    Args:
+        shooting: the problem.
+        model: what to extend.
+        candidate: the cause to add.
+        start: full vector to start from.
+        iterations: linearisations to spend.
+    """
+    theta = sketch(shooting, model, candidate).theta if start is None else start
+    causes = (*model.causes, candidate)
+    return replace(fit_model(shooting, theta, causes, model.states, iterations, tolerance=0.2), worth=model.worth)

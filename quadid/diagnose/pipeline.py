@@ -39,7 +39,7 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
-LEAST_STRUCTURE = 0.03
+LEAST_STRUCTURE = 0.01
 """Structure below this share of the noise is not worth a word."""
 
 
@@ -101,11 +101,12 @@ def diagnose(
         if np.all(decisive.noise.variance > NOISE_FELL * before):
             break
         short.noise = decisive.noise
-        search = select(short, decisive, first.theta, listed, report)
+        again = select(short, decisive, first.theta, listed, report, search.model)
+        search = replace(again, rounds=(*search.rounds, *again.rounds))
     left = remainder(decisive, search.model, seed)
     verdict = judge(search.nominal, search.model, left)
     report("validation", 0.0)
-    outcome, per_finding = validate(decisive, search, validation)
+    outcome, per_finding = validate(decisive, search, validation, listed)
     findings = describe(decisive, search, per_finding, verdict is not Verdict.UNKNOWN)
     text = extended_vehicle(vehicle, decisive, search.model)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])

@@ -1,9 +1,11 @@
 """What remains after the named causes: is it noise?
 
-The whitened residual of each segment, initial state eliminated, is taken apart into cosine modes.  Pure noise leaves
-every mode with the power that the elimination itself leaves it, which is computed with the same projection on drawn
-noise.  Modes that stand above the noise model by more than chance are structure, at a frequency, in a channel.  The
-noise model comes from a flexible fit and is flat below 3 Hz, so slow structure cannot hide in it.
+Two looks: does the residual follow anything the vehicle did (`quadid.diagnose.probes`), and does its power stand above
+the noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into cosine
+modes.  Pure noise leaves every mode with the power that the elimination itself leaves it, which is computed with the
+same projection on drawn noise.  Modes that stand above the noise model by more than chance are structure, at a
+frequency, in a channel.  The noise model is that of a flexible fit, flat below 3 Hz, so slow structure cannot hide
+in it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.models import Model
+from quadid.diagnose.probes import Follows, follows
 from quadid.identify.shooting import Shooting
 from quadid.identify.spectrum import mode_power
 from quadid.model.rollout import CHANNEL_NAMES
@@ -48,14 +51,38 @@ class Structure:
 
 @dataclass(frozen=True)
 class Remainder:
-    """All channels; `deviance` sums those with significant structure."""
+    """What is left, by channel of the residual and by what it follows.
+
+    Attributes:
+        channels: power above the noise, one entry a channel.
+        follows: what can be predicted on unseen blocks, strongest first.
+        rows: independent residuals.
+    """
 
     channels: tuple[Structure, ...]
+    follows: tuple[Follows, ...]
+    rows: float
 
     @property
     def deviance(self) -> float:
-        """Deviance of the significant structure."""
-        return sum(s.deviance for s in self.channels if s.errors > ALARM)
+        """Deviance of the significant structure, by the look that sees more of it; the two overlap."""
+        power = sum(s.deviance for s in self.channels if s.errors > ALARM)
+        return max(power, sum(f.gain.total for f in self.followed))
+
+    @property
+    def followed(self) -> tuple[Follows, ...]:
+        """Generic causes that predict unseen residuals beyond chance, strongest first."""
+        return tuple(f for f in self.follows if f.significant)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of each channel's residual power that is structure, for channels where there is any."""
+        out = {s.channel: s.share for s in self.significant}
+        rows = self.rows / max(len(self.channels), 1)
+        for f in self.followed:
+            name = CHANNEL_NAMES[f.site.channels[0][0]]
+            out[name] = max(out.get(name, 0.0), min(f.gain.total / rows, 1.0))
+        return out
 
     @property
     def significant(self) -> tuple[Structure, ...]:
@@ -73,7 +100,7 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
         if c in _ATTITUDE or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
         out.append(_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
-    return Remainder(tuple(out))
+    return Remainder(tuple(out), follows(shooting, model), model.rows)
 
 
 def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:

@@ -132,7 +132,15 @@ class Diagnosis:
     @property
     def unexplained(self) -> dict[str, float]:
         """Share of each channel's residual power that is structure, where there is any."""
-        return {s.channel: round(s.share, 4) for s in self.remainder.significant}
+        return {channel: round(share, 4) for channel, share in self.remainder.shares.items()}
+
+    @property
+    def unexplained_follows(self) -> list[dict[str, Any]]:
+        """What the rest follows, strongest first: where it acts, the signal, and the errors by which it stands out."""
+        return [
+            {"acts_on": f.site.name, "signal": f.signal, "share": round(f.gain.total / self.remainder.rows, 5)}
+            for f in self.remainder.followed
+        ]
 
     def to_dict(self, vehicle_file: str | None = None) -> dict[str, Any]:
         """Plain data of contract form."""
@@ -149,6 +157,7 @@ class Diagnosis:
                 "mse_extended_refitted": self.validation.refitted,
             },
             "unexplained": self.unexplained,
+            "unexplained_follows": self.unexplained_follows,
             "vehicle_file": vehicle_file,
             "warnings": list(self.warnings),
         }

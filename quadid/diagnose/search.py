@@ -11,7 +11,7 @@ from scipy import stats
 
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.models import Model, extend, fit_model
+from quadid.diagnose.models import Model, extend, fit_model, sketch
 from quadid.diagnose.screen import Score, screen
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import NEVER
@@ -20,7 +20,11 @@ FloatArray = NDArray[np.float64]
 
 LINEAR_MISFIT = 4.0
 """Deviance per row above which the longer segments are too far from linear to search on."""
-SHORT_LIST = 5
+NEAR = 0.4
+"""Candidates that should gain this share of what the best one should are refitted beside it …"""
+MOST_SKETCHES = 10
+FEWEST_REFITS, MOST_REFITS = 3, 7
+"""… but no fewer and no more than these."""
 MOST_CAUSES = 12
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
@@ -81,7 +85,7 @@ class Search:
 
 def select(
     short: Shooting, decisive: Shooting, theta: FloatArray, listed: Sequence[Candidate],
-    report: Callable[[str, float], None],
+    report: Callable[[str, float], None], known: Model | None = None,
 ) -> Search:  # fmt: skip
     """Selects the causes that the data support, most gain first.
 
@@ -91,6 +95,7 @@ def select(
         theta: nominal optimum.
         listed: causes to try.
         report: progress.
+        known: selection made with a poorer noise model, to go on from.
     """
     nominal = fit_model(decisive, theta, ())
     rounds: list[Round] = []
@@ -98,12 +103,15 @@ def select(
     if nominal.misfit > LINEAR_MISFIT:
         shooting, model = short, fit_model(short, theta, ())
         base = model
-    tests = 1
+    tests = len(listed)
+    if known is not None:
+        shooting, base = decisive, nominal
+        model = _prune(shooting, known, None, base, tests)
     while len(model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
         scores = screen(shooting, model, list(listed))
         tests = len(scores)
-        trials = [_try(shooting, model, s, tests) for s in _short_list(scores, tests)]
+        trials = [_try(shooting, model, d, tests) for d in _drafts(shooting, model, scores, tests)]
         accepted = _choose(trials, model, base)
         rounds.append(Round(tuple(trials), accepted, tuple(scores)))
         if accepted is not None:
@@ -113,28 +121,44 @@ def select(
         if shooting is short:
             longer = replace(fit_model(decisive, model.theta, model.causes, iterations=10), worth=model.worth)
             if longer.misfit < LINEAR_MISFIT or accepted is None:
-                shooting, model, base = decisive, swap_look_alikes(decisive, longer, listed), nominal
+                shooting, base = decisive, nominal
+                model, swaps = swap_look_alikes(decisive, longer, listed)
+                rounds += swaps
                 continue
         if accepted is None:
             break
     if shooting is short:
         model = fit_model(decisive, model.theta, model.causes, iterations=10)
-    model = swap_look_alikes(decisive, model, listed)
-    return Search(nominal, model, tuple(rounds), tests)
+    model, swaps = swap_look_alikes(decisive, model, listed)
+    return Search(nominal, model, (*rounds, *swaps), tests)
 
 
-def _short_list(scores: list[Score], tests: int) -> list[Score]:
-    """Best causes of the screen, with all their look-alikes and all that cannot be linearised."""
-    threshold = 0.5 * float(stats.chi2.isf(FALSE_ALARM / tests, 1))
-    top = [s for s in scores if s.drop > threshold][:SHORT_LIST]
-    families = {s.candidate.family for s in top}
-    out = list(top)
-    for s in scores:
-        nonlinear = bool(s.candidate.starts)
-        timed_noise = s.candidate.timed is not None and s.drop <= threshold
-        if s not in out and (nonlinear or s.candidate.family in families) and not timed_noise:
-            out.append(s)
-    return _one_corner(out)
+@dataclass(frozen=True)
+class _Draft:
+    """A candidate worth refitting: what it should gain, and where to start."""
+
+    score: Score
+    drop: float
+    start: FloatArray | None
+
+
+def _drafts(shooting: Shooting, model: Model, scores: list[Score], tests: int) -> list[_Draft]:
+    """Candidates to refit: the best by prediction, and look-alikes that come near them."""
+    far = model.misfit > LINEAR_MISFIT
+    least = 0.5 * max(float(stats.chi2.isf(FALSE_ALARM / tests, 1)), LEAST_GAIN, LEAST_SHARE * model.rows)
+    linear = [s for s in scores if not s.candidate.starts and s.drop > least][:MOST_SKETCHES]
+    drafts = []
+    for score in _one_corner([s for s in scores if s.candidate.starts or s in linear]):
+        if score.candidate.timed is not None:
+            drafts.append(_Draft(score, score.drop, None))
+        elif score.candidate.starts or far:
+            drawn = sketch(shooting, model, score.candidate, far)
+            drafts.append(_Draft(score, max(drawn.drop, score.drop if far else drawn.drop), drawn.theta))
+        else:
+            drafts.append(_Draft(score, score.drop, model.theta))
+    drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)
+    near = [d for d in drafts if d.drop > NEAR * drafts[0].drop]
+    return near[:MOST_REFITS] if len(near) > FEWEST_REFITS else drafts[:FEWEST_REFITS]
 
 
 def _one_corner(scores: list[Score]) -> list[Score]:
@@ -144,18 +168,17 @@ def _one_corner(scores: list[Score]) -> list[Score]:
     return [s for s in scores if id(s) not in drop]
 
 
-def _try(shooting: Shooting, model: Model, score: Score, tests: int) -> Trial:
-    candidate = score.candidate
-    start = model
-    if candidate.timed is not None and score.time is not None:
-        theta = model.theta.copy()
-        theta[candidate.timed] = score.time
-        start = replace(model, theta=theta)
-    extended = extend(shooting, start, candidate, far=model.misfit > LINEAR_MISFIT)
+def _try(shooting: Shooting, model: Model, draft: _Draft, tests: int) -> Trial:
+    candidate, time = draft.score.candidate, draft.score.time
+    start = draft.start
+    if candidate.timed is not None and time is not None:
+        start = model.theta.copy()
+        start[candidate.timed] = time
+    extended = extend(shooting, model, candidate, start)
     if candidate.timed is not None:
         extended = _refine_time(shooting, extended, candidate)
     gain = paired_gain(model.held_out, extended.held_out)
-    return Trial(candidate, extended, gain, model.deviance - extended.deviance, tests * score.trials)
+    return Trial(candidate, extended, gain, model.deviance - extended.deviance, tests * draft.score.trials)
 
 
 def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Model:
@@ -222,29 +245,48 @@ def _choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
     return best
 
 
-def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Model:
+def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> tuple[Model, list[Round]]:
     """Puts a look-alike in the place of a cause where that fits unseen blocks better.
 
     Which of two look-alikes was taken first may have been decided on segments too short to tell them apart, or before
     another cause was known.
+
+    Returns:
+        The better model, and for each cause what its rivals did in its place.
     """
+    rounds = []
     for cause in model.causes:
-        if any(c.requires == cause.effect for c in model.causes):
-            continue
-        present = {c.label for c in model.causes}
-        rivals = [
-            c for c in listed
-            if c.family == cause.family and c.label not in present and not c.split and c.timed is None
-            and c.effect != cause.effect
-        ]  # fmt: skip
-        if not rivals:
+        rivals = _rivals(model, cause, listed)
+        if not rivals or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)
-        best = min((extend(shooting, rest, r) for r in rivals), key=lambda m: float(m.held_out.sum()))
-        gain = paired_gain(model.held_out, best.held_out)
-        if gain.total > LEAST_GAIN and gain.total > gain.error:
-            model = best
-    return model
+        sketches = sorted(((sketch(shooting, rest, r), r) for r in rivals), key=lambda pair: -pair[0].drop)
+        worth = rest.deviance - model.deviance
+        drawn = [(s, r) for s, r in sketches if s.drop > NEAR * worth][:2]
+        trials = [_stand_in(rest, extend(shooting, rest, r, s.theta), r) for s, r in drawn]
+        if not trials:
+            continue
+        holder = _stand_in(rest, model, cause)
+        best = max(trials, key=lambda t: t.gain.total)
+        gain = paired_gain(model.held_out, best.model.held_out)
+        swapped = gain.total > LEAST_GAIN and gain.total > gain.error
+        rounds.append(Round((holder, *trials), best if swapped else holder, ()))
+        model = best.model if swapped else model
+    return model, rounds
+
+
+def _stand_in(rest: Model, model: Model, candidate: Candidate) -> Trial:
+    """What a candidate does for `rest`, the model without it."""
+    return Trial(candidate, model, paired_gain(rest.held_out, model.held_out), rest.deviance - model.deviance, 1)
+
+
+def _rivals(model: Model, cause: Candidate, listed: Sequence[Candidate]) -> list[Candidate]:
+    present = {c.label for c in model.causes}
+    return [
+        c for c in listed
+        if c.family == cause.family and c.label not in present and not c.split and c.timed is None
+        and c.effect != cause.effect
+    ]  # fmt: skip
 
 
 def split_causes(model: Model) -> Model:
@@ -257,6 +299,12 @@ def split_causes(model: Model) -> Model:
 
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """Refits `model` without `cause` and what requires it."""
+    left, theta = left_over(shooting, model, cause)
+    return replace(fit_model(shooting, theta, left, model.states), worth=model.worth)
+
+
+def left_over(shooting: Shooting, model: Model, cause: Candidate) -> tuple[tuple[Candidate, ...], FloatArray]:
+    """Causes of `model` but `cause` and what requires it, and the parameter vector with those at neutral."""
     left = tuple(c for c in model.causes if c.label != cause.label and c.requires != cause.effect)
     gone = [c for c in model.causes if c not in left]
     theta = model.theta.copy()
@@ -264,12 +312,12 @@ def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
         theta[shooting.free(list(c.names)).index] = 0.0
         if c.timed is not None:
             theta[c.timed] = NEVER
-    return replace(fit_model(shooting, theta, left, model.states), worth=model.worth)
+    return left, theta
 
 
-def _prune(shooting: Shooting, model: Model, newest: Candidate, nominal: Model, tests: int) -> Model:
-    """Drops causes that the newest one made superfluous."""
-    for cause in [c for c in model.causes if c.label != newest.label]:
+def _prune(shooting: Shooting, model: Model, newest: Candidate | None, nominal: Model, tests: int) -> Model:
+    """Drops causes that the newest one, or a better noise model, made superfluous."""
+    for cause in [c for c in model.causes if newest is None or c.label != newest.label]:
         if cause.label not in {c.label for c in model.causes} or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)

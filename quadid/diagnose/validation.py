@@ -15,15 +15,20 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, paired_gain
 from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.clutter import clutter_names, without_in_clutter
 from quadid.diagnose.models import Model
 from quadid.diagnose.result import Benefit, Validation
-from quadid.diagnose.search import Search, without
+from quadid.diagnose.search import Search
 from quadid.effects import EFFECTS
 from quadid.identify.polish import polish
 from quadid.identify.shooting import Shooting
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
+
+
+_ALL = ""
+"""Key of the model from which no cause was taken out."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +41,33 @@ class Worth:
     deviance: float
 
 
-def validate(decisive: Shooting, search: Search, logs: Sequence[Window]) -> tuple[Validation, tuple[Worth, ...]]:
-    """Scores nominal and extended model on unseen data, and each cause by leaving it out.
+def validate(
+    decisive: Shooting, search: Search, logs: Sequence[Window], listed: Sequence[Candidate]
+) -> tuple[Validation, tuple[Worth, ...]]:
+    """Scores nominal and extended model on unseen data, and each cause by leaving it out (`without_in_clutter`).
+
+    Args:
+        decisive: the problem that decided.
+        search: the selection.
+        logs: validation flights; none: blocks of the training data are left out.
+        listed: the catalogue.
 
     Returns:
         The overall figures, and the worth of each cause, most valuable first.
     """
-    rest = {c.label: without(decisive, search.model, c) for c in search.model.causes}
+    rest = _each_left_out(decisive, search.model, listed)
     if not logs:
         return _on_blocks(search, rest)
     return _on_logs(decisive, search, rest, logs)
+
+
+def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
+    if not model.causes:
+        return {}
+    decisive.restore(model.states)
+    everything = decisive.linearise(model.theta, decisive.free(clutter_names(model, listed)))
+    out = {c.label: without_in_clutter(decisive, model, c, listed, everything) for c in model.causes}
+    return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}
 
 
 def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, tuple[Worth, ...]]:
@@ -53,14 +75,28 @@ def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, tupl
     figures = Validation(
         float(search.nominal.held_out.sum()) / rows, float(search.model.held_out.sum()) / rows, "held-out blocks"
     )
-    worth = [_worth(c, rest[c.label].held_out, search.model.held_out, rows) for c in search.model.causes]
+    worth = [_block_worth(c, search, rest) for c in search.model.causes]
     return figures, tuple(sorted(worth, key=lambda w: -w.deviance))
 
 
-def _worth(cause: Candidate, before: FloatArray, after: FloatArray, rows: float) -> Worth:
+def _block_worth(cause: Candidate, search: Search, rest: dict[str, Model]) -> Worth:
+    mse = float(search.model.held_out.sum()) / search.model.rows
+    return _worth(cause, rest[cause.label].held_out, rest[_ALL].held_out, mse, search.model.rows)
+
+
+def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, rows: float) -> Worth:
+    """Worth from the deviance of each block without and with the cause, both amid clutter.
+
+    Args:
+        cause: what was taken out.
+        before: deviance of each block without it.
+        after: deviance of each block with it.
+        mse: error of the extended model, which the gain is reported on top of.
+        rows: independent residuals.
+    """
     gain = paired_gain(before, after)
     low, high = gain.interval
-    benefit = Benefit(float(before.sum()) / rows, float(after.sum()) / rows, (low / rows, high / rows))
+    benefit = Benefit(mse + gain.total / rows, mse, (low / rows, high / rows))
     return Worth(cause, benefit, gain.p_value, gain.total)
 
 
@@ -70,14 +106,17 @@ def _on_logs(
     scorer = Shooting(logs, decisive.vehicle, decisive.length * decisive.dt, decisive.noise, decisive.layout)
     nominal, rows = block_deviance(scorer, search.nominal)
     extended, _ = block_deviance(scorer, search.model)
+    mse, untidy = float(extended.sum()) / rows, np.empty(0)
     worth = []
     for cause in search.model.causes:
         if EFFECTS[cause.effect].per_log:
             # The value belongs to the training flight; its worth is measured there, on blocks left out.
-            worth.append(_worth(cause, rest[cause.label].held_out, search.model.held_out, search.model.rows))
+            worth.append(_block_worth(cause, search, rest))
         else:
+            if not len(untidy):
+                untidy, _ = block_deviance(scorer, rest[_ALL])
             before, _ = block_deviance(scorer, rest[cause.label])
-            worth.append(_worth(cause, before, extended, rows))
+            worth.append(_worth(cause, before, untidy, mse, rows))
     refitted = _second_halves(scorer, search.model, logs)
     figures = Validation(float(nominal.sum()) / rows, float(extended.sum()) / rows, "validation logs", refitted)
     return figures, tuple(sorted(worth, key=lambda w: -w.deviance))

@@ -49,7 +49,7 @@ class BoxProblem:
         self._theta = shooting.layout.initial(vehicle)
         none = shooting.free([])
         self._index = shooting.free(NOMINAL_NAMES).index
-        self._bases = [np.ascontiguousarray(b) for b, _, _ in shooting.eliminated(self._theta, none)]
+        self._bases = [np.ascontiguousarray(c.basis) for c in shooting.columns(self._theta, none)]
         (self._states,) = shooting.snapshot().values()
         (self._n_pre,) = shooting.snapshot()
         self.lower, self.upper = np.log(vehicle.bounds).T

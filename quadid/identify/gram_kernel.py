@@ -16,6 +16,10 @@ FloatArray = NDArray[np.float64]
 
 CHUNK = 24
 """Segments worked on at once."""
+PACK = 8
+"""Columns are padded to a multiple of this."""
+NEGLIGIBLE = 1e-5
+"""Entries of a whitener below this share of its largest are left out."""
 
 
 def segment_grams(
@@ -30,16 +34,18 @@ def segment_grams(
         weights: row weights (segments, length, C), 0 where nothing was measured.
         sigma: standard deviation of each channel (C,), for rows that are not whitened.
         coloured: True for channels to whiten, in segments that have all their samples.
-        whitener: (C, length, length).
+        whitener: (C, length, length), lower-triangular.
         first: first segment.
         last: one past the last.
         grams: (segments, width + 1, width + 1), written: products of the columns, the base residual last.
     """
     length, channels = weights.shape[1:]
-    lanes, width = out.shape[0] * LANES, len(steps) + 1
-    inverse = np.zeros(lanes)
+    width = len(steps) + 1
+    lanes = -(-width // PACK) * PACK
+    inverse = np.zeros(out.shape[0] * LANES)
     inverse[1:width] = 1.0 / steps
     flat_out = out.reshape(*out.shape[:3], -1)
+    reach = [_reach(w) for w in whitener]
     for start in range(first, last, CHUNK):
         stop = min(start + CHUNK, last)
         x = np.empty((channels, length, stop - start, lanes))
@@ -48,7 +54,7 @@ def segment_grams(
         flat = x.reshape(channels, length, -1)
         for c in np.flatnonzero(complete.any(axis=1)):
             white = np.empty_like(flat[c])
-            _product(whitener[c], flat[c], white)
+            _product(whitener[c], reach[c], flat[c], white)
             white = white.reshape(length, stop - start, lanes)
             if complete[c].all():
                 x[c] = white
@@ -80,19 +86,24 @@ def _columns(
                 base = out[0, first + s, i, c * LANES]
                 to = x[c, i, s]
                 for block in range(out.shape[0]):
-                    row = out[block, first + s, i]
-                    for lane in range(LANES):
-                        to[block * LANES + lane] = (
-                            (row[c * LANES + lane] - base) * inverse[block * LANES + lane] * scale
-                        )
+                    row, start = out[block, first + s, i], block * LANES
+                    for lane in range(min(LANES, lanes - start)):
+                        to[start + lane] = (row[c * LANES + lane] - base) * inverse[start + lane] * scale
                 to[0] = base * scale
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
-def _product(w: FloatArray, x: FloatArray, y: FloatArray) -> None:
-    """Writes y = w x for w (n, n), x (n, m) in strips that stay in cache, four terms at a time.
+def _reach(w: FloatArray) -> NDArray[np.int64]:
+    """First column of each row of a lower-triangular whitener that still matters, shape (n,)."""
+    matters = np.abs(w) > NEGLIGIBLE * np.max(np.abs(w))
+    return np.asarray(np.argmax(matters, axis=1), dtype=np.int64)
 
-    Own loops, as in `_squares`: the caller already runs one thread a core.
+
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _product(w: FloatArray, reach: NDArray[np.int64], x: FloatArray, y: FloatArray) -> None:
+    """Writes y = w x for lower-triangular w (n, n), x (n, m) in strips that stay in cache, four terms at a time.
+
+    Row i of w counts from column `reach[i]` to i.  Own loops, as in `_squares`: the caller already runs one thread a
+    core.
     """
     n, m = x.shape
     for low in range(0, m, 256):
@@ -100,12 +111,14 @@ def _product(w: FloatArray, x: FloatArray, y: FloatArray) -> None:
         for i in range(n):
             row = y[i, low:high]
             row[:] = 0.0
-            for r in range(0, n - 3, 4):
+            first, end = reach[i], i + 1
+            last = end - (end - first) % 4
+            for r in range(first, last, 4):
                 f0, f1, f2, f3 = w[i, r], w[i, r + 1], w[i, r + 2], w[i, r + 3]
                 r0, r1, r2, r3 = x[r, low:high], x[r + 1, low:high], x[r + 2, low:high], x[r + 3, low:high]
                 for j in range(high - low):
                     row[j] += f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
-            for r in range(n - n % 4, n):
+            for r in range(last, end):
                 f0 = w[i, r]
                 r0 = x[r, low:high]
                 for j in range(high - low):
@@ -125,11 +138,15 @@ def _squares(x: FloatArray, width: int, products: FloatArray) -> None:
             r0, r1, r2, r3 = x[i, s], x[i + 1, s], x[i + 2, s], x[i + 3, s]
             for a in range(width):
                 f0, f1, f2, f3 = r0[a], r1[a], r2[a], r3[a]
-                for b in range(width):
+                # Below the diagonal only what fills a pack: the rest is copied at the end.
+                for b in range(a // PACK * PACK, width):
                     g[a, b] += f0 * r0[b] + f1 * r1[b] + f2 * r2[b] + f3 * r3[b]
         for i in range(rows - rows % 4, rows):
             r0 = x[i, s]
             for a in range(width):
                 f0 = r0[a]
-                for b in range(width):
+                for b in range(a // PACK * PACK, width):
                     g[a, b] += f0 * r0[b]
+        for a in range(width):
+            for b in range(a // PACK * PACK):
+                g[a, b] = g[b, a]

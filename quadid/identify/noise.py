@@ -63,20 +63,18 @@ class NoiseModel:
     def whitener(self, length: int, dt: float) -> FloatArray:
         """Returns W, shape (channels, length, length): W[c] @ r has unit variance and is white for pure noise r.
 
-        A slow part is whitened by the Cholesky factor of its covariance, a spectrum in the cosine modes, which are
-        nearly independent for stationary noise.
+        Rows look back only (inverse of a Cholesky factor), so a whitened residual keeps its order in time.
         """
         out = np.zeros((len(self.white), length, length))
         for c, (white, slow) in enumerate(zip(self.white, self.slow, strict=True)):
             if slow > 0.0:
-                cov = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / self.slow_time)
-                out[c] = np.linalg.inv(np.linalg.cholesky(cov))
-            elif self.shape is not None:
-                modes = np.linspace(0.0, 1.0, length, endpoint=False)
-                level = np.interp(modes, np.linspace(0.0, 1.0, SHAPE_POINTS), self.shape[c])
-                out[c] = _cosines(length) / (white * np.sqrt(level))[:, None]
+                covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / self.slow_time)
+            elif self.shape is not None and np.ptp(self.shape[c]) > 0.0:
+                covariance = white**2 * _stationary(self.shape[c], length)
             else:
                 out[c] = np.eye(length) / white
+                continue
+            out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
         return out
 
     @property
@@ -86,12 +84,16 @@ class NoiseModel:
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
 
 
-@lru_cache(maxsize=32)
-def _cosines(length: int) -> FloatArray:
-    """Orthonormal cosine transform, rows are modes."""
-    from scipy.fft import dct
+def _stationary(shape: FloatArray, length: int) -> FloatArray:
+    """Covariance (length, length) of noise whose spectrum is `shape` from 0 to the Nyquist frequency (Wiener-Khinchin).
 
-    return np.asarray(dct(np.eye(length), axis=0, norm="ortho"))
+    The spectrum is linear between its points, on a grid fine enough for the longest lag.
+    """
+    points = max(4 * length, SHAPE_POINTS)
+    frequency = (np.arange(points) + 0.5) / points
+    level = np.interp(frequency, np.linspace(0.0, 1.0, SHAPE_POINTS), shape)
+    lag = np.cos(np.pi * np.outer(np.arange(length), frequency)) @ level / points
+    return np.asarray(lag[np.abs(np.subtract.outer(np.arange(length), np.arange(length)))])
 
 
 @lru_cache(maxsize=32)

@@ -174,14 +174,14 @@ def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
     white = [np.count_nonzero(w - np.diag(np.diag(w))) == 0 for w in whitener]
     variance = shooting.noise.variance
     parts = []
-    for i, (basis, _, complete) in enumerate(shooting.eliminated(theta, shooting.free([]))):
-        q = basis.reshape(len(basis), shooting.length, shooting.channels, -1)
+    for i, part in enumerate(shooting.columns(theta, shooting.free([]))):
+        q = part.basis.reshape(len(part.basis), shooting.length, shooting.channels, -1)
         rows = shooting.segments[i].starts[:, None] + np.arange(shooting.length)
         measured = np.count_nonzero(shooting.rollouts[i].valid[rows][..., : shooting.channels], axis=1)
         left = variance * (measured - np.sum(q**2, axis=(1, 3)))
         for c in np.flatnonzero(~np.array(white)):
             coloured = np.sum(factor[c] ** 2) - np.sum(np.matmul(factor[c], q[:, :, c]) ** 2, axis=(1, 2))
-            left[:, c] = np.where(complete[:, c], coloured, left[:, c])
+            left[:, c] = np.where(part.complete[:, c], coloured, left[:, c])
         parts.append(np.maximum(left, 0.0))
     return np.concatenate(parts)
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.columns import Columns
 from quadid.identify.free import Free as Free
 from quadid.identify.gram_kernel import segment_grams
 from quadid.identify.initial_states import first_states, retract
@@ -240,25 +241,32 @@ class Shooting:
             time=self.rollouts[i].window.t[segments.starts],
         )
 
-    def eliminated(self, theta: FloatArray, free: Free) -> Iterator[tuple[FloatArray, FloatArray, NDArray[np.bool_]]]:
-        """For each window, what the elimination of initial states does to the residual at `theta`.
+    def columns(self, theta: FloatArray, free: Free, parameters: bool = True) -> Iterator[Columns]:
+        """For each window the whitened residual at `theta`, and what initial states and `free` can do to it.
 
-        Yields:
-            Orthonormal basis of the initial-state directions, whitened (segments, length * channels, k); the whitened
-            residual (segments, length, channels); which channels of a segment were measured throughout.
+        Args:
+            theta: full parameter vector.
+            free: free parameters; they decide which directions of an initial state matter.
+            parameters: whether to work out the columns of `free`.
         """
         n_pre, k = self._shape(theta, free)
-        states = self.states(n_pre)
+        free = free if parameters else self.free([])
+        whitener = self.noise.whitener(self.length, self.dt)
         for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
-            out, steps = self._roll_directions(rollout, segments, theta, self.free([]), states[i], n_pre, k)
+            out, steps = self._roll_directions(rollout, segments, theta, free, self.states(n_pre)[i], n_pre, k)
             weights = _weights(rollout, segments, self.channels)
-            base = out[0, ..., : self.channels, :1]
-            columns = (out[0, ..., : self.channels, 1 : k + 1] - base) / steps
-            white = self.whiten(np.concatenate([columns, base], axis=3), weights)
-            flat = white.reshape(len(white), -1, k + 1)
+            lanes = out[..., : self.channels, :].transpose(1, 2, 3, 0, 4).reshape(*weights.shape, -1)
+            base = lanes[..., :1]
+            moved = (lanes[..., 1 : 1 + len(steps)] - base) / steps
+            white = self.whiten(np.concatenate([moved, base], axis=3), weights)
+            flat = white.reshape(len(white), -1, len(steps) + 1)
             ridge = np.repeat(np.diag(1.0 / _RIDGE[:k])[None], len(flat), axis=0)
             basis = np.linalg.qr(np.concatenate([flat[..., :k], ridge], axis=1))[0][:, :-k]
-            yield basis, white[..., k], np.all(weights > 0.0, axis=1)
+            yield Columns(
+                rollout.window, segments.starts[:, None] + np.arange(segments.length), basis, white[..., -1],
+                np.all(weights > 0.0, axis=1), flat[..., k:-1], base[..., 0], weights,
+                np.sqrt(self.noise.variance), self.noise.coloured, whitener,
+            )  # fmt: skip
 
     def _has_velocity(self, i: int) -> bool:
         return self.rollouts[i].channels > 9

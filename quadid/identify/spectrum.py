@@ -42,10 +42,10 @@ def mode_power(
         Power found, power of unit white noise, and the number of segments, per channel; NaN where none is complete.
     """
     parts: list[tuple[FloatArray, FloatArray, NDArray[np.bool_]]] = []
-    for basis, residual, complete in shooting.eliminated(theta, free):
-        powers = [_powers(residual, basis)]
-        powers += [_powers(rng.standard_normal(residual.shape), basis) for _ in range(DRAWS)]
-        parts.append((powers[0], np.mean(powers[1:], axis=0), complete))
+    for c in shooting.columns(theta, free, parameters=False):
+        powers = [_powers(c.residual, c.basis)]
+        powers += [_powers(rng.standard_normal(c.residual.shape), c.basis) for _ in range(DRAWS)]
+        parts.append((powers[0], np.mean(powers[1:], axis=0), c.complete))
     found, null = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     complete = np.concatenate([p[2] for p in parts])
     counts = complete.sum(axis=0)
