@@ -40,6 +40,9 @@ def replay(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = 50.0,
     window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
     refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
+    diagnose: Annotated[
+        float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
+    ] = 60.0,
     approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
     gate: Annotated[
         str,
@@ -76,7 +79,7 @@ def replay(
     pace = _pace(speed)
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
-    settings = session_settings(rate=rate, window=window, refit=refit, approval=approval, seed=seed, **asked)
+    settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
     recording, clock = open_log(log, preset), Clock()
     if as_recorded:
         beginning = _beginning(Path(log), described.name)

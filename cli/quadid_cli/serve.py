@@ -42,6 +42,9 @@ def serve(
     approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
     window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
     refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
+    diagnose: Annotated[
+        float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
+    ] = 60.0,
     gate: Annotated[
         str, typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05.")
     ] = "",
@@ -72,7 +75,7 @@ def serve(
     output.check_file(json, "--json")
     described = load_vehicle(vehicle)
     asked = {f"gate_{n}": v for n, v in parse_pairs(gate).items()}
-    settings = session_settings(approval=approval, window=window, refit=refit, seed=seed, **asked)
+    settings = session_settings(approval=approval, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
     known = name or described.name
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     with ExitStack() as opened:

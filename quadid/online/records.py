@@ -118,8 +118,8 @@ class Diagnosed:
 
     Attributes:
         t: when they were known [s]; start, stop: the data they rest on [s].
-        findings: most important first; empty: a change whose cause is unknown.
-        verdict: ``explained`` or ``unknown``.
+        findings: most important first; empty: nothing found, or a change whose cause is unknown.
+        verdict: ``nothing_found``, ``explained``, ``partly_explained`` or ``unknown``.
     """
 
     t: float

@@ -3,6 +3,7 @@
     push(sample)            buffer it
     poll() -> actions       every tick of the data's own time, in order:
         watch for sudden changes                -> ChangeRequest, Diagnosed
+        diagnose the last minute, now and then  -> StudyRequest, Diagnosed; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
         FitRequest                              -> stops here until `deliver` brings the reply
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)
@@ -17,7 +18,7 @@ import math
 from quadid.online.buffer import Buffer, Rows
 from quadid.online.changes import ChangeReply, ChangeRequest
 from quadid.online.desk import Desk
-from quadid.online.fitting import FitReply, FitRequest
+from quadid.online.fitting import FitReply, FitRequest, is_excited
 from quadid.online.learner import Learner
 from quadid.online.ledger import Answer, Ledger
 from quadid.online.quality import Quality, judge
@@ -26,6 +27,7 @@ from quadid.online.rows import Cut, RowStore
 from quadid.online.sentry import Sentry
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
+from quadid.online.study import STUDIED, Student, StudyReply
 from quadid.online.voice import Action, Voice
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
@@ -64,8 +66,10 @@ class Session:
         self.ledger = Ledger(self.settings.gate.approval, restored, next_sequence, baseline)
         self._vehicle = vehicle
         self._voice = Voice(self.buffer.time.stamp)
-        self._store = RowStore(self.settings.rate, self.settings.window + 10.0)
+        studied = STUDIED if self.settings.diagnose else 0.0
+        self._store = RowStore(self.settings.rate, max(self.settings.window, studied) + 10.0)
         self._sentry = Sentry(vehicle, self._store)
+        self._student = Student(vehicle, self._store, self.settings.diagnose, self.settings.seed)
         self._learner = Learner(vehicle, self.settings.memory, self.settings.seed)
         self._desk = Desk(self._learner, self.ledger, self._voice, self.settings.gate)
         self._cut = Cut((), 0.0, 0)
@@ -85,9 +89,11 @@ class Session:
         """Takes one sample: stamp [s], channel, values in core units and frames."""
         self.buffer.push(sample)
 
-    def deliver(self, reply: FitReply | ChangeReply) -> None:
-        """Takes the answer to the running request; an answer to any other is ignored."""
-        if self._waiting is not None and reply.number == self._waiting.number:
+    def deliver(self, reply: FitReply | ChangeReply | StudyReply) -> None:
+        """Takes the answer to the running request or study; an answer to any other is ignored."""
+        if isinstance(reply, StudyReply):
+            self._student.deliver(reply)
+        elif self._waiting is not None and reply.number == self._waiting.number:
             self._reply = reply
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
@@ -187,10 +193,23 @@ class Session:
             self._voice.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._voice.stamp(seen.at):.2f} s"
             self._voice.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
+        self._study(tick)
         if self._sentry.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
             self._fit(tick)
+
+    def _study(self, tick: float) -> None:
+        """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
+        since = self._desk.learn_from
+        told = self._student.answer(tick, since, self._voice.stamp)
+        if told is not None:
+            self._voice.act(told)
+        moving = self._learner.learned and is_excited(self._learner.excitation)
+        if moving and self._sentry.seen is None and self._desk.quality == Quality():
+            request = self._student.ask(tick, since)
+            if request is not None:
+                self._voice.act(request)
 
     def _explain(self, tick: float) -> None:
         assert self._sentry.seen is not None

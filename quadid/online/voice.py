@@ -8,8 +8,9 @@ from collections.abc import Callable
 from quadid.online.changes import ChangeRequest
 from quadid.online.fitting import FitRequest
 from quadid.online.records import Diagnosed, Event, Phase, Publish
+from quadid.online.study import StudyRequest
 
-Action = FitRequest | ChangeRequest | Publish | Diagnosed | Event
+Action = FitRequest | ChangeRequest | StudyRequest | Publish | Diagnosed | Event
 
 
 class Voice:

@@ -31,7 +31,7 @@ PHASES = {
     Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
     Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
 }  # fmt: skip
-VERDICTS = {"explained": 1, "unknown": 3}
+VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
 

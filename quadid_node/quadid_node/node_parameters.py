@@ -40,6 +40,7 @@ PARAMETERS: tuple[NodeParameter, ...] = (
     P("refit", 1.0, "[s] between fits.", (0.5, 60.0)),
     P("rate", 50.0, "[Hz] of the uniform grid.", (20.0, 400.0)),
     P("memory", 120.0, "[s] time constant with which excited flight is forgotten.", (20.0, 86400.0)),
+    P("diagnose", 60.0, "[s] between two diagnoses of the last minute of flight; 0: never.", (0.0, 3600.0)),
     P("seed", 0, "Decides every random number.", (0, 2**31 - 1)),
     P("approval", "auto", "auto: what passes the gate is published; manual: it waits for quadid/approve.", live=True),
     P("gate.windows", 3, "Windows without a common sample that must agree.", (2, 20)),
@@ -59,7 +60,7 @@ PARAMETERS: tuple[NodeParameter, ...] = (
 def read_settings(values: dict[str, Any]) -> SessionSettings:
     """Settings of the session from parameter values; raises QuadidError."""
     gate = {n.replace("gate.", "gate_"): v for n, v in values.items() if n.startswith("gate.")}
-    plain = {n: values[n] for n in ("window", "refit", "rate", "memory", "seed")}
+    plain = {n: values[n] for n in ("window", "refit", "rate", "memory", "diagnose", "seed")}
     return session_settings(approval=values["approval"], **plain, **gate)
 
 

@@ -15,6 +15,7 @@ from quadid.online.changes import ChangeReply, ChangeRequest
 from quadid.online.ledger import Answer
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.online.status import SessionStatus
+from quadid.online.study import StudyReply, StudyRequest
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
 from quadid_node.store import Restored, Store
@@ -80,6 +81,7 @@ class Service:
         self.vehicle, self.restored = vehicle, restored
         self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
         self._worker, self._store, self._clock = worker, store, clock
+        self._studying: Worker | None = None
         self._arrived: dict[str, float] = {}
         self._counted: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, float] = {}
@@ -111,6 +113,9 @@ class Service:
             if isinstance(action, FitRequest | ChangeRequest):
                 self._fit_began = self._clock()
                 self._worker.submit(action)
+            elif isinstance(action, StudyRequest):
+                self._studying = self._studying or self._worker.sibling()
+                self._studying.submit(action)
             else:
                 outputs.append(action)
         return self._journalled(outputs)
@@ -122,8 +127,11 @@ class Service:
     def _tidy(self) -> list[Output]:
         outputs: list[Output] = list(self._notes)
         self._notes.clear()
-        for item in self._worker.poll():
-            if isinstance(item, FitReply | ChangeReply):
+        studied = self._studying.poll() if self._studying is not None else []
+        for item in (*self._worker.poll(), *studied):
+            if isinstance(item, StudyReply):
+                self.session.deliver(item)
+            elif isinstance(item, FitReply | ChangeReply):
                 self._fit_seconds = self._clock() - self._fit_began
                 self.session.deliver(item)
             else:
@@ -152,8 +160,10 @@ class Service:
         return Health(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)
 
     def close(self) -> None:
-        """Ends worker and history; what was journalled is on the disk afterwards."""
-        self._worker.close()
+        """Ends workers and history; what was journalled is on the disk afterwards."""
+        for worker in (self._worker, self._studying):
+            if worker is not None:
+                worker.close()
         if self._store is not None:
             self._store.close()
 

@@ -136,8 +136,10 @@ class Store:
 
     def diagnosis(self, item: Diagnosed) -> None:
         """Journals findings."""
-        text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or "a change without a known cause"
-        self._event("warning", "diagnosis", text, item.t, json.dumps(diagnosis_to_dict(item)))
+        quiet = item.verdict == "nothing_found"
+        empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
+        text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or empty
+        self._event("info" if quiet else "warning", "diagnosis", text, item.t, json.dumps(diagnosis_to_dict(item)))
 
     def close(self, seconds: float = 1.5) -> None:
         """Writes what waits, at most for `seconds`, and lets others write."""

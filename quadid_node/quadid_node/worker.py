@@ -15,18 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from quadid.online import FitReply, FitRequest, fit_window
-from quadid.online.changes import ChangeReply, ChangeRequest, explain_change
+from quadid.online.answering import Reply, Request, answer, failed
+from quadid.online.changes import ChangeReply
+from quadid.online.fitting import FitReply
+from quadid.online.study import StudyReply
 from quadid.vehicle import Vehicle
 from quadid_node.worker_main import READY, THREADS, frame, unframe
-
-Request = FitRequest | ChangeRequest
-Reply = FitReply | ChangeReply
 
 START_LIMIT = 180.0
 """A worker that is not ready by then [s] is replaced; a first start may have to compile the kernels."""
 FIT_LIMIT = 30.0
-"""A fit that takes longer [s] counts as hung."""
+"""A fit that takes longer [s] counts as hung,"""
+STUDY_LIMIT = 600.0
+"""... and a diagnosis."""
 TRIES = 3
 """Workers that may fail on one request before it is given up."""
 BACKOFF = (0.2, 1.0, 5.0, 20.0, 60.0)
@@ -62,6 +63,9 @@ class Worker(Protocol):
     def state(self) -> str:
         """One word for monitors."""
 
+    def sibling(self) -> Worker:
+        """Another one of its kind, for diagnoses, which take longer than fits may wait."""
+
     def close(self) -> None:
         """Ends it."""
 
@@ -82,7 +86,11 @@ class InlineWorker:
     def poll(self) -> list[Reply | Trouble]:
         """Does all fits that wait."""
         waiting, self._waiting = self._waiting, []
-        return [explain_change(r) if isinstance(r, ChangeRequest) else fit_window(r) for r in waiting]
+        return [answer(request) for request in waiting]
+
+    def sibling(self) -> InlineWorker:
+        """Another one."""
+        return InlineWorker()
 
     def close(self) -> None:
         """Nothing to end."""
@@ -97,16 +105,20 @@ class ProcessWorker:
     """
 
     def __init__(
-        self, vehicle: Vehicle, memory_mb: int = MEMORY_MB, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+        self, vehicle: Vehicle, memory_mb: int = MEMORY_MB, clock: Callable[[], float] = time.monotonic,
+        name: str = "fit", limit: float = FIT_LIMIT,
+    ) -> None:  # fmt: skip
         """Starts the child; `ready` tells when its kernels are warm.
 
         Args:
             vehicle: whose model is warmed up.
             memory_mb: most memory of the child [MiB]; 0 for no limit.
             clock: seconds, monotonic.
+            name: what it is called when something is told of it.
+            limit: a request that takes longer [s] counts as hung.
         """
         self._vehicle, self._memory, self._clock = vehicle, memory_mb, clock
+        self._name, self._limit = name, limit
         self._child: subprocess.Popen[bytes] | None = None
         self._out, self._in = bytearray(), bytearray()
         self._request: Request | None = None
@@ -143,6 +155,10 @@ class ProcessWorker:
             self._check(replies)
         told, self._told = self._told, []
         return [*replies, *told]
+
+    def sibling(self) -> ProcessWorker:
+        """A child of its own for diagnoses."""
+        return ProcessWorker(self._vehicle, self._memory, self._clock, "diagnosis", STUDY_LIMIT)
 
     def poll_ready(self) -> bool:
         """Polls while nothing was submitted yet; what is told waits for the next `poll`."""
@@ -196,7 +212,7 @@ class ProcessWorker:
                 self.state = "idle"
                 if self._request is not None:
                     self._give()
-            elif isinstance(item, FitReply | ChangeReply):
+            elif isinstance(item, FitReply | ChangeReply | StudyReply):
                 self._request, self.state = None, "idle"
                 replies.append(item)
         if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
@@ -212,8 +228,8 @@ class ProcessWorker:
             why = f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
         elif self.state == "starting" and waited > START_LIMIT:
             why = f"not ready after {START_LIMIT:g} s"
-        elif self.state == "busy" and waited > FIT_LIMIT:
-            why = f"hung for {FIT_LIMIT:g} s"
+        elif self.state == "busy" and waited > self._limit:
+            why = f"hung for {self._limit:g} s"
         else:
             return
         self._end_child()
@@ -221,16 +237,10 @@ class ProcessWorker:
         self._failures, self.restarts = self._failures + 1, self.restarts + 1
         self._last_failure = self._clock()
         self.state, self._since = "resting", self._clock() + pause
-        self._told.append(Trouble("warning", f"the fit process {why}; the next one starts in {pause:g} s"))
+        self._told.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
         if self._request is not None and self._tries >= TRIES:
-            problem = f"{TRIES} fit processes failed on this window (the last one {why})"
-            number = self._request.number
-            failed: Reply = (
-                ChangeReply(number, problem=problem)
-                if isinstance(self._request, ChangeRequest)
-                else FitReply(number, problem)
-            )
-            replies.append(failed)
+            problem = f"{TRIES} {self._name} processes failed on this window (the last one {why})"
+            replies.append(failed(self._request, problem))
             self._told.append(Trouble("error", problem))
             self._request = None
 

@@ -27,8 +27,8 @@ def main() -> None:
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _behave(int(sys.argv[1]))
-    from quadid.online.changes import ChangeRequest, explain_change
-    from quadid.online.fitting import fit_window, warm_up
+    from quadid.online.answering import answer
+    from quadid.online.fitting import warm_up
 
     vehicle = _read(requests)
     if vehicle is None:
@@ -36,8 +36,7 @@ def main() -> None:
     warm_up(vehicle)
     _write(channel, READY)
     while (request := _read(requests)) is not None:
-        reply = explain_change(request) if isinstance(request, ChangeRequest) else fit_window(request)
-        _write(channel, reply)
+        _write(channel, answer(request))
 
 
 def _behave(megabytes: int) -> None:

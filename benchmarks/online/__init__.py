@@ -1,0 +1,1 @@
+"""What the online service reaches: accuracy, changes, silence in hover, repeatability, load and memory."""

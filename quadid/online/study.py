@@ -1,0 +1,140 @@
+"""The diagnosis of a flight while it lasts: now and then `quadid.diagnose` on the last minute, beside the fits.
+
+It takes seconds of a processor, so the session does not wait for it: what it says is published once a fixed time of
+data has passed, later only when it took longer than that.  Estimates never depend on it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from quadid.errors import QuadidError
+from quadid.online.records import Alternative, Diagnosed, OnlineFinding
+from quadid.online.rows import COMPLETE, RowStore
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+STUDIED = 60.0
+"""Flight that a diagnosis looks at [s]."""
+ANSWER_AFTER = 30.0
+"""Time of the data between question and published answer [s]."""
+Z95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class StudyRequest:
+    """The last minute, to be diagnosed.
+
+    Attributes:
+        number: counts the studies of a session.
+        vehicle: nominal vehicle.
+        windows: data; start, stop: their time [s].
+        seed: of what is drawn.
+    """
+
+    number: int
+    vehicle: Vehicle
+    windows: tuple[Window, ...]
+    start: float
+    stop: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class StudyReply:
+    """Answer: findings, most important first, with the verdict of `quadid.diagnose`; or why there is none."""
+
+    number: int
+    findings: tuple[OnlineFinding, ...] = ()
+    verdict: str = ""
+    problem: str = ""
+
+
+def diagnose_window(request: StudyRequest) -> StudyReply:
+    """Diagnoses; trouble is told in the reply, never raised."""
+    from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
+
+    try:
+        result, _ = diagnose(request.windows, request.vehicle, seed=request.seed, swarm=True)
+    except (QuadidError, ArithmeticError, ValueError) as error:
+        return StudyReply(request.number, problem=str(error))
+    findings = []
+    for f in result.findings:
+        findings.append(OnlineFinding(
+            f.effect, {p.name: p.value for p in f.parameters},
+            {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
+            {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
+            tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
+        ))  # fmt: skip
+    return StudyReply(request.number, tuple(findings), result.verdict.value)
+
+
+class Student:
+    """Asks for diagnoses of one vehicle, and tells what is new in their answers."""
+
+    def __init__(self, vehicle: Vehicle, store: RowStore, every: float, seed: int) -> None:
+        """Studies the rows of `store` every so many seconds of flight [s]; 0: never."""
+        self._vehicle, self._store, self._every, self._seed = vehicle, store, every, seed
+        self._asked: StudyRequest | None = None
+        self._reply: StudyReply | None = None
+        self._last, self._number = -math.inf, 0
+        self._told: StudyReply | None = None
+
+    def ask(self, tick: float, since: float) -> StudyRequest | None:
+        """The next question, if it is time for one.
+
+        Args:
+            tick: now [s].
+            since: data before this belong to another vehicle [s].
+        """
+        start = tick - STUDIED
+        if not self._every or self._asked is not None or tick - self._last < self._every or start < since:
+            return None
+        cut = self._store.cut(start, tick)
+        if cut.reason or cut.seconds < COMPLETE * STUDIED:
+            return None
+        self._last, self._number = tick, self._number + 1
+        self._asked = StudyRequest(self._number, self._vehicle, cut.windows, start, tick, self._seed)
+        return self._asked
+
+    def deliver(self, reply: StudyReply) -> None:
+        """Takes the answer to the running question; an answer to any other is ignored."""
+        if self._asked is not None and reply.number == self._asked.number:
+            self._reply = reply
+
+    def answer(self, tick: float, since: float, stamp: Callable[[float], float]) -> Diagnosed | None:
+        """What there is to tell now.
+
+        Args:
+            tick: now [s].
+            since: an answer about data from before this is no longer true [s].
+            stamp: turns session time into time of the stamps [s].
+        """
+        asked, reply = self._asked, self._reply
+        if asked is None or reply is None or tick < asked.stop + ANSWER_AFTER:
+            return None
+        self._asked = self._reply = None
+        if asked.start < since or reply.problem or (self._told is not None and _same(self._told, reply)):
+            return None
+        self._told = reply
+        findings = tuple(_stamped(f, stamp) for f in reply.findings)
+        return Diagnosed(stamp(asked.stop), stamp(asked.start), stamp(asked.stop), findings, reply.verdict)
+
+
+def _stamped(finding: OnlineFinding, stamp: Callable[[float], float]) -> OnlineFinding:
+    if "time" not in finding.values:
+        return finding
+    return replace(finding, values={**finding.values, "time": stamp(finding.values["time"])})
+
+
+def _same(old: StudyReply, new: StudyReply) -> bool:
+    """No news: the same verdict and causes, and no number outside the interval told before."""
+    if old.verdict != new.verdict or [f.effect for f in old.findings] != [f.effect for f in new.findings]:
+        return False
+    return all(
+        abs(b.values.get(name, math.inf) - value) <= Z95 * a.sigma.get(name, 0.0)
+        for a, b in zip(old.findings, new.findings, strict=True)
+        for name, value in a.values.items()
+    )

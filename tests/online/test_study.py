@@ -1,0 +1,83 @@
+"""The diagnosis beside the fits: when it is asked for, what of its answers is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from quadid.online import Diagnosed, Session, SessionSettings
+from quadid.online.answering import answer
+from quadid.online.records import OnlineFinding
+from quadid.online.study import ANSWER_AFTER, STUDIED, StudyReply, StudyRequest
+from quadid.online.voice import Action
+from quadid.vehicle import Vehicle
+from quadid.window import Sample
+from tests.online.driving import EPOCH, diagnosed, drive, flight, samples
+
+PELICAN = Vehicle.shipped("pelican")
+QUICK = SessionSettings(window=5.0, refit=5.0)
+DRAG = OnlineFinding("rotor_drag", {"k_x": 0.3}, {"k_x": 0.02}, {"k_x": "1/s"}, 1.4, 1.0, 1e-6, (), "seen")
+
+
+def fly(seconds: float, settings: SessionSettings = QUICK) -> tuple[Session, list[Sample]]:
+    return Session(PELICAN, settings), samples(flight(seconds, 11).recording, EPOCH)
+
+
+def studies(actions: list[Action]) -> list[StudyRequest]:
+    return [a for a in actions if isinstance(a, StudyRequest)]
+
+
+def test_it_is_asked_for_after_a_minute_of_flight_and_told_later() -> None:
+    session, stream = fly(160.0)
+    early = drive(session, [s for s in stream if s.t < EPOCH + 80.0])
+    (request,) = studies(early)
+    assert request.stop - request.start == pytest.approx(STUDIED)
+    assert sum(len(w) for w in request.windows) * 0.02 == pytest.approx(STUDIED, abs=0.1)
+    session.deliver(StudyReply(request.number, (DRAG,), "explained"))
+    session.deliver(StudyReply(99, (), "unknown"))
+    assert not diagnosed(drive(session, [s for s in stream if EPOCH + 80.0 <= s.t < EPOCH + 88.0]))
+    rest = drive(session, [s for s in stream if s.t >= EPOCH + 88.0])
+    (told,) = diagnosed(rest)
+    assert (told.verdict, told.findings) == ("explained", (DRAG,))
+    assert told.t - EPOCH == pytest.approx(request.stop - request.start, abs=6.0)
+    (again,) = studies(rest)
+    assert again.stop >= request.stop + ANSWER_AFTER
+
+
+def test_what_was_told_is_not_told_again_but_news_are() -> None:
+    session, stream = fly(160.0, QUICK.model_copy(update={"diagnose": 1.0}))
+    moved = replace(DRAG, values={"k_x": 0.5})
+    replies = iter([(DRAG,), (replace(DRAG, values={"k_x": 0.31}),), (moved,)])
+    told: list[Diagnosed] = []
+    for sample in stream:
+        actions = drive(session, [sample])
+        told += diagnosed(actions)
+        for request in studies(actions):
+            session.deliver(StudyReply(request.number, next(replies, (moved,)), "explained"))
+    assert [d.findings for d in told][:1] == [(DRAG,)]
+    assert (replace(DRAG, values={"k_x": 0.31}),) not in [d.findings for d in told]
+
+
+def test_zero_never_asks() -> None:
+    session, stream = fly(80.0, QUICK.model_copy(update={"diagnose": 0.0}))
+    assert not studies(drive(session, stream))
+
+
+def test_an_answer_from_before_a_change_is_not_told() -> None:
+    session, stream = fly(100.0)
+    (request,) = studies(drive(session, [s for s in stream if s.t < EPOCH + 70.0]))
+    session.deliver(StudyReply(request.number, (DRAG,), "explained"))
+    late = [Sample(s.t + 400.0, s.channel, s.values) for s in stream]  # a break in the stream: another flight perhaps
+    assert not diagnosed(drive(session, late[:8000]))
+
+
+def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
+    made = flight(61.5, 11, "excited", (("rotor_drag", "k_x", 0.35), ("rotor_drag", "k_y", 0.35)))
+    session = Session(PELICAN, QUICK)
+    (request,) = studies(drive(session, samples(made.recording)))
+    reply = answer(request)
+    assert isinstance(reply, StudyReply)
+    assert not reply.problem
+    assert reply.findings[0].effect == "rotor_drag"
+    assert reply.findings[0].values["k_x"] == pytest.approx(0.35, rel=0.3)
