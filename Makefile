@@ -69,6 +69,29 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 	cp reproduce-out/paper.md docs/results/
 	cp reproduce-out/paper/*.png docs/results/paper/
 
+# --- studies: figures of docs/results; QUADID_DATA says where the recorded flights are
+
+STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
+
+.PHONY: truth cases campaign real-logs paper-scale kernel-speed
+truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
+	$(STUDY) studies.truth --out docs/results
+
+cases: venv ## the independent simulated cases, diagnosed
+	$(STUDY) studies.cases
+
+campaign: venv ## blinded campaign of hidden effects (hours)
+	$(STUDY) studies.campaign --out docs/results
+
+real-logs: venv ## every recorded flight, identified and set beside what is known
+	$(STUDY) studies.real_logs --out docs/results
+
+paper-scale: venv ## three 500 s sets: error, time and memory of the fit
+	$(STUDY) studies.paper_scale --out docs/results
+
+kernel-speed: venv ## nanoseconds per particle and step
+	$(STUDY) benchmarks.kernel --out docs/results
+
 # --- check
 
 .PHONY: test test-browser test-slow lint typecheck format

@@ -141,6 +141,8 @@ def noise_levels(seeds: int, processes: int) -> str:
     for j, name in enumerate(NOMINAL_NAMES):
         cells = [f"{np.mean(z[:, j]):+.3f} ± {np.std(z[:, j]) / np.sqrt(len(z)):.3f}" for z in shares.values()]
         text.append(f"| {name} | " + " | ".join(cells) + " |")
+    worst = max(float(np.abs(np.mean(z, axis=0)).max()) for z in shares.values())
+    text += ["", f"The largest mean error is {worst:.2f} standard deviations."]
     for x, part in parts.items():
         text += ["", f"### Noise × {x:g}", "", table(part)]
     return "\n".join(text)

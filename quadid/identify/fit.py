@@ -8,15 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError, WindowError
-from quadid.identify.noise import NoiseModel, estimate_noise
+from quadid.identify.floor import flexible_names as flexible_names
+from quadid.identify.floor import noise_floor as noise_floor
+from quadid.identify.floor import residual_noise as residual_noise
+from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import Convergence, Polished, Prior, default_prior, polish
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.spectrum import shaped_noise
 from quadid.identify.swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
-from quadid.model.layout import LOSS, Layout
+from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.vehicle import Vehicle
@@ -28,7 +29,6 @@ Progress = Callable[[str, float], None]
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
-SPECTRUM_SECONDS = 0.5
 SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
 """Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
 MOMENT_MISFIT = 1.5
@@ -38,8 +38,6 @@ _SET_ASIDE = (
     "slow roll and pitch moments that the model lacks were set aside in every segment, so that they do not pass for "
     "inertia; parameters come from the faster motion alone; quadid diagnose names the cause"
 )
-FLEXIBLE_DRAG = 0.1
-"""Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
 
 
 @dataclass(frozen=True)
@@ -253,60 +251,6 @@ def _to_box(free: Free, values: FloatArray) -> FloatArray:
 
 def _from_box(free: Free, points: FloatArray) -> FloatArray:
     return np.where(free.is_log, np.exp(points), points * free.scale)
-
-
-def residual_noise(shooting: Shooting, polished: Polished) -> NoiseModel:
-    """Noise from the residuals of a polish, all structure counted as noise (a starting point)."""
-    lin = polished.lin
-    used = float(lin.rows.sum())
-    freedom = max(used - lin.gram.shape[1], 1.0) / max(used, 1.0)
-    return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
-
-
-def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
-    """Everything the catalogue can free at once on these data: the model that leaves only noise."""
-    # Left out: what needs a time or height, or doubles another cause.
-    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "command_delay"}
-    if not shooting.has_velocity:
-        skip.add("parasitic_drag")
-    out = list(NOMINAL_NAMES)
-    for name in layout.entries:
-        effect = name.split(".")[0]
-        if effect in EFFECTS and effect not in skip and not name.endswith(".time"):
-            out.append(name)
-    losses = [n for n, e in layout.entries.items() if e.index >= LOSS]
-    return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
-
-
-def noise_floor(
-    windows: Sequence[Window], short: Shooting, theta: FloatArray, free: Free, iterations: int = 4
-) -> tuple[NoiseModel, int]:
-    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it.
-
-    The flexible model is fitted on short segments, where it is nearly linear, and again on longer ones that resolve
-    the spectrum of the vibration.
-
-    Args:
-        windows: data.
-        short: short segments; its initial states are left as they were.
-        theta: nominal optimum.
-        free: nominal free parameters (kept free).
-        iterations: linearisations to spend on the short segments.
-    """
-    names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
-    wide = short.free(names)
-    keep = short.snapshot()
-    start = theta.copy()
-    drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
-    start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
-    first = polish(short, start, wide, iterations=iterations)
-    noise = residual_noise(short, first)
-    short.restore(keep)
-    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, noise, short.layout)
-    second = polish(longer, first.theta, wide, iterations=3)
-    longer.noise = residual_noise(longer, second)
-    noise = shaped_noise(longer, second.theta, wide)
-    return noise, (first.iterations + second.iterations) * (len(names) + 10)
 
 
 def channel_names(channels: int) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ measured rate at the start and put on the predicted one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,17 +125,48 @@ def _file_tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, 
     return tally
 
 
-def _window_tally(window: Window, vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
+def rate_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> FloatArray:
+    """Error of the predicted body rates `samples` after every start, axis by axis.
+
+    Args:
+        windows: of one or more files, on one grid.
+        vehicle: geometry and mass.
+        theta: full parameter vector, shape (size,).
+        samples: horizon, 1 to `LONGEST`.
+
+    Returns:
+        Predicted - measured p, q, r [rad/s], body FRD, shape (starts, 3), windows one after the other; rows without a
+        measurement at the target are left out.
+    """
+    parts = []
+    for window in windows:
+        if len(window) > samples:
+            for _, residual, valid in _runs(window, vehicle, theta, samples):
+                parts.append(residual[valid[:, samples - 1], samples - 1, :3])
+    return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+
+def _runs(
+    window: Window, vehicle: Vehicle, theta: FloatArray, longest: int
+) -> Iterator[tuple[NDArray[np.intp], FloatArray, Mask]]:
+    """Rolls from every measured rate: rows of starts, residual (starts, longest, channels), measured rate at target."""
     known = _finite(window)
     states = initial_states(window, theta, known)
     starts = np.flatnonzero(known["gyro"][: len(window) - longest])
     rollout = Rollout(_padded(window), vehicle)
-    tally = _empty(longest)
     for first in range(0, len(starts), _CHUNK):
         rows = starts[first : first + _CHUNK]
         segments = Segments(longest, 1, (rows + 1).astype(np.int64))
         residual = rollout.roll(segments, theta[None], np.ascontiguousarray(states[rows]))[0][0, ..., 0]
-        tally = tally + _tally(residual, rollout.valid, rows, longest, known)
+        yield rows, residual, rollout.valid[:, 0][rows[:, None] + 1 + np.arange(longest)]
+
+
+def _window_tally(window: Window, vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
+    known = _finite(window)
+    valid = Rollout(_padded(window), vehicle).valid
+    tally = _empty(longest)
+    for rows, residual, _ in _runs(window, vehicle, theta, longest):
+        tally = tally + _tally(residual, valid, rows, longest, known)
     return tally
 
 

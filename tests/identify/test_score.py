@@ -7,7 +7,7 @@ import pytest
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
-from quadid.identify.horizon import horizon_scores, true_rate
+from quadid.identify.horizon import horizon_scores, rate_errors, true_rate
 from quadid.identify.noise import NoiseModel
 from quadid.identify.score import euler, mse_score
 from quadid.model import layout as ix
@@ -133,3 +133,13 @@ def test_impossible_horizons(flight: Flight) -> None:
             horizon_scores([[flight.window]], PELICAN, theta, horizons)
     with pytest.raises(NotIdentifiableError):
         horizon_scores([[flight.window.slice(0, 50)]], PELICAN, theta)
+
+
+def test_rate_errors_by_axis_are_those_of_the_score(flight: Flight) -> None:
+    theta = Layout(PELICAN).initial(PELICAN)
+    errors = rate_errors([flight.window], PELICAN, theta, 10)
+    pooled, _ = horizon_scores([[flight.window]], PELICAN, theta, [10])
+    # The score's longest run is fifty samples, so it leaves out the last forty starts.
+    mean = np.linalg.norm(errors[: pooled.samples], axis=1).mean()
+    assert mean == pytest.approx(pooled.at(10)["rate"], rel=1e-9)
+    assert len(errors) == pooled.samples + 40

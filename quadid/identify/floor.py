@@ -1,0 +1,85 @@
+"""The noise floor: sensor noise from a deliberately flexible fit, whatever the model of interest lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quadid.effects import EFFECTS
+from quadid.identify.noise import NoiseModel, estimate_noise
+from quadid.identify.polish import FloatArray, Polished, polish
+from quadid.identify.shooting import Free, Shooting
+from quadid.identify.spectrum import shaped_noise
+from quadid.model.layout import LOSS, Layout
+from quadid.model.rollout import Segments
+from quadid.parameters import NOMINAL_NAMES
+from quadid.window import Window
+
+SPECTRUM_SECONDS = 0.5
+FLEXIBLE_DRAG = 0.1
+"""Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
+SHORT_SEGMENTS = 400
+"""Most short segments the flexible model is fitted to at first."""
+
+
+def residual_noise(shooting: Shooting, polished: Polished) -> NoiseModel:
+    """Noise from the residuals of a polish, all structure counted as noise (a starting point)."""
+    lin = polished.lin
+    used = float(lin.rows.sum())
+    freedom = max(used - lin.gram.shape[1], 1.0) / max(used, 1.0)
+    return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
+
+
+def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
+    """Everything the catalogue can free at once on these data: the model that leaves only noise."""
+    # Left out: what needs a time or height, or doubles another cause.
+    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "command_delay"}
+    if not shooting.has_velocity:
+        skip.add("parasitic_drag")
+    out = list(NOMINAL_NAMES)
+    for name in layout.entries:
+        effect = name.split(".")[0]
+        if effect in EFFECTS and effect not in skip and not name.endswith(".time"):
+            out.append(name)
+    losses = [n for n, e in layout.entries.items() if e.index >= LOSS]
+    return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
+
+
+def noise_floor(
+    windows: Sequence[Window], short: Shooting, theta: FloatArray, free: Free, iterations: int = 4
+) -> tuple[NoiseModel, int]:
+    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it.
+
+    The flexible model is fitted on short segments, where it is nearly linear (of a long flight on some of them, spread
+    evenly), and again on longer ones that resolve the spectrum of the vibration.
+
+    Args:
+        windows: data.
+        short: short segments; its initial states are left as they were.
+        theta: nominal optimum.
+        free: nominal free parameters (kept free).
+        iterations: linearisations to spend on the short segments.
+    """
+    names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
+    start = theta.copy()
+    drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
+    start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
+    few = thinned(windows, short, short.length * short.dt, short.noise, SHORT_SEGMENTS)
+    wide = few.free(names)
+    first = polish(few, start, wide, iterations=iterations)
+    # All of them: the level of the noise decides every score and interval.
+    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, residual_noise(few, first), short.layout)
+    second = polish(longer, first.theta, wide, iterations=3)
+    longer.noise = residual_noise(longer, second)
+    return shaped_noise(longer, second.theta, wide), (first.iterations + second.iterations) * (len(names) + 10)
+
+
+def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
+    """Segments of `seconds`, at most about `most` of them spread evenly; vehicle and local parameters as in `like`."""
+    out = Shooting(windows, like.vehicle, seconds, noise, like.layout)
+    out.local = like.local
+    every = -(-out.count // most)
+    if every > 1:
+        out.segments = [Segments(s.length, s.lead, np.ascontiguousarray(s.starts[::every])) for s in out.segments]
+    return out
