@@ -1,0 +1,29 @@
+"""Documents that list what the code has: nothing missing, nothing that is not there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from quadid.effects import EFFECTS
+from quadid.parameters import NOMINAL_UNITS
+
+
+def test_the_dictionary_of_symbols_has_every_parameter_with_its_unit(repository: Path) -> None:
+    text = (repository / "docs" / "symbols.md").read_text(encoding="utf-8")
+    plain = text.replace("²", "^2")
+    for name, unit in NOMINAL_UNITS.items():
+        row = next(line for line in plain.splitlines() if line.startswith(f"| {name} | `{name}` |"))
+        assert unit in row
+    for effect in EFFECTS.values():
+        for parameter in effect.parameters:
+            assert f"| `{effect.name}` | `{parameter.name}` | {parameter.unit or '1'} |" in plain
+
+
+def test_the_map_of_the_house_names_what_is_there(repository: Path) -> None:
+    text = (repository / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rooms = re.findall(r"^\| `(quadid/\w+)` \|", text, flags=re.MULTILINE)
+    there = {f"quadid/{p.parent.name}" for p in (repository / "quadid").glob("*/__init__.py")}
+    assert set(rooms) == there
+    for path in re.findall(r"`([\w/]+\.(?:py|md|yaml))`", text):
+        assert (repository / path).exists(), path
