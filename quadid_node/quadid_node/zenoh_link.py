@@ -34,6 +34,8 @@ LARGEST = 1 << 18
 """A payload beyond this is not ours [bytes]."""
 MOST_COMMANDS = 16
 RETRY = 3.0
+REPEAT = 5
+"""Every so many reports of health the set in force and the last diagnosis are told again."""
 _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
@@ -114,6 +116,7 @@ class ZenohLink:
         self._commands: queue.Queue[tuple[str, Any]] = queue.Queue(MOST_COMMANDS)
         self._publishers: dict[str, Any] = {}
         self._session: Any = None
+        self._reports = 0
         self._lock, self._closed = threading.Lock(), threading.Event()
         self.problem = f"Zenoh at {where}: connecting"
         threading.Thread(target=self._keep_connecting, args=(retry,), name="zenoh", daemon=True).start()
@@ -158,6 +161,9 @@ class ZenohLink:
             "status": status_to_dict(health.status), "feeds": feeds, "worker": health.worker,
             "restarts": health.restarts, "history": health.history,
         })  # fmt: skip
+        self._reports += 1
+        if self._reports % REPEAT == 0:
+            self._repeat()
 
     def attend(self) -> None:
         """Carries out commands that have come; called by the loop that owns the service."""
@@ -176,6 +182,13 @@ class ZenohLink:
         with self._lock:
             if self._session is not None:
                 self._session.close()
+
+    def _repeat(self) -> None:
+        """Tells again what a crowded network may have lost, since it never waits for one."""
+        with self._lock:
+            for kind in ("parameters", "diagnosis"):
+                if kind in self._latest and kind in self._publishers:
+                    self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 
     def _carry_out(self, name: str) -> tuple[bool, str]:
         if self._service is None:

@@ -3,86 +3,26 @@
 from __future__ import annotations
 
 import json
-import socket
-import subprocess
-import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zenoh
 from quadid_cli.watch import snapshot, table
-from quadid_node.service import Service
-from quadid_node.worker import InlineWorker
 from quadid_node.zenoh_link import Fleet, ZenohError, ZenohLink, key_of
 
-from quadid.online import SessionSettings
-from quadid.online.records import Diagnosed, OnlineFinding, Publish
-from quadid.vehicle import Vehicle
+from quadid.online.records import Diagnosed, OnlineFinding
+from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.test_gate import TRUE, online_set
-
-PELICAN = Vehicle.shipped("pelican")
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "zenoh"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def until(done: Callable[[], object], seconds: float = 10.0) -> bool:
-    deadline = time.monotonic() + seconds
-    while not done() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return bool(done())
-
-
-class Net:
-    """A router process, and configuration files of its clients."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.port = folder, free_port()
-        certs = folder / "certs"
-        for place, names in ((certs, ("router", "quad1", "quad2", "quad3", "watch")), (folder / "foreign", ("quad1",))):
-            subprocess.run([str(EXAMPLES / "certificates.sh"), str(place), *names], check=True)
-        router = self._write("router.json5", (EXAMPLES / "router.json5").read_text())
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("zenoh_router.py")), str(router)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "routing\n"
-
-    def _write(self, name: str, text: str, certs: str = "certs") -> Path:
-        path = self.folder / name
-        text = text.replace("certs/", f"{self.folder / certs}/").replace("0.0.0.0:7447", f"127.0.0.1:{self.port}")
-        path.write_text(text.replace("localhost:7447", f"localhost:{self.port}"))
-        return path
-
-    def client(self, name: str, certs: str = "certs") -> str:
-        """Configuration file of a client with the certificate `name`."""
-        text = (EXAMPLES / "quad1.json5").read_text().replace("quad1", name)
-        return str(self._write(f"{certs}-{name}.json5", text, certs))
 
 
 @pytest.fixture(scope="module")
 def net(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
     made = Net(tmp_path_factory.mktemp("zenoh"))
     yield made
-    assert made.process.stdin is not None
-    made.process.stdin.close()
-    made.process.wait(10)
-
-
-def service() -> Service:
-    return Service(PELICAN, SessionSettings(), InlineWorker())
-
-
-def accepted(number: int, b: float = TRUE["b"]) -> Publish:
-    return Publish("parameters", replace(online_set({**TRUE, "b": b}), sequence=number, approved_by="auto"))
+    made.close()
 
 
 def test_three_vehicles_are_seen_and_who_comes_late_gets_the_latest(net: Net) -> None:
@@ -122,8 +62,6 @@ def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
     try:
         time.sleep(0.5)
         answers = []
-        import threading
-
         asker = threading.Thread(target=lambda: answers.extend([fleet.command("quad1", "approve") for _ in range(2)]))
         asker.start()
         deadline = time.monotonic() + 15.0
@@ -199,14 +137,26 @@ def test_garbage_and_floods_are_counted_not_shown(net: Net) -> None:
     rogue = zenoh.open(zenoh.Config.from_file(net.client("quad3")))
     try:
         time.sleep(0.3)
-        for payload in (b"\xff\xfe", b"[1, 2]", b"{" * 20000, b'{"a":' + b" " * 400_000 + b"1}", b"null"):
-            rogue.put("quadid/quad3/parameters", payload)
+        garbage = (b"\xff\xfe", b"[1, 2]", b"{" * 20000, b'{"a":' + b" " * 400_000 + b"1}", b"null")
+        for payload in garbage:
+            before = fleet.refused
+
+            def is_counted(payload: bytes = payload, before: int = before) -> bool:
+                rogue.put("quadid/quad3/parameters", payload)
+                return fleet.refused > before
+
+            assert until(is_counted), "a busy machine may lose some, not all"
         for k in range(2000):
             rogue.put("quadid/quad3/health", json.dumps({"status": {"phase": f"\x1b[31m{k}", "reason": "<b>"}}))
-        assert until(
-            lambda: fleet.latest.get("quad3", {}).get("health", {}).get("status", {}).get("phase") == "\x1b[31m1999"
-        )
-        assert fleet.refused == 5
+
+        def last_is_known() -> bool:
+            rogue.put("quadid/quad3/health", json.dumps({"status": {"phase": "\x1b[31mlast", "reason": "<b>"}}))
+            known = fleet.latest.get("quad3", {}).get("health", {}).get("status", {})
+            return bool(known.get("phase") == "\x1b[31mlast")
+
+        assert until(last_is_known), "a flood may lose messages on a busy machine, but it passes"
+        assert fleet.refused >= len(garbage)
+        assert "parameters" not in fleet.latest["quad3"]
         from rich.console import Console
 
         console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
