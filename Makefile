@@ -119,6 +119,18 @@ format: $(DEV) ## let ruff put files into the common form
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# --- documentation
+
+DOCS := $(VENV)/.stamp-docs
+$(DOCS): pyproject.toml $(RUNTIME)
+	$(PIP) install --editable ".[docs]"
+	@touch $@
+
+.PHONY: docs
+docs: $(DOCS) ## the documentation as pages in site/, every link checked
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "Written: $(CURDIR)/site/index.html"
+
 # --- tidy
 
 .PHONY: clean

@@ -136,13 +136,14 @@ def html(shown: Shown, seed: int) -> str:
     from quadid.report.diagnose_page import diagnosis_part
     from quadid.report.identify_page import identify_page
     from quadid.report.page import render
-    from quadid_cli.reporting import provenance, quality
+    from quadid_cli.reporting import provenance, quality, told
 
     done = shown.identified
     logs: Sequence[Log] = [*done.logs, *shown.hidden.logs]
     rows = [*provenance(logs), {"name": "seed", "value": str(seed)}]
     page = identify_page(done.result, done.sets, done.fit.noise, [quality(log) for log in logs], rows, shown.truth)
     page["title"] = "Demonstration: a simulated Pelican"
+    page["excitation"] = told(done.fit, done.logs[:1])
     page["diagnoses"] = [
         diagnosis_part(
             shown.diagnosed.result, shown.diagnosed.sets, "same", _TRUE_SECTION,

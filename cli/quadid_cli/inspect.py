@@ -62,7 +62,7 @@ def inspect(
         result["files"] = [str(target)]
         write_text(target, _text(result))
     write_json(result, json)
-    _print(console(quiet=json == "-"), inspection)
+    _print(console(quiet=json == "-", markup=True), inspection)
 
 
 def _part(recording: Recording, start: float | None, stop: float | None) -> Recording:

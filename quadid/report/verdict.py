@@ -114,19 +114,22 @@ def at_bounds(result: JsonDict) -> list[str]:
 
 def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
     out = []
-    solid = [n for n in stuck if n not in {p["name"] for p in open_ones}]
-    if solid:
+    diagnose = "`quadid diagnose` names what the simulation gets wrong and measures what the better model gains."
+    if not ratio <= ROUGH:
+        # First things first: with the wrong model a parameter seems hidden, or runs into a bound.
+        out.append(diagnose)
+    if stuck:
         out.append(
-            f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(solid)} "
-            f"rest{'s' * (len(solid) == 1)} on a bound."
+            f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(stuck)} "
+            f"rest{'s' * (len(stuck) == 1)} on a bound."
         )
     for p in open_ones:
-        if p["status"] == "prior_dominated":
+        if p["status"] == "prior_dominated" and p["name"] not in stuck:
             out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} does not show in these data.")
-    if open_ones:
+    if any(p["name"] not in stuck for p in open_ones):
         out.append("`quadid excite` proposes a manoeuvre and says what it would gain.")
     if ratio > NOISE_LEVEL:
-        out.append("`quadid diagnose` names what the simulation gets wrong and measures what the better model gains.")
+        out.append(diagnose)
     if all(s["role"] != "validate" for s in result["sets"]):
         out.append("Give another flight with --validate: only data that were not fitted prove a model.")
     if not out:
@@ -139,13 +142,13 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
 def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
     """Says in one sentence what the data say about a parameter; `stuck` as of `at_bounds`."""
     name, status = parameter["name"], parameter["status"]
+    if name in stuck:
+        return "Rests on a bound of the vehicle file: the data want a value outside, or the model lacks something."
     if status == "prior_dominated":
         needs = MOTION.get(name)
         return "The data say nothing about it; the value is the guess." + (f" It needs {needs}." if needs else "")
     if status == "ratio_only":
         return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
-    if name in stuck:
-        return "Rests on a bound of the vehicle file: the data want a value outside."
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan
     if not math.isfinite(change):
         return f"Known to {percent(relative_halfwidth(parameter))}."

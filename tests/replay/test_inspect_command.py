@@ -30,6 +30,7 @@ def test_tables_for_people(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     out = capsys.readouterr().out
     for text in ("gyro", "rate (Hz)", "gravity", "J_xx", "usable for identification"):
         assert text in out
+    assert "[bold]" not in out
 
 
 def test_json_alone_on_stdout(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,6 +53,15 @@ def test_a_parameter_on_its_bound_is_not_called_identified() -> None:
     assert "bound" in reason(result["parameters"][2], ["J_xx"])
 
 
+def test_with_the_wrong_model_the_diagnosis_comes_first_and_no_motion_is_asked_for_what_hit_a_bound() -> None:
+    result = _result(fitted=50.0)
+    result["parameters"][2]["status"] = "prior_dominated"
+    result["warnings"] = ["J_xx = 1.1 kg m^2 rests on its bound [0.1, 1.1]"]
+    steps = identify_verdict(result).next_steps
+    assert "quadid diagnose" in steps[0]
+    assert not any(step.startswith("Fly ") for step in steps)
+
+
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [

@@ -1,0 +1,59 @@
+"""The documentation: its commands run, its equations become MathML, and it names nothing that is not there."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from quadid_cli.main import COMMANDS
+
+from tests.cli.conftest import Cli
+
+pytest_plugins = ["tests.cli.conftest"]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Every `quadid ...` line of the code blocks of a page."""
+    blocks = re.findall(r"^```\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    lines = [line for block in blocks for line in block.splitlines() if line.startswith("quadid ")]
+    return [shlex.split(line, comments=True)[1:] for line in lines]
+
+
+@pytest.mark.slow
+def test_the_tutorial_runs_as_written(
+    quadid: Cli, repository: Path, tmp_path: Path
+) -> None:  # fmt: skip
+    found = commands(repository / "docs" / "tutorial.md")
+    assert len(found) == 9
+    for arguments in found:
+        run = quadid(*arguments, cwd=tmp_path)
+        assert run.code == 0, (arguments, run.err)
+    for file in ("report.html", "diagnosis.html", "pelican+weak_rotor+rotor_drag.yaml"):
+        assert (tmp_path / file).is_file()
+
+
+def test_every_command_that_a_page_names_exists(repository: Path) -> None:
+    for page in (repository / "docs").rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        for name in re.findall(r"`quadid ([a-z]+)\b", text):
+            assert name in COMMANDS, (page.name, name)
+        for example in re.findall(r"`(examples/[\w./]+)`", text):
+            assert (repository / example).exists(), (page.name, example)
+        for module in re.findall(r"`python -m ([\w.]+)", text):
+            assert importlib.util.find_spec(module) is not None, (page.name, module)
+
+
+def test_equations_become_mathml_and_code_is_left_alone(repository: Path) -> None:
+    pytest.importorskip("latex2mathml", reason="pip install .[docs]")
+    spec = importlib.util.spec_from_file_location("docs_math", repository / "tools" / "docs_math.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    page = module.on_page_markdown("a $x^2$ b `$HOME and $PATH`\n\n$$ y = 1 $$\n\n```\n$$ z $$\n```\n")
+    assert page.count("<math") == 2
+    assert "`$HOME and $PATH`" in page
+    assert "$$ z $$" in page
