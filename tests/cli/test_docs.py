@@ -12,8 +12,6 @@ from quadid_cli.main import COMMANDS
 
 from tests.cli.conftest import Cli
 
-pytest_plugins = ["tests.cli.conftest"]
-
 
 def commands(page: Path) -> list[list[str]]:
     """Every `quadid ...` line of the code blocks of a page."""
