@@ -100,8 +100,8 @@ def grid_recording(
         shortest: shorter windows are dropped [s]; default 1 s where a rate is given, else only single rows.
 
     Raises:
-        LogError: rotor columns that do not fit the vehicle, or no usable stretch.
-        NotIdentifiableError: no rotor signal, or one too slow to mean anything.
+        LogError: no rotor signal, rotor columns that do not fit the vehicle, or no usable stretch.
+        NotIdentifiableError: a rotor signal too slow to mean anything.
     """
     if rate is not None and not (math.isfinite(rate) and 1.0 <= rate <= 2000.0):
         raise LogError(f"grid rate {rate} Hz", "1 to 2000 Hz", "leave it out for 50 Hz")

@@ -39,13 +39,15 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
     passed over when they come at less than half the rate of the commands.
 
     Raises:
-        NotIdentifiableError: neither channel, or slower than `SLOWEST_RATE`.
-        LogError: number or unit of the columns does not fit the vehicle.
+        NotIdentifiableError: slower than `SLOWEST_RATE`.
+        LogError: neither channel; number or unit of the columns does not fit the vehicle.
     """
     speed, command = (_usable(recording, name) for name in ("rotor_speed", "motor_command"))
     described = vehicle.command.kind != "rotor_speed"
     if speed is None and command is None:
-        raise NotIdentifiableError(f"{recording.name}: no rotor speeds and no motor commands", fix=_HOW_TO_GET_MOTORS)
+        raise LogError(
+            f"{recording.name}: no rotor speeds and no motor commands", "either of them", fix=_HOW_TO_GET_MOTORS
+        )
     notes: tuple[str, ...] = ()
     if speed is not None and command is not None and described:
         slow = sample_period(speed.t) > 2.0 * sample_period(command.t)

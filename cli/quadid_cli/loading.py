@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
-_FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover")
-"""Checks of units and frames; what fails them would give numbers that look fine and mean nothing."""
+_FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order")
+"""Checks of units, frames and motors; what fails them would give numbers that look fine and mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -144,13 +144,13 @@ def load_logs(
 
 
 def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]:
-    """Checks that a log means what its reader believes, before anything is fitted to it.
+    """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
 
     Returns:
         What looks wrong but need not be.
 
     Raises:
-        LogError: units or frames that cannot be right; names the fix.
+        LogError: units, frames or a motor order that cannot be right; names the fix.
     """
     from quadid.inspection import Verdict, inspect
 

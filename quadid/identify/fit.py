@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.errors import NotIdentifiableError, WindowError
+from quadid.errors import WindowError
 from quadid.identify.floor import flexible_names as flexible_names
 from quadid.identify.floor import noise_floor as noise_floor
 from quadid.identify.floor import residual_noise as residual_noise
@@ -94,7 +94,7 @@ def check_windows(windows: Sequence[Window]) -> None:
             "no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight"
         )
     if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
-        raise NotIdentifiableError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
+        raise WindowError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
     if len({round(w.dt, 9) for w in windows}) > 1:
         raise WindowError("windows on different grids", "one grid step for all", "give --rate")
 
@@ -113,8 +113,8 @@ def fit(
         progress: called with a stage and a fraction done.
 
     Raises:
-        WindowError: unusable data.
-        NotIdentifiableError: a needed channel is missing.
+        WindowError: unusable data, or no gyro in them.
+        NotIdentifiableError: the data lead to equations that have no finite step; see `polish`.
     """
     options = options or FitOptions()
     report = progress or (lambda stage, share: None)

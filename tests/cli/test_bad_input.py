@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from quadid_replay import write_tlog
 
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli, Flights, one_line, table, write_table
@@ -72,6 +73,63 @@ def test_a_corrupted_log(inside: Cli, flights: Flights, tmp_path: Path) -> None:
     assert "broken.mcap" in run.err
 
 
+@pytest.fixture(scope="module")
+def whole_logs(flights: Flights, data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """One log of each format, by suffix."""
+    folder = tmp_path_factory.mktemp("formats")
+    write_tlog(folder / "log.tlog", flights.unseen_flight.recording)
+    return {
+        "mcap": flights.train.read_bytes(),
+        "csv": flights.unseen.read_bytes(),
+        "tlog": (folder / "log.tlog").read_bytes(),
+        "bin": (data_dir / "ardupilot" / "log171.bin").read_bytes()[:400_000],
+        "ulg": (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()[:600_000],
+    }
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_log_of_each_format_cut_in_its_first_bytes(
+    inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str
+) -> None:
+    for kept in (0, 1, 10, 30):
+        log = tmp_path / f"cut.{suffix}"
+        log.write_bytes(whole_logs[suffix][:kept])
+        line = one_line(inside("inspect", log), 2)
+        assert f"cut.{suffix}" in line
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_log_of_each_format_cut_in_the_middle(
+    inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str
+) -> None:
+    """What is before the cut is read, and the warning says so; without a whole chunk there is one clear line."""
+    data = whole_logs[suffix]
+    log = tmp_path / f"cut.{suffix}"
+    log.write_bytes(data[: len(data) * 2 // 3 + 1])
+    run = inside("inspect", log)
+    assert "Traceback" not in run.err
+    if run.code == 0:
+        assert f"cut.{suffix}" in run.out
+    else:
+        assert f"cut.{suffix}" in one_line(run, 2)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_corrupted_log_of_each_format(inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str) -> None:
+    """Zeros in the middle cost what they cover; noise behind a true beginning is refused with one line."""
+    data = bytearray(whole_logs[suffix])
+    log = tmp_path / f"broken.{suffix}"
+    middle = len(data) // 2
+    data[middle : middle + 512] = bytes(512)
+    log.write_bytes(data)
+    run = inside("inspect", log)
+    assert "Traceback" not in run.err
+    assert run.code == 0 or f"broken.{suffix}" in one_line(run, 2)
+    noise = np.random.default_rng(1).bytes(20_000)
+    log.write_bytes(bytes(data[:20]) + noise)
+    assert f"broken.{suffix}" in one_line(inside("inspect", log), 2)
+
+
 def _without(names: list[str], rows: np.ndarray, drop: str) -> tuple[list[str], np.ndarray]:
     keep = [i for i, n in enumerate(names) if n not in drop.split()]
     return [names[i] for i in keep], rows[:, keep]
@@ -80,9 +138,33 @@ def _without(names: list[str], rows: np.ndarray, drop: str) -> tuple[list[str], 
 @pytest.mark.parametrize(
     ("drop", "expected"), [("w1 w2 w3 w4", "no rotor speeds and no motor commands"), ("p q r", "no gyro")]
 )
-def test_a_missing_signal_is_exit_3(inside: Cli, flights: Flights, tmp_path: Path, drop: str, expected: str) -> None:
+def test_a_missing_signal(inside: Cli, flights: Flights, tmp_path: Path, drop: str, expected: str) -> None:
     log = write_table(tmp_path / "log.csv", *_without(*table(flights.unseen), drop))
-    assert expected in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 3)
+    assert expected in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 2)
+
+
+@pytest.mark.parametrize(
+    ("columns", "order"), [((1, 0, 2, 3), "2, 1, 3, 4"), ((2, 3, 0, 1), "3, 4, 1, 2"), ((3, 0, 1, 2), "2, 3, 4, 1")]
+)
+def test_swapped_motors(inside: Cli, flights: Flights, tmp_path: Path, columns: tuple[int, ...], order: str) -> None:
+    """Two motors exchanged, opposite ones exchanged, all moved by one; the line names the columns to take."""
+    names, rows = table(flights.unseen)
+    place = [names.index(f"w{i}") for i in range(1, 5)]
+    rows[:, place] = rows[:, [place[c] for c in columns]]
+    log = write_table(tmp_path / "swapped.csv", names, rows)
+    for command in ("identify", "diagnose"):
+        line = one_line(inside(command, log, "--vehicle", "pelican", "--out", tmp_path), 2)
+        assert f"in the order {order}" in line
+        assert "order the rotors of the vehicle file" in line
+
+
+def test_motors_that_spin_the_other_way(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    pelican = Vehicle.shipped("pelican")
+    rotors = [{"position": list(r.position), "spin": -r.spin} for r in pelican.rotors]
+    file = tmp_path / "mirrored.yaml"
+    file.write_text(_pelican(rotors=rotors), encoding="utf-8")
+    line = one_line(inside("identify", flights.train, "--vehicle", file, "--out", tmp_path), 2)
+    assert "order" in line or "negate the spins" in line
 
 
 def test_degrees_for_radians(quadid: Cli, flights: Flights, tmp_path: Path) -> None:

@@ -254,7 +254,7 @@ def test_short_windows_are_dropped_and_counted() -> None:
 
 def test_absent_slow_or_wrong_rotor_columns_are_named() -> None:
     t = np.arange(0.0, 10.0, 0.02)
-    with pytest.raises(NotIdentifiableError, match="no rotor speeds") as none:
+    with pytest.raises(LogError, match="no rotor speeds") as none:
         to_windows(FLIGHT.at({"gyro": t}), PELICAN)
     assert "SDLOG_PROFILE" in none.value.fix
     with pytest.raises(NotIdentifiableError, match="too slow"):
