@@ -26,7 +26,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 SCHEMA = 1
-STALE = 5
 UNITS = {
     "b": "N s^2/rad^2", "d": "N m s^2/rad^2", "J_xx": "kg m^2", "J_yy": "kg m^2", "J_zz": "kg m^2", "J_r": "kg m^2",
 }  # fmt: skip
@@ -52,7 +51,11 @@ class Model:
         if message.sequence <= self.sequence:
             return f"set {message.sequence} is not newer than {self.sequence}"
         if message.state not in (ParameterSet.STATE_ACCEPTED, ParameterSet.STATE_ROLLED_BACK):
-            return "it is from before a restart" if message.state == STALE else f"its state is {message.state}"
+            return (
+                "it is from before a restart"
+                if message.state == ParameterSet.STATE_STALE
+                else f"its state is {message.state}"
+            )
         for name, unit in UNITS.items():
             if units.get(name) != unit:
                 return f"{name} is in '{units.get(name)}', wanted '{unit}'"

@@ -89,7 +89,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     with node(history) as restarted:
         stale = ear.listen("quadid/parameters", ParameterSet, latched())
         assert ear.until(lambda: stale, 90.0), restarted.text
-        assert stale[-1].state == 5
+        assert stale[-1].state == ParameterSet.STATE_STALE
         assert list(stale[-1].values) == list(accepted.values)
         assert "not yet confirmed" in stale[-1].reason
 
@@ -132,6 +132,28 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
         assert identify.end()[0] == 0
     stored = read_history(tmp_path / "h.sqlite", "pelican")["sets"]
     assert [s["approved_by"] for s in stored][: 1 + again.success] == ["ros service"] * (1 + again.success)
+
+
+def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: Ear) -> None:
+    from quadid_msgs.msg import ParameterSet
+    from std_srvs.srv import Trigger
+
+    path = tmp_path / "long.mcap"
+    write_mcap(path, flight(60.0, 6).recording)
+    with node(tmp_path / "h.sqlite") as identify:
+        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        identify.wait_for("ready", 120.0)
+        with player(path, SPEED):
+            assert ear.until(lambda: len(sets) >= 2, 60.0), identify.text
+            before = sets[-2]
+            assert ear.call("quadid/rollback", Trigger).success
+            assert ear.until(lambda: sets[-1].state == ParameterSet.STATE_ROLLED_BACK, 10.0)
+        assert list(sets[-1].values) == list(before.values)
+        assert sets[-1].sequence > sets[-2].sequence
+        assert sets[-1].approved_by == "ros service"
+        assert identify.end()[0] == 0
+    stored = read_history(tmp_path / "h.sqlite", "pelican")["sets"]
+    assert "rolled_back" in [s["state"] for s in stored]
 
 
 def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
