@@ -50,10 +50,7 @@ def fleet(
     json: JsonTarget = None,
     out: OutFolder = Path("fleet-out"),
 ) -> None:
-    """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on.
-
-    Example: quadid fleet logs --vehicle pelican --workers 4 --out fleet-out
-    """
+    """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
     from quadid_cli import fleet_folder, loading, output, terminal
     from quadid_cli.fleet_store import open_store
 

@@ -36,6 +36,36 @@ COMMANDS: dict[str, str] = {
 """Every command with its one-line help, in the order of `quadid --help`."""
 
 
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "demo": ("quadid demo --quick --out demo-out",),
+    "simulate": (
+        "quadid simulate flight.mcap --seconds 120 --seed 3",
+        "quadid simulate late.csv --effect motor_lag:tau=0.04",
+        "quadid simulate udpout:127.0.0.1:14550 --seconds 60",
+    ),
+    "inspect": ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
+    "identify": (
+        "quadid identify flight.mcap --validate other.mcap --vehicle pelican --report report.html",
+        "quadid identify a.bin b.bin@30:90 --vehicle mine.yaml --json result.json",
+    ),
+    "score": ("quadid score other.mcap --vehicle pelican.fitted.yaml --horizons 1,10,50",),
+    "compare": ("quadid compare flight.mcap --validate other.mcap --vehicle pelican",),
+    "diagnose": ("quadid diagnose flight.mcap --validate other.mcap --vehicle pelican --report diagnosis.html",),
+    "excite": ("quadid excite flight.mcap --vehicle pelican",),
+    "reproduce": ("quadid reproduce --out reproduce-out",),
+    "replay": ("quadid replay flight.mcap --vehicle pelican --speed max --out result.mcap",),
+    "serve": ("quadid serve --vehicle mine.yaml --mavlink udpin:0.0.0.0:14540",),
+    "watch": ("quadid watch", "quadid watch --zenoh tcp/192.168.1.5:7447"),
+    "history": ("quadid history --vehicle mine.yaml --events 20",),
+    "export": ("quadid export --vehicle pelican.fitted.yaml --format px4 --out params",),
+    "fleet": (
+        "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
+        "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
+    ),
+}
+"""Calls that each command's help ends with."""
+
+
 def _available() -> dict[str, str]:
     """Commands whose module is installed."""
     return {n: text for n, text in COMMANDS.items() if importlib.util.find_spec(f"quadid_cli.{n}") is not None}
@@ -59,7 +89,10 @@ def load(name: str) -> Any:
     """Imports one command, ready to run."""
     module = importlib.import_module(f"quadid_cli.{name}")
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
-    alone.command(name, help=COMMANDS[name] if not getattr(module, name).__doc__ else None)(getattr(module, name))
+    # A backspace character alone on a line keeps click from joining the lines.
+    examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in EXAMPLES[name])))
+    text = COMMANDS[name] if not getattr(module, name).__doc__ else None
+    alone.command(name, help=text, epilog=examples)(getattr(module, name))
     return get_command(alone)
 
 

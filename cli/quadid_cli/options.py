@@ -14,8 +14,21 @@ Logs = Annotated[
         help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
     ),
 ]
+
+
+def shipped_names(incomplete: str) -> list[str]:
+    """Shipped vehicles that begin so, for the shell's completion; files it completes itself."""
+    from importlib.resources import files
+
+    names = (Path(entry.name) for entry in files("quadid").joinpath("vehicles").iterdir())
+    return sorted(n.stem for n in names if n.suffix == ".yaml" and n.stem.startswith(incomplete))
+
+
 VehicleName = Annotated[
-    str, typer.Option("--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.")
+    str,
+    typer.Option(
+        "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
+    ),
 ]
 Validate = Annotated[
     list[str] | None,
