@@ -3,7 +3,7 @@
     python -m benchmarks.online --out docs/results
     python -m benchmarks.online --only load --out docs/results     # one part anew, the others as they are
 
-Parts: estimate, change, hover, repeat, refit, load (needs the ROS extra), memory.
+Parts: estimate, change, hover, repeat, refit, load and costs (these need the ROS extra), memory.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.online import accuracy, load, memory, repeat
+from benchmarks.online.own_code import own_code
 from benchmarks.online.page import page
 
 
@@ -34,6 +35,7 @@ def parts(given: argparse.Namespace) -> dict[str, Callable[[], Any]]:
             "hover": load.under_load(given.load_seconds, "hover"),
             "recording": load.under_load(given.load_seconds, "excited", record=True),
         },
+        "costs": lambda: {"bare": load.bare(given.load_seconds), "own": own_code(20.0)},
         "memory": lambda: memory.day(given.hours, given.refit, progress=True),
     }
 

@@ -77,6 +77,28 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
             "imu_received": (len(noted["idle"]) + len(noted["fitting"])) / (seconds * 1000.0)}  # fmt: skip
 
 
+def bare(seconds: float) -> dict[str, float]:
+    """A node that takes the same messages and does nothing with them: its share of a core."""
+    environment = {
+        **os.environ, "PYTHONUNBUFFERED": "1", "AMENT_PREFIX_PATH": sys.prefix,
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }  # fmt: skip
+    node = _start(["benchmarks.online.bare_node"], environment)
+    try:
+        _wait_for(node, "ready")
+        feeder = _start(["benchmarks.online.feeder", str(seconds), "excited"], environment)
+        _wait_for(feeder, "flying")
+        time.sleep(SETTLE)
+        before, begin = _processor_seconds(node.pid), time.monotonic()
+        time.sleep(seconds - 2.0 * SETTLE)
+        share = (_processor_seconds(node.pid) - before) / (time.monotonic() - begin)
+        feeder.communicate(timeout=60)
+    finally:
+        node.send_signal(signal.SIGINT)
+        node.communicate(timeout=30)
+    return {"share": share}
+
+
 def _start(command: list[str], environment: dict[str, str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", *command], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

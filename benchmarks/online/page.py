@@ -117,6 +117,15 @@ def _load(r: Result) -> list[str]:
     return lines
 
 
+def _costs(r: Result) -> list[str]:
+    own = r["own"]
+    return [
+        "A node of the same executor that takes the same messages and does nothing with them: "
+        f"{100 * r['bare']['share']:.1f} % of a core. Our own code without ROS: {own['us_per_message']:.0f} us a "
+        f"message, {100 * own['share']:.1f} % of a core at these rates.",
+    ]  # fmt: skip
+
+
 def _pair(x: Result) -> str:
     return f"{x['p50']:.2f} / {x['p99']:.2f}" if x["count"] else "–"
 
@@ -146,6 +155,7 @@ PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
     "repeat": ("Live and replayed", _repeat),
     "refit": ("Refit of a 10 s window", _refit),
     "load": ("Load", _load),
+    "costs": ("Where the load comes from", _costs),
     "memory": ("Memory over many hours, accelerated", _memory),
 }
 """Parts in the order of the page."""

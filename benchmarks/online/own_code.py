@@ -1,0 +1,46 @@
+"""What our own code costs a message, without ROS: decode, choose, buffer, grid; fits left out."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from quadid_node.chooser import Chooser
+from quadid_node.convert import Decoder, best_ranks, deserializer
+from quadid_node.messages import Clock
+from quadid_node.presets import source
+from quadid_node.service import Service
+from quadid_node.worker import InlineWorker
+from quadid_replay import write_mcap
+from quadid_replay.mcap_records import McapFile
+
+from benchmarks.online.accuracy import PELICAN
+from benchmarks.online.feeder import recording
+from quadid.online import SessionSettings
+
+STEP_EVERY = 80
+"""Messages between two looks at the session: 50 ms of them."""
+
+
+def own_code(seconds: float) -> dict[str, Any]:
+    """Processor time a message [us], and as a share of one core at the feeder's rates."""
+    made = recording(seconds, "excited")
+    with tempfile.TemporaryDirectory() as folder:
+        write_mcap(Path(folder) / "k.mcap", made, 1_700_000_000 * 10**9)
+        file = McapFile(Path(folder) / "k.mcap")
+        topics = file.topics
+        messages = [(topics[number].name, data) for number, _, data in file.messages(topics.keys())]
+    inputs = source("canonical").inputs
+    chooser, clock = Chooser(best_ranks(inputs)), Clock()
+    decoders = {e.topic: Decoder(e, clock, chooser, 4, deserializer(e.type)) for e in inputs}
+    service = Service(PELICAN, SessionSettings(window=60.0, diagnose=0.0), InlineWorker())
+    begin = time.process_time()
+    for k, (topic, data) in enumerate(messages):
+        for sample in decoders[topic].samples(data):
+            service.push(sample)
+        if k % STEP_EVERY == 0:
+            service.step(2)
+    spent = time.process_time() - begin
+    return {"messages": len(messages), "us_per_message": spent / len(messages) * 1e6, "share": spent / seconds}

@@ -1,0 +1,66 @@
+"""Commands and names that the documents of the online service show: options, node parameters, presets, topics exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from quadid_cli.main import load
+from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
+from quadid_node.mavlink_link import REQUESTED
+from quadid_node.node_parameters import PARAMETERS
+from quadid_node.presets import source
+
+from quadid.online.gate import CHECKS, GateSettings
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = ("online", "using-with-ros", "using-with-px4", "using-with-ardupilot")
+
+
+def commands(page: str) -> list[list[str]]:
+    """Lines of the code blocks, as a shell would split them."""
+    blocks = re.findall(r"```\n(.*?)```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.S)
+    lines = [line for block in blocks for line in block.splitlines() if not line.startswith(" ")]
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_and_their_options_exist(page: str) -> None:
+    used = [words[1:] for words in commands(page) if words[:1] == ["quadid"]]
+    assert used
+    for name, *arguments in used:
+        known = {option for p in load(name).params for option in p.opts}
+        unknown = [a for a in arguments if a.startswith("--") and a not in known]
+        assert not unknown, (name, unknown)
+
+
+@pytest.mark.parametrize("page", PAGES[1:])
+def test_node_parameters_and_presets_exist(page: str) -> None:
+    names = {p.name for p in PARAMETERS}
+    for words in commands(page):
+        if words[:4] != ["ros2", "run", "quadid_node", "identify"]:
+            continue
+        for key, value in (w.split(":=", 1) for w in words if ":=" in w and "/" not in w.split(":=")[0]):
+            assert key in names, key
+            if key == "source":
+                assert source(value).inputs
+
+
+def test_tables_name_what_there_is() -> None:
+    online = (DOCS / "online.md").read_text(encoding="utf-8")
+    for check, _ in CHECKS:
+        assert f"`{check}`" in online
+    for setting in GateSettings.model_fields:
+        assert f"`{setting}`" in online or setting in online, setting
+    for name in MAVLINK_NAMES.values():
+        assert f"`{name}`" in online
+    px4 = (DOCS / "using-with-px4.md").read_text(encoding="utf-8")
+    asked = ("HIGHRES_IMU", "ATTITUDE_QUATERNION", "ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW", "ESC_STATUS")
+    assert all(name in px4 and name in REQUESTED for name in asked)
+    ros = (DOCS / "using-with-ros.md").read_text(encoding="utf-8")
+    for preset in ("canonical", "mavros", "px4", "ardupilot", "rotors"):
+        assert f"| `{preset}` |" in ros
+        motors = [e.topic for e in source(preset).inputs if any(c == "rotor_speed" for c, _ in e.channels)]
+        assert all(f"`{topic}`" in ros for topic in motors), motors
