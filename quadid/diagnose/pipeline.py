@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import candidates
+from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
@@ -40,7 +41,9 @@ NOISE_FELL = 0.7
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.01
-"""Structure below this share of the noise is not worth a word."""
+"""Structure below this share of the noise is not worth a word …"""
+LEAST_OF_EXPLAINED = 1e-3
+"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ def diagnose(
     """
     report = progress or (lambda stage, share: None)
     check_windows(windows)
+    faults = data_faults([*windows, *validation])
+    windows, validation = without_copies(windows), without_copies(validation)
     short = Shooting(windows, vehicle, SWARM_SECONDS)
     free = short.free(NOMINAL_NAMES)
     theta = short.layout.initial(vehicle)
@@ -107,11 +112,13 @@ def diagnose(
     verdict = judge(search.nominal, search.model, left)
     report("validation", 0.0)
     outcome, per_finding = validate(decisive, search, validation, listed)
+    if search.model.causes and (outcome.contradicted or any(f.kind == "saturated" for f in faults)):
+        verdict = Verdict.UNKNOWN
     findings = describe(decisive, search, per_finding, verdict is not Verdict.UNKNOWN)
     text = extended_vehicle(vehicle, decisive, search.model)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
-    result = Diagnosis(verdict, findings, outcome, left, text, name)
+    result = Diagnosis(verdict, findings, outcome, left, text, name, tuple(f.text for f in faults))
     return result, Workings(search, short, decisive, left)
 
 
@@ -119,7 +126,7 @@ def _with_better_noise(windows: Sequence[Window], short: Shooting, decisive: Sho
     """Re-estimates the noise around the selected model, where the flexible fit is nearly linear, and refits both."""
     short.restore({})
     wide = short.free(free_names(search.model.causes))
-    decisive.noise, _ = noise_floor(windows, short, search.model.theta, wide)
+    decisive.noise, _ = noise_floor(windows, short, search.model.theta, wide, iterations=2)
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
     return replace(search, model=model, nominal=nominal)
@@ -127,10 +134,11 @@ def _with_better_noise(windows: Sequence[Window], short: Shooting, decisive: Sho
 
 def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:
     """Verdict from what the causes explain and what is left."""
-    structure = left.deviance if left.deviance > LEAST_STRUCTURE * model.rows else 0.0
+    explained = max(float(nominal.held_out.sum() - model.held_out.sum()), 0.0)
+    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
+    structure = left.deviance if left.deviance > least else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
-    explained = max(float(nominal.held_out.sum() - model.held_out.sum()), 0.0)
     if not structure:
         return Verdict.EXPLAINED
     return Verdict.PARTLY_EXPLAINED if explained >= SHARE_TO_NAME * (explained + structure) else Verdict.UNKNOWN

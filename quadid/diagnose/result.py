@@ -109,12 +109,14 @@ class Validation:
         nominal, extended: mean squared error without and with the findings.
         on: ``validation logs`` or ``held-out blocks``.
         refitted: extended, with per-log values refitted on the first half and scored on the second; None without logs.
+        contradicted: the findings make the prediction of the validation logs worse, values of a flight refitted.
     """
 
     nominal: float
     extended: float
     on: str
     refitted: float | None = None
+    contradicted: bool = False
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ def select(
     """
     nominal = fit_model(decisive, theta, ())
     rounds: list[Round] = []
+    compared: set[str] = set()
     shooting, model, base = decisive, nominal, nominal
     if nominal.misfit > LINEAR_MISFIT:
         shooting, model = short, fit_model(short, theta, ())
@@ -124,13 +125,16 @@ def select(
                 shooting, base = decisive, nominal
                 model, swaps = swap_look_alikes(decisive, longer, listed)
                 rounds += swaps
+                compared = {c.label for c in model.causes}
                 continue
         if accepted is None:
             break
     if shooting is short:
         model = fit_model(decisive, model.theta, model.causes, iterations=10)
-    model, swaps = swap_look_alikes(decisive, model, listed)
-    return Search(nominal, model, (*rounds, *swaps), tests)
+    if compared != {c.label for c in model.causes}:
+        model, swaps = swap_look_alikes(decisive, model, listed)
+        rounds += swaps
+    return Search(nominal, model, tuple(rounds), tests)
 
 
 @dataclass(frozen=True)
@@ -300,7 +304,7 @@ def split_causes(model: Model) -> Model:
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """Refits `model` without `cause` and what requires it."""
     left, theta = left_over(shooting, model, cause)
-    return replace(fit_model(shooting, theta, left, model.states), worth=model.worth)
+    return replace(fit_model(shooting, theta, left, model.states, tolerance=0.2), worth=model.worth)
 
 
 def left_over(shooting: Shooting, model: Model, cause: Candidate) -> tuple[tuple[Candidate, ...], FloatArray]:

@@ -8,7 +8,8 @@ ten-second blocks of the training log are left out in turn.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,9 +118,14 @@ def _on_logs(
                 untidy, _ = block_deviance(scorer, rest[_ALL])
             before, _ = block_deviance(scorer, rest[cause.label])
             worth.append(_worth(cause, before, untidy, mse, rows))
-    refitted = _second_halves(scorer, search.model, logs)
-    figures = Validation(float(nominal.sum()) / rows, float(extended.sum()) / rows, "validation logs", refitted)
-    return figures, tuple(sorted(worth, key=lambda w: -w.deviance))
+    figures = Validation(float(nominal.sum()) / rows, mse, "validation logs")
+    halves = _second_halves(scorer, search, logs)
+    if halves is not None:
+        figures = replace(figures, refitted=float(halves.refitted.sum()) / halves.rows)
+    before, after = (nominal, extended) if halves is None else (halves.nominal, halves.refitted)
+    events = any(c.timed is not None for c in search.model.causes)
+    contradicted = bool(search.model.causes) and not events and paired_gain(before, after).total < 0.0
+    return replace(figures, contradicted=contradicted), tuple(sorted(worth, key=lambda w: -w.deviance))
 
 
 def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = None) -> tuple[FloatArray, float]:
@@ -151,19 +157,29 @@ def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: in
     return scorer.linearise(theta, free)
 
 
-def _second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> float | None:
+class _Halves(NamedTuple):
+    """Deviance of the blocks of the second halves, per-log values refitted on the first, and of the nominal model."""
+
+    refitted: FloatArray
+    nominal: FloatArray
+    rows: float
+
+
+def _second_halves(scorer: Shooting, search: Search, logs: Sequence[Window]) -> _Halves | None:
+    """Refits what belongs to a flight on the first half of each log and scores its second half; None without such."""
+    model = search.model
     per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
-    if not per_log:
-        return None
-    deviance, rows = 0.0, 0.0
+    refitted, nominal, rows = [], [], 0.0
     seconds = scorer.length * scorer.dt
     for window in logs:
         middle = len(window) // 2
-        if middle < 4 * scorer.length:
+        if not per_log or middle < 4 * scorer.length:
             continue
         first = Shooting([window.slice(0, middle)], scorer.vehicle, seconds, scorer.noise, scorer.layout)
         theta = polish(first, model.theta, first.free(per_log), iterations=6).theta
         second = Shooting([window.slice(middle, len(window))], scorer.vehicle, seconds, scorer.noise, scorer.layout)
         total, count = block_deviance(second, model, theta)
-        deviance, rows = deviance + float(total.sum()), rows + count
-    return deviance / rows if rows else None
+        refitted.append(total)
+        nominal.append(block_deviance(second, search.nominal)[0])
+        rows += count
+    return _Halves(np.concatenate(refitted), np.concatenate(nominal), rows) if refitted else None

@@ -1,0 +1,102 @@
+"""Faults of the data themselves, seen without any model: a sensor at the end of its range, rows that are copies.
+
+Both bend every estimate, and a cause named from them would be a stand-in.  Copies are no measurements and are left out;
+what a saturated sensor would have shown is not known, so nothing found beside it is called confident.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+LEAST_AT_LIMIT = 0.005
+"""Share of samples at exactly the largest or smallest value that makes a saturated sensor …"""
+PILE = 4.0
+"""… if they are this many times as many as lie on the next value, which coarse steps alone would not bring about."""
+LEAST_COPIES = 0.03
+"""Share of inertial rows that equal the row before exactly."""
+_AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """One fault of the data.
+
+    Attributes:
+        kind: ``saturated`` or ``repeated``.
+        channel: name of the channel, with its axis where there is one.
+        share: of the samples.
+        text: one sentence with what to do.
+    """
+
+    kind: str
+    channel: str
+    share: float
+    text: str
+
+
+def data_faults(windows: Sequence[Window]) -> tuple[DataFault, ...]:
+    """Looks for saturated and repeated inertial samples in `windows`; a flight without such faults gives none."""
+    out: list[DataFault] = []
+    for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
+        parts = [values for w in windows if (values := getattr(w, name)) is not None]
+        if parts:
+            out += _saturated(name, unit, np.concatenate(parts))
+            out += _repeated(name, parts)
+    return tuple(out)
+
+
+def without_copies(windows: Sequence[Window]) -> list[Window]:
+    """Windows in which inertial rows that equal the row before exactly count as not measured."""
+    out = []
+    for window in windows:
+        changed = {}
+        for name in ("gyro", "accel"):
+            values = getattr(window, name)
+            if values is None:
+                continue
+            copies = np.flatnonzero(np.all(values[1:] == values[:-1], axis=1)) + 1
+            if len(copies) >= LEAST_COPIES * len(values):
+                kept = values.copy()
+                kept[copies] = np.nan
+                changed[name] = kept
+        out.append(replace(window, **changed) if changed else window)
+    return out
+
+
+def _saturated(name: str, unit: str, values: FloatArray) -> list[DataFault]:
+    found = []
+    for i, axis in enumerate(_AXES):
+        column = values[np.isfinite(values[:, i]), i]
+        levels, counts = np.unique(column, return_counts=True)
+        if len(levels) < 3:
+            continue
+        for end, beside in ((0, 1), (-1, -2)):
+            share = counts[end] / len(column)
+            if share > LEAST_AT_LIMIT and counts[end] > PILE * counts[beside]:
+                text = (
+                    f"{name} {axis} stays at exactly {levels[end]:.4g} {unit} in {share:.1%} of the samples: the "
+                    "sensor saturates; log it with a wider range, or fly more gently"
+                )
+                found.append(DataFault("saturated", f"{name} {axis}", float(share), text))
+    return found
+
+
+def _repeated(name: str, parts: Sequence[FloatArray]) -> list[DataFault]:
+    same = sum(int(np.count_nonzero(np.all(p[1:] == p[:-1], axis=1))) for p in parts)
+    rows = sum(max(len(p) - 1, 0) for p in parts)
+    share = same / max(rows, 1)
+    if share < LEAST_COPIES:
+        return []
+    text = (
+        f"{share:.0%} of the {name} rows are exact copies of the row before and were left out: the sensor is slower "
+        "than the log, or the link repeats what it has; log the sensor's own samples with their own times"
+    )
+    return [DataFault("repeated", name, share, text)]
