@@ -1,0 +1,73 @@
+"""Fitted problems that several tests of the diagnosis share: flown and fitted once a process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.candidates import Candidate, candidates
+from quadid.diagnose.models import Model, fit_model
+from quadid.flight import draw_truth, fly
+from quadid.identify.fit import SWARM_SECONDS, noise_floor, residual_noise
+from quadid.identify.noise import NoiseModel
+from quadid.identify.polish import polish
+from quadid.identify.shooting import Shooting
+from quadid.parameters import NOMINAL_NAMES
+from quadid.window import Window
+from tests.identify.flights import PELICAN, guessed
+
+FloatArray = NDArray[np.float64]
+SECONDS = 60.0
+SEED = 5
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One flight, and the nominal model fitted to it on 1 s segments with the noise of the flight."""
+
+    window: Window
+    shooting: Shooting
+    nominal: Model
+
+    @property
+    def listed(self) -> list[Candidate]:
+        """The catalogue."""
+        return candidates(self.shooting.layout, self.shooting.has_velocity, self.shooting.channels >= 15)
+
+
+def window_with(effects: dict[str, dict[str, float]] | None = None, **planted: FloatArray) -> Window:
+    """A 60 s flight with hidden effects, and what is added to its channels (gyro, accel; shape (n, 3))."""
+    truth = draw_truth(PELICAN, SEED)
+    window = fly(PELICAN, truth, SECONDS, SEED, effects=effects or {}).window
+    changed: dict[str, Any] = {k: np.asarray(getattr(window, k)) + v for k, v in planted.items()}
+    return replace(window, **changed)
+
+
+def fitted(window: Window, noise: NoiseModel | None = None) -> Problem:
+    """Fits the nominal model; the noise is that of a flexible fit to the window where none is given."""
+    vehicle = guessed(draw_truth(PELICAN, SEED), SEED)
+    short = Shooting([window], vehicle, SWARM_SECONDS, noise)
+    free = short.free(NOMINAL_NAMES)
+    first = polish(short, short.layout.initial(vehicle), free, iterations=8)
+    if noise is None:
+        short.noise = residual_noise(short, first)
+        first = polish(short, first.theta, free, iterations=8)
+        short.noise, _ = noise_floor([window], short, first.theta, free)
+    decisive = Shooting([window], vehicle, 1.0, short.noise, short.layout)
+    return Problem(window, decisive, fit_model(decisive, first.theta, (), iterations=10, tolerance=0.01))
+
+
+@lru_cache(maxsize=1)
+def clean() -> Problem:
+    """A flight without effects."""
+    return fitted(window_with())
+
+
+def cause(problem: Problem, label: str) -> Candidate:
+    """One candidate by its label."""
+    (found,) = [c for c in problem.listed if c.label == label]
+    return found

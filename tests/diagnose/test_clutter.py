@@ -1,0 +1,69 @@
+"""Worth amid clutter: what a cause gains that a vehicle on which everything is a little untidy could not imitate."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from quadid.diagnose.clutter import UNTIDY, clutter_names, untidy_names, without_in_clutter
+from quadid.diagnose.models import Model, extend
+from quadid.identify.linearised import Linearised
+from quadid.parameters import NOMINAL_NAMES
+from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
+
+
+@lru_cache(maxsize=1)
+def untidy() -> tuple[Problem, Model, Linearised]:
+    """A weak rotor beside a little of everything, the model that names it, and its linearisation."""
+    effects = {
+        "weak_rotor": {"rotor": 2.0, "loss": 0.08}, "accel_bias": {"x": 0.02, "y": -0.02, "z": 0.01},
+        "cg_offset": {"x": 0.0003, "y": -0.0002}, "gyro_bias": {"x": 0.001, "y": 0.001, "z": -0.001},
+    }  # fmt: skip
+    problem = fitted(window_with(effects), clean().shooting.noise)
+    model = extend(problem.shooting, problem.nominal, cause(problem, "weak_rotor 2"), iterations=12)
+    problem.shooting.restore(model.states)
+    free = problem.shooting.free(clutter_names(model, problem.listed))
+    return problem, model, problem.shooting.linearise(model.theta, free)
+
+
+def refitted(label: str | None) -> Model:
+    problem, model, everything = untidy()
+    gone = None if label is None else cause(problem, label)
+    return without_in_clutter(problem.shooting, model, gone, problem.listed, everything)
+
+
+def test_with_all_causes_clutter_takes_up_what_is_left() -> None:
+    _, model, _ = untidy()
+    tidied = refitted(None)
+    assert tidied.deviance < model.deviance - 50.0
+    assert tidied.causes == model.causes
+
+
+def test_nothing_moves_farther_than_clutter_may() -> None:
+    problem, model, _ = untidy()
+    for label, base in ((None, model.theta), ("weak_rotor 2", None)):
+        theta = refitted(label).theta
+        for name in untidy_names(problem.listed):
+            entry = problem.shooting.layout.entry(name)
+            start = 0.0 if base is None else base[entry.index]
+            if base is None and name == "weak_rotor.loss_2":
+                assert theta[entry.index] == 0.0
+            else:
+                assert abs(theta[entry.index] - start) <= UNTIDY * entry.typical * (1.0 + 1e-9), name
+
+
+def test_a_true_cause_is_worth_far_more_than_clutter_can_imitate() -> None:
+    _, model, _ = untidy()
+    without, tidied = refitted("weak_rotor 2"), refitted(None)
+    assert not without.causes
+    assert float(without.held_out.sum() - tidied.held_out.sum()) > 0.05 * model.rows
+
+
+def test_changes_at_a_moment_wind_and_ground_are_no_clutter() -> None:
+    problem, model, _ = untidy()
+    names = clutter_names(model, problem.listed)
+    assert set(NOMINAL_NAMES) <= set(names)
+    assert len(names) == len(set(names))
+    assert not [n for n in names if n.startswith(("mass_change", "thrust_drop", "wind", "ground_effect"))]
+    assert np.isfinite(model.theta).all()

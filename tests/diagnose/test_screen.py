@@ -1,0 +1,86 @@
+"""Screening: what one linearisation promises is what a refit delivers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.diagnose.models import Model, extend
+from quadid.diagnose.screen import Score, screen
+from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
+
+SMALL = {
+    "accel_bias": {"x": 0.05, "y": -0.03, "z": 0.02},
+    "cg_offset": {"x": 0.0003, "y": -0.0002},
+    "imu_lever_arm": {"x": 0.01, "y": -0.02, "z": 0.01},
+    "rate_damping": {"l_p": 0.1, "m_q": 0.15},
+}
+"""Sizes at which the model is linear in the effect."""
+
+
+def score_of(problem: Problem, label: str, model: Model | None = None) -> Score:
+    scores = screen(problem.shooting, model or problem.nominal, problem.listed)
+    (found,) = [s for s in scores if s.candidate.label == label]
+    return found
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_predicted_drop_is_that_of_a_refit(name: str) -> None:
+    problem = fitted(window_with({name: SMALL[name]}), clean().shooting.noise)
+    score = score_of(problem, name)
+    refit = extend(problem.shooting, problem.nominal, cause(problem, name), problem.nominal.theta, iterations=12)
+    drop = problem.nominal.deviance - refit.deviance
+    assert drop > 30.0
+    assert score.drop == pytest.approx(drop, rel=0.05)
+    scores = screen(problem.shooting, problem.nominal, problem.listed)
+    assert max(scores, key=lambda s: s.drop / len(s.candidate.names)).drop <= 1.2 * score.drop + 10.0
+
+
+def test_without_effects_no_drop_is_beyond_chance() -> None:
+    """Chi-square tails of the score tests: smallest of about 25 not below 1e-4, and none promises half a per cent."""
+    problem = clean()
+    scores = screen(problem.shooting, problem.nominal, problem.listed)
+    assert len(scores) >= 20
+    assert max(s.drop for s in scores) < 0.004 * problem.nominal.rows
+
+
+def test_the_scan_finds_when_thrust_dropped() -> None:
+    problem = fitted(window_with({"thrust_drop": {"time": 37.3, "fraction": 0.02}}), clean().shooting.noise)
+    score = score_of(problem, "thrust_drop")
+    assert score.time == pytest.approx(37.3, abs=1.5)
+    assert score.trials == len(problem.nominal.lin.time)
+
+
+def test_the_scan_is_that_of_masked_columns() -> None:
+    """Sums from the end against the score test of a model whose step sits at the found time."""
+    problem = fitted(window_with({"thrust_drop": {"time": 30.0, "fraction": 0.02}}), clean().shooting.noise)
+    score = score_of(problem, "thrust_drop")
+    assert score.time is not None
+    theta = problem.nominal.theta.copy()
+    timed = score.candidate.timed
+    assert timed is not None
+    theta[timed] = score.time
+    moved = extend(problem.shooting, problem.nominal, score.candidate, theta, iterations=8)
+    assert score.drop == pytest.approx(problem.nominal.deviance - moved.deviance, rel=0.1)
+
+
+def test_what_is_in_the_model_or_lacks_its_companion_is_not_tried() -> None:
+    problem = clean()
+    labels = {s.candidate.label for s in screen(problem.shooting, problem.nominal, problem.listed)}
+    assert "rotor_drag_moment" not in labels
+    assert "rotor_drag" in labels
+    drag = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), iterations=3)
+    labels = {s.candidate.label for s in screen(problem.shooting, drag, problem.listed)}
+    assert "rotor_drag" not in labels
+    assert "rotor_drag_moment" in labels
+
+
+def test_a_direction_the_nominal_parameters_explain_promises_nothing() -> None:
+    """A thrust drop before the log begins is a smaller b: nothing is left to gain."""
+    problem = clean()
+    whole = replace(cause(problem, "thrust_drop"), timed=None)
+    (score,) = screen(problem.shooting, problem.nominal, [whole])
+    assert score.drop < 5.0
+    assert np.isfinite(score.z).all()

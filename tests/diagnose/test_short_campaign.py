@@ -1,0 +1,87 @@
+"""The short campaign: what was hidden must be found, by its name, and nothing else."""
+
+from __future__ import annotations
+
+import pytest
+
+from quadid.flight import OUTSIDE
+from studies.campaign import SINGLES
+from tests.diagnose.hidden import SECONDS, answer, confident, number, of_class, require_named, require_nothing, single
+
+QUICK = (
+    "motor_lag", "attitude_delay", "rotor_drag", "weak_rotor", "mass_change", "battery_sag", "accel_bias",
+    "imu_lever_arm",
+)  # fmt: skip
+OTHERS = (
+    "command_delay", "imu_lag", "rotor_drag_moment", "rate_damping", "axial_inflow", "wind", "cg_offset", "thrust_drop",
+    "thrust_curve", "product_of_inertia", "rotor_spin_up", "gyro_bias", "gyro_scale", "imu_misalignment",
+    "ahrs_acceleration_error",
+)  # fmt: skip
+WITHIN = {"battery_sag": 0.2, "gyro_scale": 0.4, "accel_bias": 0.1, "rotor_spin_up": 0.2, "axial_inflow": 0.2}
+"""How far the numbers of an effect may be off, as a share of the largest of them; 0.15 where nothing is said."""
+
+
+def found_and_measured(name: str, seconds: float) -> None:
+    """Requires the effect to be named alone, with its numbers about right."""
+    case = single(name, seconds)
+    found, _ = answer(case)
+    require_named(case, found)
+    truth = case.hidden[name]
+    largest = max(abs(v) for k, v in truth.items() if k not in ("rotor", "time"))
+    for key, value in truth.items():
+        room = {"rotor": 0.0, "time": 0.5}.get(key, WITHIN.get(name, 0.15) * largest)
+        assert abs(number(found, name, key) - value) <= room, (key, value, found.to_dict())
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_single_hidden_effect_is_named_and_measured(name: str) -> None:
+    found_and_measured(name, SECONDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHERS)
+def test_every_other_effect_too(name: str) -> None:
+    found_and_measured(name, 120.0)
+
+
+def test_both_effects_of_a_pair_are_named() -> None:
+    case = of_class("pair", 0)
+    assert set(case.expected) == {"motor_lag", "rotor_drag"}
+    found, _ = answer(case)
+    require_named(case, found)
+
+
+def test_a_flight_without_effects_is_left_alone() -> None:
+    found, workings = answer(of_class("null", 0))
+    require_nothing(found)
+    assert found.validation.extended == found.validation.nominal == pytest.approx(1.0, abs=0.1)
+    assert not workings.remainder.followed
+
+
+def test_what_no_entry_explains_is_called_unknown() -> None:
+    case = of_class("outside", sorted(OUTSIDE).index("gusts"))
+    assert case.outside
+    found, _ = answer(case)
+    assert found.verdict.value == "unknown", found.to_dict()
+    assert not confident(found)
+    assert found.unexplained or found.unexplained_follows, "an unknown must say where it sits"
+
+
+def test_amid_clutter_the_large_effect_comes_first_and_no_absent_one_is_named() -> None:
+    case = of_class("clutter", SINGLES.index("weak_rotor"), 120.0)
+    assert case.expected == ("weak_rotor",)
+    found, _ = answer(case)
+    assert found.findings[0].effect == "weak_rotor", found.to_dict()
+    assert found.findings[0].confident
+    assert set(confident(found)) <= set(case.hidden)
+
+
+def test_findings_are_ordered_by_their_gain_and_say_what_they_are() -> None:
+    case = of_class("pair", 0)
+    found, _ = answer(case)
+    gains = [f.gain.mse_before - f.gain.mse_after for f in found.findings]
+    assert gains == sorted(gains, reverse=True)
+    for f in found.findings:
+        assert f.gain.ci95[0] < f.gain.mse_before - f.gain.mse_after < f.gain.ci95[1]
+        assert f.p_value < 0.05
+        assert all(p.ci95[0] <= p.value <= p.ci95[1] for p in f.parameters)
