@@ -73,7 +73,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: truth cases campaign real-logs paper-scale kernel-speed
+.PHONY: truth cases campaign real-logs paper-scale excite kernel-speed
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -88,6 +88,9 @@ real-logs: venv ## every recorded flight, identified and set beside what is know
 
 paper-scale: venv ## three 500 s sets: error, time and memory of the fit
 	$(STUDY) studies.paper_scale --out docs/results
+
+excite: venv ## intervals that a proposed manoeuvre promises and obtains
+	$(STUDY) studies.excite --out docs/results
 
 kernel-speed: venv ## nanoseconds per particle and step
 	$(STUDY) benchmarks.kernel --out docs/results

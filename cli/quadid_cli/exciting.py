@@ -1,0 +1,212 @@
+"""A manoeuvre that reveals most: candidate movements are flown in simulation, weighed, chosen and put in a row.
+
+The flights are those of the simulated vehicle with the parameters believed so far; what counts of them is the Fisher
+information that a log of them would carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import NotIdentifiableError
+from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
+from quadid.identify.design import d_optimal, halfwidths
+from quadid.identify.excitation import excitation
+from quadid.parameters import NOMINAL_NAMES
+
+if TYPE_CHECKING:
+    from quadid.identify.noise import NoiseModel
+    from quadid.vehicle import Vehicle
+    from quadid_cli.terminal import Advance
+
+FloatArray = NDArray[np.float64]
+BLOCK = 6.0
+"""Length of one movement [s]."""
+PAUSE = 0.5
+"""Rest after each [s], in which the vehicle levels."""
+BANDS = ((0.3, 1.0), (0.8, 2.0), (1.5, 3.5))
+"""Frequencies of the stick movements [Hz], lowest and highest."""
+MIXES = (
+    ("roll",), ("pitch",), ("yaw",), ("throttle",), ("roll", "pitch"), ("roll", "yaw"), ("pitch", "yaw"),
+    ("roll", "pitch", "yaw"), ("roll", "pitch", "yaw", "throttle"),
+)  # fmt: skip
+START = {"roll": 0.1, "pitch": 0.1, "yaw": 0.3, "throttle": 0.07}
+"""Amplitudes that a search for the largest allowed ones begins with: rad rms, fraction of hover thrust."""
+LARGEST = {"roll": 0.35, "pitch": 0.35, "yaw": 1.5, "throttle": 0.15}
+ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a manoeuvre must not exceed: tilt [rad], body rate [rad/s]."""
+
+    tilt: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class Movement:
+    """One block: its name, its segments from time 0, and the information it brings (P, P)."""
+
+    name: str
+    segments: tuple[Segment, ...]
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A manoeuvre and what it would give.
+
+    Attributes:
+        movements: chosen blocks in the order flown.
+        segments: of the whole manoeuvre.
+        seconds: its length.
+        peak: largest tilt [rad] and rate [rad/s] in simulation.
+        now, pilot, after: relative 95 % half-widths now, after as long a gentle flight, after the manoeuvre, (P,).
+        flight: the manoeuvre flown in simulation.
+    """
+
+    movements: tuple[Movement, ...]
+    segments: tuple[Segment, ...]
+    seconds: float
+    peak: Limits
+    now: FloatArray
+    pilot: FloatArray
+    after: FloatArray
+    flight: Flight
+
+
+class Simulator:
+    """Flies what is believed of the vehicle and weighs the flights."""
+
+    def __init__(self, vehicle: Vehicle, noise: NoiseModel | None, seed: int) -> None:
+        """Takes the vehicle file's values for the truth; `noise` as found in logs, or None for a typical one."""
+        self.vehicle, self.noise, self.seed = vehicle, noise, seed
+        self.truth = TruthParameters(
+            **{n: vehicle.parameters[n].initial for n in NOMINAL_NAMES}, mass=vehicle.mass
+        )  # fmt: skip
+
+    def fly(self, segments: Sequence[Segment], seconds: float, profile: str = "scripted") -> Flight:
+        """One flight; raises FlightError when it ends on the ground."""
+        return fly(
+            self.vehicle, self.truth, seconds, self.seed, profile, effects=self.vehicle.effects,
+            segments=segments if profile == "scripted" else None,
+        )  # fmt: skip
+
+    def information(self, flight: Flight) -> FloatArray:
+        """Fisher information of the log parameters in the log of a flight, shape (P, P)."""
+        return excitation([flight.window], self.vehicle, noise=self.noise).information
+
+    def within(
+        self, segments: tuple[Segment, ...], seconds: float, limits: Limits
+    ) -> tuple[tuple[Segment, ...], Flight]:
+        """The segments at the largest amplitude within the limits, and their flight.
+
+        Raises:
+            FlightError: they cannot be flown.
+        """
+        flight, safe = None, None
+        for _ in range(ROUNDS):
+            flight = self.fly(segments, seconds)
+            found = peaks(flight)
+            room = min(limits.tilt / found.tilt, limits.rate / found.rate)
+            if room >= 1.0:
+                safe = (segments, flight)
+            if 0.95 <= room <= 1.1:
+                break
+            segments = scaled(segments, float(np.clip(0.97 * room, 0.2, 3.0)))
+        if safe is None:
+            raise FlightError("a movement exceeds the limits at any amplitude tried", "a wider limit")
+        return safe
+
+
+def peaks(flight: Flight) -> Limits:
+    """Largest tilt and body rate that the log of a flight shows."""
+    q, gyro = flight.window.attitude, flight.window.gyro
+    assert q is not None
+    assert gyro is not None
+    tilt = np.arccos(np.clip(1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1.0, 1.0))
+    return Limits(float(np.nanmax(tilt)), float(np.nanmax(np.abs(gyro))))
+
+
+def scaled(segments: Sequence[Segment], factor: float) -> tuple[Segment, ...]:
+    """Segments with their amplitudes scaled, each up to the largest of its axis."""
+    return tuple(replace(s, amplitude=min(s.amplitude * factor, LARGEST[s.axis])) for s in segments)
+
+
+def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Movement]:
+    """Every candidate movement at the amplitude that the limits allow, with its information."""
+    out = []
+    todo = [(mix, band) for mix in MIXES for band in BANDS]
+    for i, (mix, (low, high)) in enumerate(todo):
+        advance("movements", i / len(todo))
+        start = tuple(Segment(axis, "multisine", 0.0, BLOCK, START[axis], low, high) for axis in mix)
+        try:
+            segments, flight = simulator.within(start, BLOCK + PAUSE, limits)
+        except FlightError:
+            continue
+        name = f"{' + '.join(mix)}, {low:g} to {high:g} Hz"
+        out.append(Movement(name, segments, simulator.information(flight)))
+    return out
+
+
+def propose(simulator: Simulator, known: FloatArray, limits: Limits, seconds: float, advance: Advance) -> Proposal:
+    """Chooses a manoeuvre of about `seconds` and says what it would give.
+
+    Args:
+        simulator: what is believed of the vehicle.
+        known: information there already is, prior included, shape (P, P).
+        limits: largest tilt and rate.
+        seconds: length of the manoeuvre.
+        advance: told how far it is.
+
+    Raises:
+        NotIdentifiableError: no movement stays within the limits.
+    """
+    candidates = movements(simulator, limits, advance)
+    if not candidates:
+        raise NotIdentifiableError(
+            "no movement stays within the limits", "a tilt of 5 degrees or more, a rate of 30 deg/s or more",
+            "give wider --tilt and --rate-limit",
+        )  # fmt: skip
+    blocks = max(round(seconds / (BLOCK + PAUSE)), 1)
+    chosen = d_optimal(np.array([m.information for m in candidates]), known, blocks)
+    picked = tuple(candidates[i] for i in chosen)
+    length = blocks * (BLOCK + PAUSE)
+    row = in_a_row(picked)
+    for _ in range(ROUNDS):
+        flight = simulator.fly(row, length)
+        peak = peaks(flight)
+        excess = max(peak.tilt / limits.tilt, peak.rate / limits.rate)
+        if excess <= 1.0:
+            break
+        picked = tuple(replace(m, segments=scaled(m.segments, 0.97 / excess)) for m in picked)
+        row = in_a_row(picked)
+    advance("movements", 1.0)
+    gentle = simulator.information(simulator.fly((), length, "gentle"))
+    gained = simulator.information(flight)
+    return Proposal(
+        picked, row, length, peak, halfwidths(known), halfwidths(known + gentle), halfwidths(known + gained), flight
+    )
+
+
+def in_a_row(picked: Sequence[Movement]) -> tuple[Segment, ...]:
+    """Segments of movements flown one after the other."""
+    return tuple(
+        replace(s, start=i * (BLOCK + PAUSE) + s.start) for i, movement in enumerate(picked) for s in movement.segments
+    )
+
+
+def manoeuvre_file(vehicle: str, proposal: Proposal) -> str:
+    """The manoeuvre as YAML that ``quadid simulate --manoeuvre`` flies."""
+    import yaml
+
+    segments = [{k: v if isinstance(v, str) else round(v, 5) for k, v in asdict(s).items()} for s in proposal.segments]
+    body: dict[str, Any] = {"vehicle": vehicle, "seconds": proposal.seconds, "segments": segments}
+    units = "# amplitude: rms of roll, pitch, yaw [rad]; fraction of hover thrust for throttle. start, duration [s].\n"
+    return units + yaml.safe_dump(body, sort_keys=False, default_flow_style=None, width=120)

@@ -1,0 +1,57 @@
+"""`quadid excite`: limits are kept, the file can be flown, and what was promised is obtained."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from quadid.parameters import NOMINAL_NAMES
+from tests.cli.conftest import Cli, Flights, one_line
+
+
+def test_a_manoeuvre_from_a_log_keeps_limits_and_promises(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    """With good values to start from, forecast and obtained intervals agree."""
+    run = inside(
+        "excite", flights.train, "--vehicle", "pelican", "--seconds", "26", "--tilt", "20", "--rate-limit", "120",
+        "--out", tmp_path, "--json", "-", "--report", tmp_path / "excite.html",
+    )  # fmt: skip
+    assert run.code == 0, run.err
+    result = run.data
+    assert result["schema"] == "quadid.excite/1"
+    assert result["peak"]["tilt_deg"] <= 20.0
+    assert result["peak"]["rate_deg_s"] <= 120.0
+    assert [p["name"] for p in result["parameters"]] == list(NOMINAL_NAMES)
+    for p in result["parameters"]:
+        assert p["manoeuvre"] < p["gentle_flight"] <= p["now"] * 1.001
+    assert "<html" in (tmp_path / "excite.html").read_text(encoding="utf-8")
+    file = Path(result["manoeuvre_file"])
+    seconds = str(yaml.safe_load(file.read_text(encoding="utf-8"))["seconds"])
+    flown = tmp_path / "flown.mcap"
+    made = inside("simulate", flown, "--vehicle", "pelican", "--manoeuvre", file, "--seconds", seconds, "--seed", "9")
+    assert made.code == 0, made.err
+    both = inside("identify", flights.train, flown, "--vehicle", "pelican", "--out", tmp_path, "--json", "-")
+    for promised, got in zip(result["parameters"], both.data["parameters"], strict=True):
+        half = math.sqrt(got["ci95"][1] / got["ci95"][0]) - 1.0
+        assert half == pytest.approx(promised["manoeuvre"], rel=0.25), got["name"]
+
+
+def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path: Path) -> None:
+    run = inside("excite", "--vehicle", "hexacopter", "--seconds", "13", "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+    assert len(run.data["movements"]) == 2
+    axes = {axis for m in run.data["movements"] for axis in m["amplitudes"]}
+    assert {"roll", "pitch", "yaw"} <= axes
+    assert np.isfinite(run.data["gain"])
+    assert run.data["gain"] > 4.0
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--seconds", "1"), ("--seconds", "nan"), ("--tilt", "0"), ("--tilt", "90"), ("--rate-limit", "5")]
+)
+def test_limits_that_nobody_can_fly(inside: Cli, tmp_path: Path, arguments: tuple[str, str]) -> None:
+    line = one_line(inside("excite", "--vehicle", "pelican", "--out", tmp_path, *arguments), 2)
+    assert arguments[0] in line
