@@ -161,7 +161,8 @@ def null_page(records: list[Record], seconds: float) -> str:
     return (
         f"{n} flights of {seconds:.0f} s without any effect ({len(records) - n} failed); 95 % intervals of\n"
         "the binomial law, exact. The best three causes of each screening were refitted whatever they promised;\n"
-        "rows three to five say what each part of the rule alone would have let through. The selection asks for all three.\n\n"
+        "rows three to five say what each part of the rule alone would have let through. The selection\n"
+        "asks for all three.\n\n"
         f"| flights in which | share |\n|---|---|\n{table}\n\n"
         f"Largest gain on unseen blocks of any of these trials, as a share of the noise: median {largest[0]:.5f},\n"
         f"95 % quantile {largest[1]:.5f}, largest {largest[2]:.5f}; the rule asks for {rule.LEAST_SHARE}.\n\n"
