@@ -36,6 +36,8 @@ from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
 
+BUDGET = {"smooth": 1500, "non-smooth": 1000}
+"""Simulations of the flight that a run may spend."""
 SECONDS, SEGMENT = {"smooth": 10.0, "non-smooth": 5.0}, 0.2
 SUCCESS = 1.01
 DELAY, KNEE = 0.04, 1.12
@@ -233,7 +235,6 @@ def main() -> None:
     """Command line of the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--budget", type=int, default=1500)
     parser.add_argument("--keep", type=Path, default=None, help="file that an interrupted run goes on from")
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
@@ -241,11 +242,11 @@ def main() -> None:
     for kind in ("smooth", "non-smooth"):
         for bounds in BOUNDS:
             results[kind, bounds] = [
-                kept_or_run(options.keep, kind, bounds, seed, options.budget) for seed in range(options.seeds)
+                kept_or_run(options.keep, kind, bounds, seed, BUDGET[kind]) for seed in range(options.seeds)
             ]
             print(f"## {kind}, {bounds}", *table(results[kind, bounds]), sep="\n", flush=True)
     if options.out is not None:
-        text = page(results, options.seeds, options.budget)
+        text = page(results, options.seeds)
         (options.out / "optimisers.md").write_text(text, encoding="utf-8")
 
 
@@ -286,20 +287,21 @@ def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str
     return lines
 
 
-def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int, budget: int) -> str:
+def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -> str:
     """The result as Markdown."""
     lines = [
         "# When is a particle swarm worth it?", "",
-        f"`python -m studies.optimisers --seeds {seeds} --budget {budget} --out docs/results`", "",
+        f"`python -m studies.optimisers --seeds {seeds} --out docs/results`", "",
         "Each seed is a new individual Pelican, a new flight, and a start drawn at random in the box, the same for all "
         "methods. One evaluation is one simulation of one parameter vector, finite differences included. Success: cost "
         f"within {SUCCESS - 1.0:.0%} of the lowest that any method, or least squares from the truth, found for that "
         "seed; evaluations are those until then.", "",
-        f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, stretches of {SEGMENT:g} s.",
+        f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, stretches of {SEGMENT:g} s, "
+        f"{BUDGET['smooth']} evaluations.",
         f"* Non-smooth: flights of {SECONDS['non-smooth']:g} s in which commands come {1e3 * DELAY:g} ms late and "
         f"rotors saturate at {KNEE:g} hover speeds. The simulation is late by whole samples (20 ms) only and clips at "
         "a speed to be found: eight parameters, one without a gradient, one with a gradient only where rotors "
-        "saturate.",
+        f"saturate; {BUDGET['non-smooth']} evaluations.",
         "* Bounds: " + ", ".join(f"{name} a factor of {factor:g} each way" for name, factor in BOUNDS.items())
         + f", off centre by up to a factor of {np.exp(OFF_CENTRE):.2f}.", "",
         "## Answer", "", *answer(results), "",
