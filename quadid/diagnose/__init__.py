@@ -1,5 +1,6 @@
 """Diagnosis: what the simulation gets wrong, why, and what the better model gains."""
 
+from quadid.diagnose.pipeline import Workings as Workings
 from quadid.diagnose.pipeline import diagnose as diagnose
 from quadid.diagnose.result import Diagnosis as Diagnosis
 from quadid.diagnose.result import Verdict as Verdict

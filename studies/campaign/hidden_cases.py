@@ -1,6 +1,4 @@
-"""Blinded campaign: hides effects in flown data, lets the diagnosis look at the log alone, and grades the answer.
-
-    python -m studies.campaign --cases 400 --out docs/results
+"""The cases: what is hidden, and how it is flown.
 
 Every case is decided by its class and number alone.  The diagnosis gets windows and a vehicle file with a poor guess;
 what was hidden never reaches it.
@@ -8,25 +6,14 @@ what was hidden never reaches it.
 
 from __future__ import annotations
 
-import argparse
-import json
-import multiprocessing
-import os
-import time
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from quadid.diagnose import Diagnosis, diagnose
 from quadid.effects import EFFECTS
-from quadid.errors import QuadidError
-from quadid.flight import OUTSIDE, FlightError, draw_effect, draw_outside, draw_truth, fly
+from quadid.flight import OUTSIDE, draw_effect, draw_outside, draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
@@ -65,25 +52,6 @@ class Case:
     def seed(self) -> int:
         """Seed of the flight."""
         return zlib.crc32(f"{self.group}/{self.number}".encode()) % 2**31
-
-
-@dataclass(frozen=True)
-class Graded:
-    """The answer to one case beside the truth."""
-
-    case: Case
-    verdict: str
-    named: tuple[str, ...]
-    listed: tuple[str, ...]
-    first: str | None
-    values: dict[str, dict[str, float]]
-    intervals: dict[str, dict[str, tuple[float, float]]]
-    mse_nominal: float
-    mse_extended: float
-    mse_oracle: float | None
-    rest: float
-    seconds: float
-    note: str = ""
 
 
 def cases(group: str, count: int, start: int = 0) -> list[Case]:
@@ -129,8 +97,9 @@ def _case(group: str, n: int) -> Case:
         for i, name in enumerate(SINGLES):
             if name not in ("mass_change", "thrust_drop", "ground_effect", "wind"):
                 hidden.update({k: v for k, v in draw_effect(name, n + 1000 * i, 0.05, craft).items() if k == name})
+        # What is invisible without a companion is drawn with it, both at full size.
         hidden.update(draw(large))
-        return replace(blank, hidden=hidden, expected=(large,))
+        return replace(blank, hidden=hidden, expected=tuple(draw(large)))
     raise ValueError(f"unknown class '{group}'")
 
 
@@ -163,99 +132,3 @@ def flown(case: Case) -> tuple[Window, Window, Vehicle]:
         )  # fmt: skip
         windows.append(flight.window)
     return windows[0], windows[1], guessed_vehicle(case, truth.as_dict())
-
-
-def run(case: Case) -> Graded:
-    """Flies, diagnoses and grades one case."""
-    try:
-        train, validate, vehicle = flown(case)
-    except (FlightError, QuadidError) as error:
-        return _failed(case, f"not flown: {error}")
-    began = time.perf_counter()
-    try:
-        found, workings = diagnose([train], vehicle, [validate], seed=case.seed)
-    except QuadidError as error:
-        return _failed(case, f"refused: {error}")
-    seconds = time.perf_counter() - began
-    return _graded(case, found, workings.remainder.deviance / workings.search.model.rows, seconds)
-
-
-def _graded(case: Case, found: Diagnosis, rest: float, seconds: float) -> Graded:
-    return Graded(
-        case,
-        found.verdict.value,
-        tuple(f.effect for f in found.findings if f.confident),
-        tuple(f.effect for f in found.findings),
-        found.findings[0].effect if found.findings else None,
-        {f.effect: {p.name: p.value for p in f.parameters} for f in found.findings},
-        {f.effect: {p.name: p.ci95 for p in f.parameters} for f in found.findings},
-        found.validation.nominal,
-        found.validation.extended,
-        None,
-        rest,
-        seconds,
-    )
-
-
-def _failed(case: Case, note: str) -> Graded:
-    return Graded(case, "failed", (), (), None, {}, {}, float("nan"), float("nan"), None, 0.0, 0.0, note)
-
-
-def right(g: Graded) -> bool:
-    """Whether the answer is right in full: all that was hidden, nothing else; `unknown` for the unknown."""
-    group = g.case.group
-    if group == "null":
-        return g.verdict == "nothing_found"
-    if group == "outside":
-        return g.verdict == "unknown" or (g.verdict == "nothing_found")
-    if group == "clutter":
-        return g.first in g.case.expected and all(n in g.case.hidden for n in g.named)
-    return set(g.named) == set(g.case.expected)
-
-
-def _line(g: Graded) -> str:
-    """One wrong answer, for the log of a campaign."""
-    what = g.case.expected if g.case.group == "clutter" else g.case.hidden or g.case.outside
-    return (
-        f"{g.case.number} {g.case.vehicle} {g.verdict} {list(g.listed)} hidden {what} "
-        f"mse {g.mse_nominal:.3f} -> {g.mse_extended:.3f} rest {g.rest:.3f} {g.note}"
-    )
-
-
-def run_many(todo: Sequence[Case], processes: int = 2) -> list[Graded]:
-    """Runs cases in worker processes, in order."""
-    if processes <= 1:
-        return [_said(run(c)) for c in todo]
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        return [_said(g) for g in pool.imap(run, todo, chunksize=1)]
-
-
-def _said(g: Graded) -> Graded:
-    """Prints one case as it is done."""
-    print("   ", "right" if right(g) else "WRONG", f"{g.seconds:.1f} s", _line(g), flush=True)
-    return g
-
-
-def main() -> None:
-    """Command line of the campaign."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--groups", default=",".join(GROUPS))
-    parser.add_argument("--count", type=int, default=0, help="cases a class (default: the full campaign)")
-    parser.add_argument("--start", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", default="")
-    options = parser.parse_args()
-    everything: list[dict[str, Any]] = []
-    for group in options.groups.split(","):
-        todo = cases(group, options.count or GROUPS[group], options.start)
-        graded = run_many(todo, options.processes)
-        good = sum(right(g) for g in graded)
-        print(f"{group}: {good} of {len(graded)} right", flush=True)
-        everything += [asdict(g) for g in graded]
-    if options.out:
-        Path(options.out).mkdir(parents=True, exist_ok=True)
-        (Path(options.out) / "campaign.json").write_text(json.dumps(everything, default=float), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

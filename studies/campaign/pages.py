@@ -1,0 +1,147 @@
+"""The result of a campaign as a page with tables and pictures."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from quadid.effects import EFFECTS
+from studies.campaign import summary
+from studies.campaign.grading import Graded, line, right
+
+COMMAND = "python -m studies.campaign --out docs/results"
+
+
+def write(graded: Sequence[Graded], folder: Path, command: str = COMMAND) -> Path:
+    """Writes `diagnosis.md` and its pictures into `folder`; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    groups = {g.case.group: [x for x in graded if x.case.group == g.case.group] for g in graded}
+    parts = [
+        "# Diagnosis: blinded campaign\n",
+        f"{len(graded)} cases, `{command}`, {datetime.date.today().isoformat()}. Class and number of a case are its "
+        "seed. Flights of 120 s unless said otherwise; intervals in brackets are exact 95 % binomial ones.\n",
+        _classes(groups),
+    ]
+    singles = groups.get("single", [])
+    if singles:
+        parts += [_parameters(singles), _oracle(groups), "## Which effect was named first\n"]
+        confusion(singles, folder / "diagnosis-confusion.png")
+        parts.append("![Hidden effect against first finding](diagnosis-confusion.png)\n")
+    sizes = {float(k.split("_")[1]): v for k, v in groups.items() if k.startswith("size_")}
+    if sizes:
+        detection({**sizes, 1.0: singles}, folder / "diagnosis-detection.png")
+        parts += ["## How small an effect is found\n", "![Detection curve](diagnosis-detection.png)\n"]
+    parts.append(_misses(graded))
+    page = folder / "diagnosis.md"
+    page.write_text("\n".join(parts), encoding="utf-8")
+    return page
+
+
+def _classes(groups: dict[str, list[Graded]]) -> str:
+    rows = [
+        "| class | first finding right | all found | nothing else named | wholly right | verdicts | median s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, graded in groups.items():
+        hides = name not in ("null", "outside")
+        cells = [
+            str(summary.first_right(graded)) if hides else "–",
+            str(summary.all_found(graded)) if hides else "–",
+            str(summary.nothing_else(graded)),
+            str(summary.wholly_right(graded)),
+            summary.verdicts(graded),
+            f"{np.median([g.seconds for g in graded]):.1f}",
+        ]
+        rows.append(f"| {name} | " + " | ".join(cells) + " |")
+    note = (
+        "\nWholly right: a null is left alone; an effect outside the catalogue gets no confident name; in clutter "
+        "(every effect at a twentieth of its size, one large) the large one comes first and nothing absent is named; "
+        "elsewhere exactly what was hidden is named.\n"
+    )
+    return "## By class\n\n" + "\n".join(rows) + "\n" + note
+
+
+def _parameters(singles: Sequence[Graded]) -> str:
+    errors, inside = summary.parameter_errors(singles), summary.coverage(singles)
+    rows = [
+        "| effect | found | median error | largest error | 95 % interval holds the truth |",
+        "|---|---|---|---|---|",
+    ]
+    for effect, values in errors.items():
+        cells = [str(len(values)), f"{100 * np.median(values):.1f} %", f"{100 * max(values):.1f} %"]
+        rows.append(f"| {effect} | " + " | ".join([*cells, str(inside.get(effect, "–"))]) + " |")
+    everything = [e for v in errors.values() for e in v]
+    total = summary.Share(sum(s.k for s in inside.values()), sum(s.n for s in inside.values()))
+    middle, worst = 100 * np.median(everything), 100 * max(everything)
+    rows.append(f"| **all** | {len(everything)} | {middle:.1f} % | {worst:.1f} % | {total} |")
+    return "## The effect's own parameters\n\n" + "\n".join(rows) + "\n"
+
+
+def _oracle(groups: dict[str, list[Graded]]) -> str:
+    rows = ["| class | cases | median | worst | share at 95 % or more |", "|---|---|---|---|---|"]
+    for name, graded in groups.items():
+        ratios = summary.oracle_ratios(graded)
+        if ratios:
+            high = summary.Share(sum(r >= 0.95 for r in ratios), len(ratios))
+            rows.append(f"| {name} | {len(ratios)} | {np.median(ratios):.3f} | {min(ratios):.3f} | {high} |")
+    head = "## Gain on an unseen flight, relative to an oracle that knows the true structure\n\n"
+    return head + "\n".join(rows) + "\n"
+
+
+def _misses(graded: Sequence[Graded]) -> str:
+    wrong = [g for g in graded if not right(g)]
+    listed = "\n".join(f"* {line(g)}" for g in wrong)
+    return f"## Every answer that was not wholly right ({len(wrong)})\n\n{listed}\n"
+
+
+def confusion(singles: Sequence[Graded], path: Path) -> None:
+    """Draws hidden effect against first finding."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    hidden = list(EFFECTS)
+    named = [*EFFECTS, "unknown", "nothing_found"]
+    counts = np.zeros((len(hidden), len(named)))
+    for g in singles:
+        own = [e for e in g.case.expected if e != "rotor_drag"] or list(g.case.expected)
+        said = own[0] if g.first in g.case.expected else (g.first if g.named else g.verdict)
+        counts[hidden.index(own[0]), named.index(said if said in named else "unknown")] += 1
+    figure, axes = plt.subplots(figsize=(11, 9.5), layout="constrained")
+    axes.imshow(counts, cmap="Blues", vmin=0, vmax=max(counts.max(), 1))
+    for i, j in np.argwhere(counts > 0):
+        colour = "white" if counts[i, j] > 0.6 * counts.max() else "black"
+        axes.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", color=colour, fontsize=8)
+    axes.set_xticks(range(len(named)), named, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(hidden)), hidden, fontsize=8)
+    axes.set_xlabel("named first")
+    axes.set_ylabel("hidden")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def detection(sizes: dict[float, list[Graded]], path: Path) -> None:
+    """Draws the share found and the share of wrong names against the size of the effect."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    scales = sorted(s for s in sizes if sizes[s])
+    found = [np.mean([set(g.case.expected) <= set(g.named) for g in sizes[s]]) for s in scales]
+    wrong = [np.mean([any(n not in g.case.hidden for n in g.named) for g in sizes[s]]) for s in scales]
+    axes.semilogx(scales, found, "o-", label="found and named")
+    axes.semilogx(scales, wrong, "s--", label="something else named")
+    axes.set_xticks(scales, [f"{s:g}" for s in scales])
+    axes.set_xlabel("size of the effect, realistic size = 1")
+    axes.set_ylabel("share of cases")
+    axes.set_ylim(-0.03, 1.03)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
