@@ -18,10 +18,13 @@ from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
+STAND_ERROR = 0.02
+"""Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
 DEFAULT_BOUND_FACTOR = 4.0
 """A bare initial guess may be wrong by this factor each way."""
 
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -116,6 +119,13 @@ class Stabiliser(_Strict):
     rate: PositiveFloat | None = None
 
 
+class ThrustPoint(_Strict):
+    """One reading of a thrust stand, one rotor: speed [rad/s], thrust [N]."""
+
+    speed: PositiveFloat
+    thrust: PositiveFloat
+
+
 class Vehicle(_Strict):
     """Everything known about a vehicle before its log is read.
 
@@ -128,10 +138,16 @@ class Vehicle(_Strict):
         effects: effects that are part of the model, name -> parameter -> value.
         noise: known sensor noise, or None.
         stabiliser: known stabiliser gains, or None.
+        mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
+        arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
+        thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
     """
 
     name: str
     mass: PositiveFloat
+    mass_sigma: Spread = 0.0
+    arm_sigma: Spread = 0.0
+    thrust_stand: tuple[ThrustPoint, ...] = ()
     rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=16)
     command: Command = Command()
     parameters: dict[str, ParameterPrior]
@@ -174,6 +190,13 @@ class Vehicle(_Strict):
         why = impossible_inertia(diagonal)
         if why:
             raise ValueError(f"impossible inertia: {why}")
+        if self.stand_thrust is not None:
+            low, high = self.parameters["b"].limits
+            if not low < self.stand_thrust[0] < high:
+                raise ValueError(
+                    f"thrust_stand gives b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
+                    "check rad/s and N, one rotor a reading"
+                )
         arms = np.array([r.position for r in self.rotors])[:, :2]
         spread = np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)
         if spread[-1] < 1e-4:
@@ -193,6 +216,23 @@ class Vehicle(_Strict):
     def spins(self) -> FloatArray:
         """Shape (rotors,), +1 or -1."""
         return np.array([float(r.spin) for r in self.rotors])
+
+    @property
+    def arm(self) -> float:
+        """Mean horizontal distance of the rotors from the geometric centre [m]."""
+        return float(np.mean(np.linalg.norm(self.rotor_positions[:, :2], axis=1)))
+
+    @property
+    def stand_thrust(self) -> tuple[float, float] | None:
+        """Thrust coefficient [N s^2/rad^2] and its relative standard deviation from the thrust stand, or None.
+
+        Least squares of thrust / speed^2 with equal relative errors; a stand is never trusted below `STAND_ERROR`.
+        """
+        if not self.thrust_stand:
+            return None
+        logs = np.log([p.thrust / p.speed**2 for p in self.thrust_stand])
+        spread = float(np.std(logs, ddof=1) / math.sqrt(len(logs))) if len(logs) > 1 else 0.0
+        return float(np.exp(np.mean(logs))), max(spread, STAND_ERROR)
 
     @property
     def initial(self) -> FloatArray:
@@ -245,6 +285,9 @@ class Vehicle(_Strict):
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
         data = self.model_dump(mode="json", exclude_none=True)
+        for name in ("mass_sigma", "arm_sigma", "thrust_stand"):
+            if not data[name]:
+                del data[name]
         return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
 
 
@@ -259,7 +302,8 @@ def _first_problem(error: ValidationError) -> str:
 
 def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
     models: dict[str, type[BaseModel]] = {
-        "rotors": Rotor, "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser,
+        "rotors": Rotor, "thrust_stand": ThrustPoint,
+        "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser,
     }  # fmt: skip
     model = models.get(str(path[0]), Vehicle) if path else Vehicle
     return list(model.model_fields)

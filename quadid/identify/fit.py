@@ -14,6 +14,7 @@ from quadid.identify.floor import noise_floor as noise_floor
 from quadid.identify.floor import residual_noise as residual_noise
 from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import Convergence, Polished, Prior, default_prior, polish
+from quadid.identify.scale import with_uncertain_scale
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
@@ -188,6 +189,7 @@ def _finish(
     prior = default_prior(shooting, free)
     lin = polished.lin if polished is not None else shooting.linearise(theta, free)
     unc = uncertainty(lin, free, prior, theta)
+    theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(

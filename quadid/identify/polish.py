@@ -65,9 +65,14 @@ class Polished:
 
 
 def default_prior(shooting: Shooting, free: Free) -> Prior:
-    """Prior of each free parameter: the vehicle file's sigma, else half of its bounds on the log scale."""
+    """Prior of each free parameter: thrust stand, else the file's sigma, else half of its bounds on the log scale."""
     mean, sigma = [], []
+    stand = shooting.vehicle.stand_thrust
     for e in free.entries:
+        if e.name == "b" and stand is not None:
+            mean.append(stand[0])
+            sigma.append(stand[1])
+            continue
         if e.name in shooting.vehicle.parameters:
             p = shooting.vehicle.parameters[e.name]
             low, high = p.limits
