@@ -118,10 +118,9 @@ def gyro_check(recording: Recording) -> Check:
     if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
         return Check("gyro_attitude", Verdict.UNKNOWN, "needs gyro and attitude")
     best: tuple[str, AxisMap] | None = None
-    stride = max(1, round(_STEP / sample_period(attitude.t)))
     for name, q in _attitude_readings(attitude.values):
-        measured, derived = _rates(gyro, attitude.t[::stride], q[::stride])
-        if len(measured) < 20 or np.max(np.std(derived, axis=0)) < _MOTION:
+        measured, derived = _moving_rates(gyro, attitude.t, q)
+        if len(measured) < 20:
             continue
         fit = _fit_without_jumps(measured, derived)
         if best is None or _likely(name, fit) > _likely(*best):
@@ -129,6 +128,26 @@ def gyro_check(recording: Recording) -> Check:
     if best is None:
         return Check("gyro_attitude", Verdict.UNKNOWN, "too little rotation to compare gyro and attitude")
     return _judge_rates(*best)
+
+
+def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates as of `_rates` over steps long enough for the motion to stand above the attitude's noise; none if still.
+
+    White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
+    steps tell them apart: motion = (4 var(2 step) - var(step)) / 3.
+    """
+    stride = max(1, round(_STEP / sample_period(t)))
+    measured, derived = _rates(gyro, t[::stride], q[::stride])
+    longer = _rates(gyro, t[:: 2 * stride], q[:: 2 * stride])[1]
+    if len(longer) < 20:
+        return (measured, derived) if np.max(np.std(derived, axis=0), initial=0.0) >= _MOTION else (longer[:0],) * 2
+    total = np.var(derived, axis=0)
+    motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
+    if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
+        return longer[:0], longer[:0]
+    if np.sum(motion) > 0.8 * np.sum(total):
+        return measured, derived
+    return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
 
 
 def _likely(reading: str, fit: AxisMap) -> float:

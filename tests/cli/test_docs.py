@@ -44,6 +44,14 @@ def test_every_command_that_a_page_names_exists(repository: Path) -> None:
             assert importlib.util.find_spec(module) is not None, (page.name, module)
 
 
+def test_every_test_that_a_wish_names_exists(repository: Path) -> None:
+    text = (repository / "docs" / "results" / "wishes.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(tests/[\w./]+)`", text)
+    assert len(named) >= 12
+    for name in named:
+        assert (repository / name).exists(), name
+
+
 def test_equations_become_mathml_and_code_is_left_alone(repository: Path) -> None:
     pytest.importorskip("latex2mathml", reason="pip install .[docs]")
     spec = importlib.util.spec_from_file_location("docs_math", repository / "tools" / "docs_math.py")

@@ -256,3 +256,14 @@ def test_a_crash_ends_the_flight_of_a_real_log(data_dir: Path) -> None:
     zero = float(recording.channels["gyro"].t[0])
     assert spans[-1][0] - zero < 83.0
     assert 216.0 < spans[-1][1] - zero < 230.0
+
+
+@pytest.mark.parametrize(("profile", "verdict"), [("hover", "unknown"), ("gentle", "ok"), ("excited", "ok")])
+def test_a_flight_that_hardly_turns_is_not_called_wrong(profile: str, verdict: str) -> None:
+    from quadid.flight import fly
+
+    pelican = Vehicle.shipped("pelican")
+    for seed in (1, 2):
+        found = inspect(fly(pelican, seconds=40.0, seed=seed, profile=profile).recording, pelican)
+        (check,) = (c for c in found.checks if c.name == "gyro_attitude")
+        assert check.verdict.value == verdict, check.message
