@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from quadid.effects import EFFECTS
 from quadid.parameters import NOMINAL_UNITS
+from quadid.vehicle import Vehicle
 
 
 def test_the_dictionary_of_symbols_has_every_parameter_with_its_unit(repository: Path) -> None:
@@ -27,3 +30,12 @@ def test_the_map_of_the_house_names_what_is_there(repository: Path) -> None:
     assert set(rooms) == there
     for path in re.findall(r"`([\w/]+\.(?:py|md|yaml))`", text):
         assert (repository / path).exists(), path
+
+
+def test_the_vehicle_file_of_the_guide_is_valid_and_sensible(repository: Path) -> None:
+    text = (repository / "docs" / "new-vehicle.md").read_text(encoding="utf-8")
+    vehicle = Vehicle.from_yaml(text.split("```yaml\n")[1].split("```")[0])
+    assert vehicle.arm == pytest.approx(0.226, abs=0.001)
+    assert vehicle.stand_thrust is not None
+    assert vehicle.stand_thrust[0] == pytest.approx(vehicle.parameters["b"].initial, rel=0.1)
+    assert 0.4 < vehicle.hover_speed() / 900.0 < 0.67
