@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from quadid_cli.options import JsonTarget, VehicleName
+from quadid_cli.tables import number
 
 
 def history(
@@ -40,9 +42,6 @@ def history(
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints sets, estimates and events."""
-    from rich.table import Table
-    from rich.text import Text
-
     from quadid_cli import terminal
 
     console = terminal.console(quiet=quiet)
@@ -50,22 +49,46 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         others = ", ".join(v["name"] for v in result["vehicles"]) or "none"
         console.print(f"no sets of '{result['vehicle']}' yet; vehicles in this history: {others}", markup=False)
     else:
-        table = Table(title=f"Parameter sets of {result['vehicle']}")
-        for heading in ("set", "when", "state", "by", "data", "error", "b", "d", "J_xx", "J_yy", "J_zz", "J_r", "why"):
-            table.add_column(heading, overflow="fold")
-        for item in result["sets"]:
-            values = {p["name"]: p["value"] for p in item["parameters"]}
-            span = (item["stop"] or 0.0) - (item["start"] or 0.0)
-            table.add_row(
-                str(item["sequence"]), _when(item["wall"]), item["state"], Text(item["approved_by"]), f"{span:.0f} s",
-                f"{item['mse'] or float('nan'):.2f}", *(f"{values[n]:.4g}" for n in list(values)[:6]),
-                Text(item["reason"]),
-            )  # fmt: skip
-        console.print(table)
+        console.print(_story(result["sets"], f"Parameter sets of {result['vehicle']}"))
+        console.print(_values(result["sets"]))
     for item in result["candidates"]:
         console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}", markup=False)
     for item in result["events"]:
         console.print(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}", markup=False)
+
+
+def _story(sets: Sequence[dict[str, Any]], title: str) -> Any:
+    """When, by whom, from which data and why."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title)
+    for heading in ("set", "when", "state", "by", "data [s]", "error"):
+        table.add_column(heading, no_wrap=True, justify="right" if heading in ("set", "data [s]", "error") else "left")
+    table.add_column("why", overflow="fold")
+    for item in sets:
+        span = (item["stop"] or 0.0) - (item["start"] or 0.0)
+        table.add_row(
+            str(item["sequence"]), _when(item["wall"]), item["state"], Text(item["approved_by"]), f"{span:.0f}",
+            number(item["mse"], 3), Text(item["reason"]),
+        )  # fmt: skip
+    return table
+
+
+def _values(sets: Sequence[dict[str, Any]]) -> Any:
+    """The parameters of every set, with units."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title="Values")
+    table.add_column("set", justify="right")
+    shown = sets[-1]["parameters"][:6]
+    for p in shown:
+        table.add_column(Text(f"{p['name']}\n[{p['unit']}]"), justify="right", no_wrap=True)
+    for item in sets:
+        values = {p["name"]: p["value"] for p in item["parameters"]}
+        table.add_row(str(item["sequence"]), *(number(values.get(p["name"])) for p in shown))
+    return table
 
 
 def _when(wall: float) -> str:
