@@ -124,4 +124,4 @@ EFFECTS: dict[str, Effect] = {
         ),
     )
 }
-"""Every effect by name, in the order of `docs/effects.md`."""
+"""Every effect by name; `docs/effects.md` explains each."""

@@ -183,14 +183,20 @@ def coverage_page(records: list[Record], seconds: float) -> str:
     spread = math.sqrt(sum((h - covered * len(zs)) ** 2 for h, zs in zip(held, numbers, strict=True))) / max(total, 1)
     alike = sorted(abs(z) for zs in numbers for z in zs)
     times = [z for r in good for k, z in r["scaled"].items() if k.endswith(".time")]
-    by_name: dict[str, list[tuple[float, float]]] = {}
+    by_effect: dict[str, list[tuple[float, float]]] = {}
     for r in good:
         for k, z in r["scaled"].items():
-            by_name.setdefault(k, []).append((z, r["share"][k]))
+            if not k.endswith(".time"):
+                by_effect.setdefault(k.split(".")[0], []).append((z, r["share"][k]))
     rows = "\n".join(
-        f"| {k} | {len(v)} | {sum(abs(z) <= Z95 for z, _ in v)} | {np.sqrt(np.mean([z * z for z, _ in v])):.2f} "
+        f"| {k} | {sum(abs(z) <= Z95 for z, _ in v)} of {len(v)} | {np.sqrt(np.mean([z * z for z, _ in v])):.2f} "
         f"| {100.0 * np.median([s for _, s in v]):.2f} |"
-        for k, v in sorted(by_name.items())
+        for k, v in sorted(by_effect.items())
+    )
+    wrong = "\n".join(
+        f"| {', '.join(r['effects'])} | {r['verdict']} | {', '.join(r['named']) or '–'} |"
+        for r in good
+        if set(r["effects"]) != set(r["named"])
     )
     middle = float(np.median(alike)) if alike else math.nan
     return (
@@ -199,8 +205,9 @@ def coverage_page(records: list[Record], seconds: float) -> str:
         f"Numbers of found effects inside their 95 % interval: {proportion(sum(held), total)}; standard error between "
         f"flights {100.0 * spread:.1f} %. Median error {middle:.2f} standard deviations (0.67 for honest ones).\n"
         f"Onset times, whose deviation is set: {proportion(sum(abs(z) <= Z95 for z in times), len(times))}.\n\n"
-        "| number | found | inside | RMS error in standard deviations | median error % |\n|---|---|---|---|---|\n"
-        + rows
+        "| effect | numbers inside | RMS error in standard deviations | median error % |\n"
+        f"|---|---|---|---|\n{rows}\n\n"
+        f"Silent, or named something else:\n\n| hidden | verdict | named |\n|---|---|---|\n{wrong}"
     )
 
 
