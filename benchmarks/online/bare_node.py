@@ -12,6 +12,7 @@ from quadid_node.stopping import Stop
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 
 def main() -> int:
@@ -25,7 +26,7 @@ def main() -> int:
     executor.add_node(node)
     print("ready", flush=True)
     while not stop():
-        executor.spin_once(timeout_sec=0.2)
+        executor.spin_until_future_complete(Future(), timeout_sec=0.2)
     stop.ignore_more()
     executor.shutdown()
     node.destroy_node()

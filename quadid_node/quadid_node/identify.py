@@ -47,6 +47,7 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.executors import ExternalShutdownException
     from rclpy.experimental.events_executor import EventsExecutor
     from rclpy.signals import SignalHandlerOptions
+    from rclpy.task import Future
 
     from quadid_node.node import IdentifyNode
 
@@ -59,7 +60,8 @@ def main(args: list[str] | None = None) -> int:
         while not stop() and code == 0:
             if starter is not None and not starter.step():
                 code = 2
-            executor.spin_once(timeout_sec=SPIN_SECONDS)
+            # Works off all that arrives until the time is over; `spin_once` would come back after every message.
+            executor.spin_until_future_complete(Future(), timeout_sec=SPIN_SECONDS)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
