@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.models import Model, fit_model
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import SWARM_SECONDS, noise_floor, residual_noise
+from quadid.identify.fit import SWARM_SECONDS
+from quadid.identify.floor import noise_floor, residual_noise
 from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import polish
 from quadid.identify.shooting import Shooting
