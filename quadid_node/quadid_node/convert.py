@@ -7,6 +7,7 @@ and its recording give the same numbers bit for bit.  Out: dictionaries of `mess
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -122,15 +123,34 @@ def _same(v: Any) -> tuple[float, ...]:
     return tuple(v)
 
 
+def _attitude(q: Any) -> tuple[float, ...]:
+    """FLU->ENU to FRD->NED, as `flip_attitude`."""
+    w, x, y, z = q
+    return (_HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z))
+
+
+def _world(v: Any) -> tuple[float, ...]:
+    """ENU to NED, as `flip_world`."""
+    return (v[1], v[0], -v[2])
+
+
+_HALF = math.sqrt(0.5)
 _FAST: dict[str, Callable[[Any], tuple[float, ...]]] = {
     "body_rate": _flip,
     "body_force": _flip,
+    "attitude": _attitude,
+    "pose_attitude": _attitude,
+    "position": _world,
+    "velocity": _world,
     "gyro": _same,
     "accel": _same,
     "rotor_speed": _same,
     "motor_command": _same,
     "outputs": _same,
     "battery": _same,
+    "frd_attitude": _same,
+    "ned_position": _same,
+    "ned_velocity": _same,
 }
 """Signals whose conversion needs no array; the numbers are the same to the bit."""
 
