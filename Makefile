@@ -31,6 +31,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(RUNTIME): pyproject.toml | $(BIN)/python
+	@echo "Installing quadid and what it needs into $(VENV): a minute or so ..."
 	$(PIP) install --editable .
 	@touch $@
 
@@ -73,7 +74,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: truth cases campaign real-logs paper-scale excite kernel-speed
+.PHONY: truth cases campaign real-logs paper-scale excite optimisers subspace kernel-speed
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -91,6 +92,12 @@ paper-scale: venv ## three 500 s sets: error, time and memory of the fit
 
 excite: venv ## intervals that a proposed manoeuvre promises and obtains
 	$(STUDY) studies.excite --out docs/results
+
+optimisers: venv ## every optimiser on smooth and non-smooth problems, narrow and wide bounds (half an hour)
+	$(STUDY) studies.optimisers --out docs/results
+
+subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
+	$(STUDY) studies.subspace --out docs/results
 
 kernel-speed: venv ## nanoseconds per particle and step
 	$(STUDY) benchmarks.kernel --out docs/results
