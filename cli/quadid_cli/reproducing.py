@@ -51,11 +51,11 @@ class Plan:
 
     seconds: float = 500.0
     particles: int = 32
-    iterations: int = 80
-    seeds: int = 5
+    iterations: int = 40
+    seeds: int = 3
 
 
-QUICK = Plan(60.0, 32, 40, 2)
+QUICK = Plan(60.0, 32, 25, 2)
 
 
 @dataclass(frozen=True)

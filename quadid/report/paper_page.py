@@ -86,8 +86,8 @@ def paper_markdown(result: JsonDict, figures: str) -> str:
     flight, said = result["flight"], notes(result)
     lines = [
         f"# {TITLE}", "", f"{SOURCE}.", "",
-        f"`make reproduce` ({result['command']}), {result['date']}, seed {result['seed']}, {result['seconds']:.0f} s; "
-        f"quadid {result['version']}.", "",
+        f"`{result['command']}`, {result['date']}, seed {result['seed']}, {result['seconds']:.0f} s; quadid "
+        f"{result['version']}. `make reproduce` flies sets of 500 s and renews this page.", "",
         f"Three sets of {flight['seconds']:g} s of a simulated Pelican, stabiliser at {flight['stabiliser_rate']:g} "
         "Hz, logged at 50 Hz; set 1 trains, sets 2 and 3 validate and are seen by no fit. The vehicle flies with "
         f"effects that the paper's model lacks: {_effects(flight['effects'])}. Its equations are not those of the "
