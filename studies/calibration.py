@@ -1,6 +1,6 @@
 """How often a diagnosis cries wolf, and whether its intervals hold: many flights without effects and with one.
 
-    python -m studies.calibration --nulls 100 --singles 50 --records calibration.jsonl --page docs/diagnosis-method.md
+    python -m studies.calibration --nulls 100 --singles 75 --records calibration.jsonl --page docs/diagnosis-method.md
 
 Every flight is decided by its number alone; numbers begin where the blinded campaign never goes.  A run that is
 stopped goes on from its records.
@@ -201,7 +201,8 @@ def coverage_page(records: list[Record], seconds: float) -> str:
     middle = float(np.median(alike)) if alike else math.nan
     return (
         f"{len(good)} flights of {seconds:.0f} s, one effect of realistic size each, every effect in turn "
-        f"({len(records) - len(good)} failed). Named exactly what was hidden: {proportion(exact, len(good))}.\n\n"
+        f"({len(records) - len(good)} failed).\n"
+        f"Named exactly what was hidden: {proportion(exact, len(good))}.\n\n"
         f"Numbers of found effects inside their 95 % interval: {proportion(sum(held), total)}; standard error between "
         f"flights {100.0 * spread:.1f} %. Median error {middle:.2f} standard deviations (0.67 for honest ones).\n"
         f"Onset times, whose deviation is set: {proportion(sum(abs(z) <= Z95 for z in times), len(times))}.\n\n"
