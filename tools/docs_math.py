@@ -22,5 +22,5 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def _equations(text: str) -> str:
-    text = _BLOCK.sub(lambda m: f"\n<div>{convert(m[1], display='block')}</div>\n", text)
+    text = _BLOCK.sub(lambda m: f'\n<div style="margin: 0.8em 0">{convert(m[1], display="block")}</div>\n', text)
     return _INLINE.sub(lambda m: convert(m[1]), text)
