@@ -74,7 +74,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: truth cases campaign real-logs paper-scale excite optimisers subspace kernel-speed
+.PHONY: truth cases campaign real-logs paper-scale excite optimisers subspace control kernel-speed
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -98,6 +98,9 @@ optimisers: venv ## every optimiser on smooth and non-smooth problems, narrow an
 
 subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
 	$(STUDY) studies.subspace --out docs/results
+
+control: venv ## tracking with guessed, identified, extended and true parameters
+	$(STUDY) studies.control --out docs/results
 
 kernel-speed: venv ## nanoseconds per particle and step
 	$(STUDY) benchmarks.kernel --out docs/results
