@@ -231,19 +231,26 @@ def kept_or_run(keep: Path | None, kind: str, bounds: str, seed: int, budget: in
     return {name: Outcome(*values) for name, values in known[key].items()}
 
 
+def finished(keep: Path, kind: str, bounds: str) -> int:
+    """Number of seeds of one problem that an interrupted run has finished."""
+    return sum(key.startswith(f"{kind} {bounds} ") for key in json.loads(keep.read_text(encoding="utf-8")))
+
+
 def main() -> None:
     """Command line of the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--keep", type=Path, default=None, help="file that an interrupted run goes on from")
+    parser.add_argument("--finished", action="store_true", help="run nothing, show what is in the file")
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
     results: dict[tuple[str, str], list[dict[str, Outcome]]] = {}
     for kind in ("smooth", "non-smooth"):
         for bounds in BOUNDS:
-            results[kind, bounds] = [
-                kept_or_run(options.keep, kind, bounds, seed, BUDGET[kind]) for seed in range(options.seeds)
-            ]
+            seeds = range(options.seeds)
+            if options.finished:
+                seeds = range(finished(options.keep, kind, bounds))
+            results[kind, bounds] = [kept_or_run(options.keep, kind, bounds, seed, BUDGET[kind]) for seed in seeds]
             print(f"## {kind}, {bounds}", *table(results[kind, bounds]), sep="\n", flush=True)
     if options.out is not None:
         text = page(results, options.seeds)
@@ -272,14 +279,15 @@ def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str
     lines, worth, alone = [], [], []
     for (kind, bounds), outcomes in results.items():
         names = ("least_squares", "quasi_newton", "pso", "pso_algorithm_1", "pso_polish")
+        first = best(outcomes)[0]
         lines.append(
             f"* {kind}, {bounds} bounds: {', '.join(told(outcomes, n) for n in names)}; best: "
-            f"{told(outcomes, best(outcomes)[0])}."
+            f"{told(outcomes, first) if successes(outcomes, first)[0] else 'none'}."
         )
         gain = successes(outcomes, "pso_polish")[0] - successes(outcomes, "least_squares")[0]
         if gain >= GAIN * len(outcomes):
             worth.append(f"{kind}, {bounds} bounds (+{gain} successes)")
-        if best(outcomes)[0] in ("pso", "pso_algorithm_1"):
+        if first in ("pso", "pso_algorithm_1") and successes(outcomes, first)[0]:
             alone.append(f"{kind}, {bounds} bounds")
     lines += ["", f"A swarm before least squares gains at least {GAIN:.0%} of the runs over least squares alone on: "]
     lines[-1] += f"{'; '.join(worth)}." if worth else "none of these problems."
@@ -307,7 +315,8 @@ def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -
         "## Answer", "", *answer(results), "",
     ]  # fmt: skip
     for (kind, bounds), outcomes in results.items():
-        lines += [f"## {kind.capitalize()}, {bounds} bounds", "", *table(outcomes), ""]
+        cut = "" if len(outcomes) == seeds else f" (cut short after {len(outcomes)} seeds)"
+        lines += [f"## {kind.capitalize()}, {bounds} bounds{cut}", "", *table(outcomes), ""]
     lines += [
         "Medians of seconds are of a shared machine and only compare methods; `pso_algorithm_1` simulates one particle "
         "at a time, as printed, the others many at once where they can.",
