@@ -165,7 +165,7 @@ def tables(results: FloatArray) -> list[str]:
 
 
 REMARK = """\
-* Identified parameters cut the error against the initial guess on every path, with intervals far from zero; with lag and
+* Identified parameters cut the error against the initial guess on every path, intervals far from zero; with lag and
   drag identified too, the error is that of the true parameters to within 3 %.
 * The nominal parameters alone leave most of the error on the fast paths: it comes from the lag and the drag that they
   do not hold.
