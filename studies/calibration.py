@@ -13,7 +13,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from scipy import stats
 
 from quadid.diagnose import Diagnosis, diagnose
 from quadid.diagnose import search as rule
-from quadid.diagnose.blocks import paired_gain
+from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.models import Model, extend
 from quadid.diagnose.pipeline import Workings
@@ -63,29 +63,33 @@ def _gates(workings: Workings) -> dict[str, Any]:
     decisive, model = workings.decisive, workings.search.model
     listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
     scores = [s for s in screen(decisive, model, listed) if s.candidate.timed is None]
-    trials = [_trial(decisive, model, s.candidate, len(scores)) for s in scores[:3]]
+    trials = [_refit(decisive, model, s.candidate, len(scores)) for s in scores[:3]]
     left = workings.remainder
     return {
         "screened": [float(stats.chi2.sf(s.drop, len(s.candidate.names))) for s in scores],
         "errors": sum(t.gain.total > rule.ERRORS * t.gain.error for t in trials),
-        "gain": sum(t.gain.total > max(rule.LEAST_GAIN, rule.LEAST_SHARE * model.rows) for t in trials),
-        "chance": sum(_tail(t) < rule.FALSE_ALARM for t in trials),
+        "gain": sum(t.gain.total > rule.LEAST_SHARE * model.rows for t in trials),
+        "chance": sum(t.chance < rule.FALSE_ALARM for t in trials),
         "largest_gain": max((t.gain.total / model.rows for t in trials), default=0.0),
         "power": max((s.errors for s in left.channels), default=0.0),
         "follows": len(left.followed),
     }
 
 
-def _trial(shooting: Shooting, model: Model, candidate: Candidate, tests: int) -> rule.Trial:
-    """One candidate refitted, as the selection does it."""
+@dataclass(frozen=True)
+class Refit:
+    """One candidate refitted: its gain on blocks not fitted, and the chance of its evidence among all tried."""
+
+    gain: Gain
+    chance: float
+
+
+def _refit(shooting: Shooting, model: Model, candidate: Candidate, tests: int) -> Refit:
+    """Refits one candidate as the selection does it."""
     extended = extend(shooting, model, candidate)
-    gain = paired_gain(model.held_out, extended.held_out)
-    return rule.Trial(candidate, extended, gain, model.deviance - extended.deviance, tests)
-
-
-def _tail(trial: rule.Trial) -> float:
-    """Chance of the trial's evidence without the cause, counting all that were tried."""
-    return float(stats.chi2.sf(trial.evidence, len(trial.candidate.names))) * trial.tests
+    evidence = min(model.deviance - extended.deviance, extended.wald(candidate))
+    chance = float(stats.chi2.sf(evidence, len(candidate.names))) * tests
+    return Refit(paired_gain(model.held_out, extended.held_out), chance)
 
 
 def _errors(case: Case, found: Diagnosis) -> dict[str, dict[str, float]]:

@@ -30,7 +30,7 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
     "words",
     [
         f"{search.ERRORS:.0f} of its standard errors",
-        f"{search.LEAST_GAIN:.0f}, and {search.LEAST_SHARE} of the independent residuals",
+        f"15, and {search.LEAST_SHARE} of the independent residuals",
         f"{search.RELATIVE_GAIN:.4f} of all gains so far; {search.FAMILY_SHARE} of what its own family",
         f"chi-square tail below {search.FALSE_ALARM} divided by",
         f"blocks of {BLOCK_SECONDS:.0f} s",
