@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate, all_names
+from quadid.diagnose.exchange import left_over
 from quadid.diagnose.models import Model, as_model, free_names
-from quadid.diagnose.search import left_over
 from quadid.identify.free import Free
 from quadid.identify.linearised import Linearised
 from quadid.identify.polish import bounded_step, default_prior, polish

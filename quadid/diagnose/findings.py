@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.exchange import Trial
 from quadid.diagnose.models import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
-from quadid.diagnose.search import Search, Trial
+from quadid.diagnose.search import Search
 from quadid.diagnose.validation import Worth
 from quadid.diagnose.words import evidence
 from quadid.effects import EFFECTS
@@ -15,6 +16,9 @@ from quadid.identify.shooting import Shooting
 from quadid.identify.uncertainty import Z95, uncertainty
 
 MOST_ALTERNATIVES = 4
+STEP_SIGMA = 3e-4
+"""Standard deviation [s] added to lags and delays: commands and samples of a loop at 1 kHz keep whole steps, and stamps
+no more; two minutes of data would tell a delay ten times better than that."""
 TIME_SIGMA = 0.1
 """Standard deviation [s] given to a change time, the resolution of its scan."""
 
@@ -68,9 +72,16 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
     for p in spec.parameters:
         entry = shooting.layout.entry(f"{cause.effect}.{p.name}")
         value = float(model.theta[entry.index])
-        half = Z95 * (TIME_SIGMA if p.name == "time" else sigma[entry.name])
+        half = Z95 * _sigma(p.name, sigma.get(entry.name, 0.0))
         out.append(FoundParameter(p.name, p.unit, value, (value - half, value + half)))
     return tuple(out)
+
+
+def _sigma(name: str, from_data: float) -> float:
+    """Standard deviation of a number: of the scan for a moment, widened by the steps of real loops for a lag."""
+    if name == "time":
+        return TIME_SIGMA
+    return math.hypot(from_data, STEP_SIGMA) if name in ("tau", "delay") else from_data
 
 
 def _alternatives(search: Search, cause: Candidate) -> tuple[Alternative, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]
 States = dict[int, list[FloatArray]]
+
+FAR_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -119,22 +122,20 @@ class Sketch:
     drop: float
 
 
-def sketch(shooting: Shooting, model: Model, candidate: Candidate, far: bool = False) -> Sketch:
+def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Sequence[FloatArray] = ()) -> Sketch:
     """Predicts what `model` with `candidate` would gain, by one linearisation at each of its starts; the best one.
 
     Args:
         shooting: the problem.
         model: what to extend.
         candidate: the cause to add.
-        far: also start from the vehicle file's nominal parameters, because without the cause the nominal ones may have
-            been driven far away.
+        elsewhere: nominal parameters, shape (6,), to start from too: without the cause those of `model` may have been
+            driven far away.
     """
     free = shooting.free(free_names((*model.causes, candidate)))
     prior = default_prior(shooting, free)
     thetas = [model.theta]
-    if far:
-        nominal = shooting.layout.initial(shooting.vehicle)
-        thetas.append(np.concatenate([nominal[: len(NOMINAL_NAMES)], model.theta[len(NOMINAL_NAMES) :]]))
+    thetas += [np.concatenate([nominal, model.theta[len(NOMINAL_NAMES) :]]) for nominal in elsewhere]
     best: Sketch | None = None
     for base in thetas:
         for start in candidate.starts or ((),):
@@ -142,16 +143,27 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate, far: bool = F
             if start:
                 theta[shooting.free(list(candidate.names)).index] = start
             shooting.restore(model.states)
-            lin = shooting.linearise(theta, free)
-            precision, pull, cost = prior_terms(free, prior, theta)
-            h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
-            z = bounded_step(free, theta, h, g)
-            deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
-            trial = Sketch(free.move(theta, z), model.deviance - deviance)
+            trial = _walk(shooting, model, free, theta) if elsewhere else _step(shooting, model, free, prior, theta)
             if best is None or trial.drop > best.drop:
                 best = trial
     assert best is not None
     return best
+
+
+def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: FloatArray) -> Sketch:
+    """What the linearised problem promises."""
+    lin = shooting.linearise(theta, free)
+    precision, pull, cost = prior_terms(free, prior, theta)
+    h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
+    z = bounded_step(free, theta, h, g)
+    deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
+    return Sketch(free.move(theta, z), model.deviance - deviance)
+
+
+def _walk(shooting: Shooting, model: Model, free: Free, theta: FloatArray) -> Sketch:
+    """What a few steps bring: far from the optimum a linear promise is worth nothing."""
+    result = polish(shooting, theta, free, iterations=FAR_STEPS)
+    return Sketch(result.theta, model.deviance - result.cost - float(result.lin.occam.sum()))
 
 
 def extend(

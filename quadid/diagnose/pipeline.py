@@ -8,23 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.diagnose.backward import eliminate
 from quadid.diagnose.candidates import candidates
 from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
-from quadid.diagnose.search import Search, select
+from quadid.diagnose.search import LINEAR_MISFIT, Search, select
 from quadid.diagnose.validation import validate
 from quadid.diagnose.vehicle_file import extended_vehicle
-from quadid.identify.fit import (
-    SWARM_SECONDS,
-    FitOptions,
-    check_windows,
-    noise_floor,
-    residual_noise,
-    swarm_search,
-)
+from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
+from quadid.identify.floor import flexible_fit, noise_floor, residual_noise
+from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import polish
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -34,10 +30,17 @@ from quadid.window import Window
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-DECIDE_SECONDS = 1.0
+DECIDE_SECONDS = (1.0, 0.5)
+"""Lengths of segments that may decide, longest first; below them only the short ones of the first fit."""
+FEWEST_SEGMENTS = 5
+FAR = 4.0
+"""Deviance per row of the nominal fit, under typical noise, above which it tells neither noise nor parameters."""
+FAR_ITERATIONS = 10
 NOISE_ROUNDS = 2
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
+NOISE_ROSE = 1.5
+"""When it rises by more than this the flexible fit has lost its way, and the first estimate stands."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.01
@@ -88,26 +91,44 @@ def diagnose(
     if swarm:
         theta, _ = swarm_search(short, theta, free, FitOptions(seed=seed), report)
     report("fit", 0.0)
+    start = theta
     first = polish(short, theta, free, iterations=8)
-    short.noise = residual_noise(short, first)
+    far = first.cost > FAR * float(first.lin.rows.sum())
+    typical, short.noise = short.noise, residual_noise(short, first)
     first = polish(short, first.theta, free, iterations=8)
     report("noise floor", 0.0)
-    short.noise, _ = noise_floor(windows, short, first.theta, free)
-    decisive = Shooting(windows, vehicle, DECIDE_SECONDS, short.noise, short.layout)
-    listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
+    if far:
+        # What the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
+        flexible = flexible_fit(windows, short, [first.theta, start], free, typical, FAR_ITERATIONS)
+    else:
+        flexible = flexible_fit(windows, short, [first.theta], free, short.noise)
+    short.noise = flexible.noise
+    elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
+    ladder = [Shooting(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
+    ladder = [*(s for s in ladder if s.count >= FEWEST_SEGMENTS), short]
+    listed = candidates(short.layout, short.has_velocity, short.channels >= 15)
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    search = select(short, decisive, first.theta, listed, report)
+    search = select(ladder, first.theta, listed, report, elsewhere)
+    if search.model.misfit > LINEAR_MISFIT:
+        # One by one led nowhere; from everything at once it may.
+        general = eliminate(short, flexible.theta, listed)
+        known = Search(short, general, general, (), len(listed))
+        other = select(ladder, first.theta, listed, report, elsewhere, known)
+        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.misfit))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
             break
         report("noise floor", 0.5)
-        before = decisive.noise.variance
-        search = _with_better_noise(windows, short, decisive, search)
-        if np.all(decisive.noise.variance > NOISE_FELL * before):
+        before = search.shooting.noise.variance
+        noise = _noise_around(windows, short, search.model)
+        if np.any(noise.variance > NOISE_ROSE * before):
             break
-        short.noise = decisive.noise
-        again = select(short, decisive, first.theta, listed, report, search.model)
+        search = _with_noise(noise, ladder, search)
+        if np.all(noise.variance > NOISE_FELL * before):
+            break
+        again = select(ladder, first.theta, listed, report, elsewhere, search)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
+    decisive = search.shooting
     left = remainder(decisive, search.model, seed)
     verdict = judge(search.nominal, search.model, left)
     report("validation", 0.0)
@@ -122,14 +143,21 @@ def diagnose(
     return result, Workings(search, short, decisive, left)
 
 
-def _with_better_noise(windows: Sequence[Window], short: Shooting, decisive: Shooting, search: Search) -> Search:
-    """Re-estimates the noise around the selected model, where the flexible fit is nearly linear, and refits both."""
+def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:
+    """Re-estimates the noise around the selected model, where the flexible fit is nearly linear."""
     short.restore({})
-    wide = short.free(free_names(search.model.causes))
-    decisive.noise, _ = noise_floor(windows, short, search.model.theta, wide, iterations=2)
+    wide = short.free(free_names(model.causes))
+    return noise_floor(windows, short, model.theta, wide, iterations=2)[0]
+
+
+def _with_noise(noise: NoiseModel, ladder: Sequence[Shooting], search: Search) -> Search:
+    """Refits nominal and selected model under another noise model."""
+    for shooting in ladder:
+        shooting.noise = noise
+    decisive = search.shooting
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
-    return replace(search, model=model, nominal=nominal)
+    return replace(search, model=replace(model, worth=search.model.worth), nominal=nominal)
 
 
 def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:

@@ -11,30 +11,27 @@ from scipy import stats
 
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
 from quadid.diagnose.models import Model, extend, fit_model, sketch
 from quadid.diagnose.screen import Score, screen
 from quadid.identify.shooting import Shooting
-from quadid.model.layout import NEVER
 
 FloatArray = NDArray[np.float64]
 
 LINEAR_MISFIT = 4.0
-"""Deviance per row above which the longer segments are too far from linear to search on."""
-NEAR = 0.4
-"""Candidates that should gain this share of what the best one should are refitted beside it …"""
+"""Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
 MOST_SKETCHES = 10
+"""Most linear candidates whose gain is predicted while the misfit is large."""
 FEWEST_REFITS, MOST_REFITS = 3, 7
-"""… but no fewer and no more than these."""
+"""Fewest and most candidates refitted in one round."""
 MOST_CAUSES = 12
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
 ERRORS = 2.0
 """A gain on unseen blocks must exceed this many of its standard errors."""
-LEAST_GAIN = 15.0
-"""… and this much deviance …"""
 LEAST_SHARE = 0.004
-"""… and this share of the noise that no model can remove: less is of no use to anybody, and within what the time
-step of a simulation or of an autopilot's own filter can imitate."""
+"""… and `LEAST_GAIN`, and this share of the noise that no model can remove: less is of no use to anybody, and within
+what the time step of a simulation or of an autopilot's own filter can imitate."""
 RELATIVE_GAIN = 1e-4
 """… and this share of all gains so far, so that the tail of a huge effect is not named as another."""
 FAMILY_SHARE = 0.01
@@ -43,40 +40,17 @@ that is not quite linear is no second cause."""
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One candidate refitted: the extended model, what it gains on blocks not fitted and on fitted data, tests made."""
-
-    candidate: Candidate
-    model: Model
-    gain: Gain
-    drop: float
-    tests: int
-
-    @property
-    def evidence(self) -> float:
-        """Chi-square of the new parameters: the smaller of the fall in deviance and the robust Wald statistic."""
-        return min(self.drop, self.model.wald(self.candidate))
-
-
-@dataclass(frozen=True)
-class Round:
-    """One step of the selection: all candidates refitted, and the one accepted (or None)."""
-
-    trials: tuple[Trial, ...]
-    accepted: Trial | None
-    screened: tuple[Score, ...]
-
-
-@dataclass(frozen=True)
 class Search:
     """Outcome of the selection.
 
     Attributes:
+        shooting: the problem that decided.
         nominal: model without causes; model: the selected one.
         rounds: what was tried, in order.
         tests: number of alternatives looked at in one round, for the correction.
     """
 
+    shooting: Shooting
     nominal: Model
     model: Model
     rounds: tuple[Round, ...]
@@ -84,57 +58,101 @@ class Search:
 
 
 def select(
-    short: Shooting, decisive: Shooting, theta: FloatArray, listed: Sequence[Candidate],
-    report: Callable[[str, float], None], known: Model | None = None,
+    ladder: Sequence[Shooting], theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None],
+    elsewhere: Sequence[FloatArray] = (), known: Search | None = None,
 ) -> Search:  # fmt: skip
     """Selects the causes that the data support, most gain first.
 
+    The search begins on the longest segments that the model follows for their whole length.  While it follows only
+    short ones, where even a large error stays nearly linear, causes are sought there; as soon as it follows longer
+    ones, on which slow causes show too, they decide.
+
     Args:
-        short: segments so short that even a large error stays nearly linear; used while the misfit is large.
-        decisive: longer segments, on which slow causes show; decides as soon as the model follows them.
+        ladder: the data cut into segments of falling length.
         theta: nominal optimum.
         listed: causes to try.
         report: progress.
+        elsewhere: nominal parameters, shape (6,), to start from too while the misfit is large.
         known: selection made with a poorer noise model, to go on from.
     """
-    nominal = fit_model(decisive, theta, ())
+    climb = _Climb(ladder, theta)
     rounds: list[Round] = []
     compared: set[str] = set()
-    shooting, model, base = decisive, nominal, nominal
-    if nominal.misfit > LINEAR_MISFIT:
-        shooting, model = short, fit_model(short, theta, ())
-        base = model
     tests = len(listed)
-    if known is not None:
-        shooting, base = decisive, nominal
-        model = _prune(shooting, known, None, base, tests)
-    while len(model.causes) < MOST_CAUSES:
+    if known is None:
+        climb.place(climb.nominal_on)
+    else:
+        climb.place(lambda rung: replace(climb.refitted(rung, known.model), worth=known.model.worth))
+        climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
+    while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
+        shooting, model = climb.shooting, climb.model
         scores = screen(shooting, model, list(listed))
         tests = len(scores)
-        trials = [_try(shooting, model, d, tests) for d in _drafts(shooting, model, scores, tests)]
-        accepted = _choose(trials, model, base)
+        trials = [_try(shooting, model, d, tests) for d in _drafts(shooting, model, scores, tests, elsewhere)]
+        accepted = _choose(trials, model, climb.base)
         rounds.append(Round(tuple(trials), accepted, tuple(scores)))
-        if accepted is not None:
-            worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
-            accepted = replace(accepted, model=split_causes(replace(accepted.model, worth=worth)))
-            model = _prune(shooting, accepted.model, accepted.candidate, base, tests)
-        if shooting is short:
-            longer = replace(fit_model(decisive, model.theta, model.causes, iterations=10), worth=model.worth)
-            if longer.misfit < LINEAR_MISFIT or accepted is None:
-                shooting, base = decisive, nominal
-                model, swaps = swap_look_alikes(decisive, longer, listed)
-                rounds += swaps
-                compared = {c.label for c in model.causes}
-                continue
         if accepted is None:
             break
-    if shooting is short:
-        model = fit_model(decisive, model.theta, model.causes, iterations=10)
-    if compared != {c.label for c in model.causes}:
-        model, swaps = swap_look_alikes(decisive, model, listed)
+        worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
+        model = split_causes(replace(accepted.model, worth=worth))
+        climb.model = _prune(shooting, model, accepted.candidate, climb.base, tests)
+        if climb.up():
+            climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
+            rounds += swaps
+            compared = {c.label for c in climb.model.causes}
+    if compared != {c.label for c in climb.model.causes}:
+        climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
         rounds += swaps
-    return Search(nominal, model, tuple(rounds), tests)
+    return Search(climb.shooting, climb.base, climb.model, tuple(rounds), tests)
+
+
+class _Climb:
+    """Where on the ladder of segment lengths the search stands.
+
+    Attributes:
+        shooting: the rung; base: nominal model there; model: the selected one there.
+    """
+
+    def __init__(self, ladder: Sequence[Shooting], theta: FloatArray) -> None:
+        """Starts nowhere; call `place`."""
+        self._ladder, self._theta = ladder, theta
+        self._rung = len(ladder) - 1
+        self._nominal: dict[int, Model] = {}
+        self.model = self.base = self.nominal_on(self._rung)
+
+    @property
+    def shooting(self) -> Shooting:
+        """The problem of this rung."""
+        return self._ladder[self._rung]
+
+    def nominal_on(self, rung: int) -> Model:
+        """Nominal model on a rung."""
+        if rung not in self._nominal:
+            self._nominal[rung] = fit_model(self._ladder[rung], self._theta, ())
+        return self._nominal[rung]
+
+    def refitted(self, rung: int, model: Model) -> Model:
+        """A model fitted on another rung."""
+        fitted = fit_model(self._ladder[rung], model.theta, model.causes, iterations=10)
+        return replace(fitted, worth=model.worth)
+
+    def place(self, fit: Callable[[int], Model]) -> None:
+        """Goes to the longest segments that the model follows, or the shortest."""
+        for rung in range(len(self._ladder)):
+            model = fit(rung)
+            if model.misfit < LINEAR_MISFIT or rung == len(self._ladder) - 1:
+                self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
+                return
+
+    def up(self) -> bool:
+        """Goes to longer segments if the model follows them now."""
+        for rung in range(self._rung):
+            model = self.refitted(rung, self.model)
+            if model.misfit < LINEAR_MISFIT:
+                self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
+                return True
+        return False
 
 
 @dataclass(frozen=True)
@@ -146,7 +164,9 @@ class _Draft:
     start: FloatArray | None
 
 
-def _drafts(shooting: Shooting, model: Model, scores: list[Score], tests: int) -> list[_Draft]:
+def _drafts(
+    shooting: Shooting, model: Model, scores: list[Score], tests: int, elsewhere: Sequence[FloatArray]
+) -> list[_Draft]:
     """Candidates to refit: the best by prediction, and look-alikes that come near them."""
     far = model.misfit > LINEAR_MISFIT
     least = 0.5 * max(float(stats.chi2.isf(FALSE_ALARM / tests, 1)), LEAST_GAIN, LEAST_SHARE * model.rows)
@@ -156,7 +176,7 @@ def _drafts(shooting: Shooting, model: Model, scores: list[Score], tests: int) -
         if score.candidate.timed is not None:
             drafts.append(_Draft(score, score.drop, None))
         elif score.candidate.starts or far:
-            drawn = sketch(shooting, model, score.candidate, far)
+            drawn = sketch(shooting, model, score.candidate, elsewhere if far else ())
             drafts.append(_Draft(score, max(drawn.drop, score.drop if far else drawn.drop), drawn.theta))
         else:
             drafts.append(_Draft(score, score.drop, model.theta))
@@ -247,76 +267,6 @@ def _choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
         if lost.total < lost.error:
             return t
     return best
-
-
-def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> tuple[Model, list[Round]]:
-    """Puts a look-alike in the place of a cause where that fits unseen blocks better.
-
-    Which of two look-alikes was taken first may have been decided on segments too short to tell them apart, or before
-    another cause was known.
-
-    Returns:
-        The better model, and for each cause what its rivals did in its place.
-    """
-    rounds = []
-    for cause in model.causes:
-        rivals = _rivals(model, cause, listed)
-        if not rivals or any(c.requires == cause.effect for c in model.causes):
-            continue
-        rest = without(shooting, model, cause)
-        sketches = sorted(((sketch(shooting, rest, r), r) for r in rivals), key=lambda pair: -pair[0].drop)
-        worth = rest.deviance - model.deviance
-        drawn = [(s, r) for s, r in sketches if s.drop > NEAR * worth][:2]
-        trials = [_stand_in(rest, extend(shooting, rest, r, s.theta), r) for s, r in drawn]
-        if not trials:
-            continue
-        holder = _stand_in(rest, model, cause)
-        best = max(trials, key=lambda t: t.gain.total)
-        gain = paired_gain(model.held_out, best.model.held_out)
-        swapped = gain.total > LEAST_GAIN and gain.total > gain.error
-        rounds.append(Round((holder, *trials), best if swapped else holder, ()))
-        model = best.model if swapped else model
-    return model, rounds
-
-
-def _stand_in(rest: Model, model: Model, candidate: Candidate) -> Trial:
-    """What a candidate does for `rest`, the model without it."""
-    return Trial(candidate, model, paired_gain(rest.held_out, model.held_out), rest.deviance - model.deviance, 1)
-
-
-def _rivals(model: Model, cause: Candidate, listed: Sequence[Candidate]) -> list[Candidate]:
-    present = {c.label for c in model.causes}
-    return [
-        c for c in listed
-        if c.family == cause.family and c.label not in present and not c.split and c.timed is None
-        and c.effect != cause.effect
-    ]  # fmt: skip
-
-
-def split_causes(model: Model) -> Model:
-    """Replaces a joint cause by the causes it stands for; the parameters are the same."""
-    causes: list[Candidate] = []
-    for c in model.causes:
-        causes += [part for part in (c.split or (c,)) if part.label not in {x.label for x in causes}]
-    return replace(model, causes=tuple(causes))
-
-
-def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
-    """Refits `model` without `cause` and what requires it."""
-    left, theta = left_over(shooting, model, cause)
-    return replace(fit_model(shooting, theta, left, model.states, tolerance=0.2), worth=model.worth)
-
-
-def left_over(shooting: Shooting, model: Model, cause: Candidate) -> tuple[tuple[Candidate, ...], FloatArray]:
-    """Causes of `model` but `cause` and what requires it, and the parameter vector with those at neutral."""
-    left = tuple(c for c in model.causes if c.label != cause.label and c.requires != cause.effect)
-    gone = [c for c in model.causes if c not in left]
-    theta = model.theta.copy()
-    for c in gone:
-        theta[shooting.free(list(c.names)).index] = 0.0
-        if c.timed is not None:
-            theta[c.timed] = NEVER
-    return left, theta
 
 
 def _prune(shooting: Shooting, model: Model, newest: Candidate | None, nominal: Model, tests: int) -> Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from quadid.window import Window
 SPECTRUM_SECONDS = 0.5
 FLEXIBLE_DRAG = 0.1
 """Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
+GROWS = 3.0
+"""Growth of a channel's residual variance, from short segments to longer ones, that no sensor noise shows."""
 SHORT_SEGMENTS = 400
 """Most short segments the flexible model is fitted to at first."""
 
@@ -46,10 +49,32 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
 
 
+@dataclass(frozen=True)
+class Flexible:
+    """The flexible fit.
+
+    Attributes:
+        noise: what it leaves; theta: its optimum, full vector; simulated: parameter vectors simulated for it.
+    """
+
+    noise: NoiseModel
+    theta: FloatArray
+    simulated: int
+
+
 def noise_floor(
     windows: Sequence[Window], short: Shooting, theta: FloatArray, free: Free, iterations: int = 4
 ) -> tuple[NoiseModel, int]:
-    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it.
+    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it."""
+    found = flexible_fit(windows, short, [theta], free, short.noise, iterations)
+    return found.noise, found.simulated
+
+
+def flexible_fit(
+    windows: Sequence[Window], short: Shooting, starts: Sequence[FloatArray], free: Free, noise: NoiseModel,
+    iterations: int = 4,
+) -> Flexible:  # fmt: skip
+    """Fits everything the catalogue can free at once.
 
     The flexible model is fitted on short segments, where it is nearly linear (of a long flight on some of them, spread
     evenly), and again on longer ones that resolve the spectrum of the vibration.
@@ -57,22 +82,31 @@ def noise_floor(
     Args:
         windows: data.
         short: short segments; its initial states are left as they were.
-        theta: nominal optimum.
+        starts: full vectors; the best outcome counts.
         free: nominal free parameters (kept free).
+        noise: weights of the first fit.
         iterations: linearisations to spend on the short segments.
     """
     names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
-    start = theta.copy()
     drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
-    start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
-    few = thinned(windows, short, short.length * short.dt, short.noise, SHORT_SEGMENTS)
+    tried: list[tuple[Polished, Shooting]] = []
+    for theta in starts:
+        start = theta.copy()
+        start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
+        few = thinned(windows, short, short.length * short.dt, noise, SHORT_SEGMENTS)
+        tried.append((polish(few, start, few.free(names), iterations=iterations), few))
+    first, few = min(tried, key=lambda t: t[0].cost)
     wide = few.free(names)
-    first = polish(few, start, wide, iterations=iterations)
     # All of them: the level of the noise decides every score and interval.
-    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, residual_noise(few, first), short.layout)
+    brief = residual_noise(few, first)
+    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, brief, short.layout)
     second = polish(longer, first.theta, wide, iterations=3)
     longer.noise = residual_noise(longer, second)
-    return shaped_noise(longer, second.theta, wide), (first.iterations + second.iterations) * (len(names) + 10)
+    simulated = (sum(t.iterations for t, _ in tried) + second.iterations) * (len(names) + 10)
+    # Noise does not grow with the length of a segment; what does is the model losing its way.
+    if np.any(longer.noise.variance > GROWS * brief.variance):
+        return Flexible(brief, first.theta, simulated)
+    return Flexible(shaped_noise(longer, second.theta, wide), second.theta, simulated)
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
