@@ -76,6 +76,14 @@ class Gain:
         return float(stats.t.sf(self.total / self.error, n - 1))
 
     @property
+    def spread(self) -> bool:
+        """Whether most blocks gain, and the gain outlasts its best block: it is not one odd stretch of the flight.
+
+        An effect that acts only in some manoeuvres gains in few blocks; their spread then says little about chance.
+        """
+        return float(np.mean(self.blocks > 0.0)) >= 2.0 / 3.0 and self.total > 1.25 * float(np.max(self.blocks))
+
+    @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the total."""
         half = float(stats.t.ppf(0.975, max(len(self.blocks) - 1, 1))) * self.error

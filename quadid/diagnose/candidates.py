@@ -63,10 +63,10 @@ _STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
     "command_delay": ((0.015,),),
     "imu_lag": ((0.10,),),
     "attitude_delay": ((0.02,),),
-    "rotor_drag": ((0.2, 0.2),),
-    "parasitic_drag": ((0.03,),),
-    "axial_inflow": ((0.2,),),
-    "ground_effect": ((1.0,),),
+    "rotor_drag": ((0.2, 0.2), (0.0, 0.0)),
+    "parasitic_drag": ((0.03,), (0.0,)),
+    "axial_inflow": ((0.2,), (0.0,)),
+    "ground_effect": ((1.0,), (0.0,)),
 }
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from scipy.stats import chi2
+
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.exchange import Trial
 from quadid.diagnose.models import Model
@@ -45,11 +47,16 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         confident=confident,
         parameters=numbers,
         gain=benefit,
-        p_value=min(1.0, worth.p_value * search.tests),
+        p_value=_p_value(search, cause),
         alternatives=_alternatives(search, cause),
         evidence=evidence(cause.effect, values, benefit.mse_before, benefit.mse_after),
         per_log=EFFECTS[cause.effect].per_log,
     )
+
+
+def _p_value(search: Search, cause: Candidate) -> float:
+    """Chance of numbers so far from neutral without the effect, by the robust Wald statistic, for all causes tried."""
+    return min(1.0, float(chi2.sf(search.model.wald(cause), len(cause.names))) * search.tests)
 
 
 def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]) -> tuple[FoundParameter, ...]:

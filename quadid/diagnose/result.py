@@ -65,7 +65,7 @@ class Finding:
         confident: False when the verdict is `unknown`.
         parameters: numbers of the effect.
         gain: what it is worth on unseen data, given all other findings.
-        p_value: chance of such a gain without the effect, corrected for how many causes were tried.
+        p_value: chance of numbers so far from neutral without the effect, corrected for how many causes were tried.
         alternatives: look-alikes refitted in its place, best first.
         evidence: one sentence a pilot understands.
         per_log: its values belong to the flight, not the vehicle.

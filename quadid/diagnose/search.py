@@ -28,7 +28,7 @@ MOST_CAUSES = 12
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
 ERRORS = 2.0
-"""A gain on unseen blocks must exceed this many of its standard errors."""
+"""A gain on unseen blocks must exceed this many of its standard errors, or be spread over most of them …"""
 LEAST_SHARE = 0.004
 """… and `LEAST_GAIN`, and this share of the noise that no model can remove: less is of no use to anybody, and within
 what the time step of a simulation or of an autopilot's own filter can imitate."""
@@ -239,7 +239,7 @@ def _significant(gain: Gain, evidence: float, cause: Candidate, tests: int, cont
         FAMILY_SHARE * context.families.get(cause.family, 0.0),
     )
     return (
-        gain.total > ERRORS * gain.error
+        (gain.total > ERRORS * gain.error or gain.spread)
         and gain.total > least
         and float(stats.chi2.sf(evidence, len(cause.names))) * tests < FALSE_ALARM
     )

@@ -88,12 +88,22 @@ class Fit:
     warnings: tuple[str, ...] = ()
 
 
+LEAST_SECONDS = 2.0
+"""Shortest stretch worth fitting."""
+
+
 def check_windows(windows: Sequence[Window]) -> None:
     """Raises when `windows` lack what identification needs, saying what is missing and how to get it."""
     if not windows:
         raise WindowError(
             "no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight"
         )
+    longest = max((len(w) - 1) * w.dt for w in windows)
+    if longest < LEAST_SECONDS:
+        raise WindowError(
+            f"the longest stretch without gaps is {longest:.2g} s", f"at least {LEAST_SECONDS:g} s",
+            "record a longer flight, or log without gaps",
+        )  # fmt: skip
     if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
         raise WindowError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
     if len({round(w.dt, 9) for w in windows}) > 1:
