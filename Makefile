@@ -74,12 +74,15 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: truth cases campaign real-logs paper-scale excite optimisers subspace control kernel-speed
+.PHONY: truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
 	$(STUDY) studies.cases
+
+real-diagnosis: venv ## every recorded flight, diagnosed; gain on other flights
+	$(STUDY) studies.real_diagnosis --out docs/results
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results
