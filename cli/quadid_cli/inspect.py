@@ -151,16 +151,17 @@ def _print(console: Console, inspection: Inspection) -> None:
 
 
 def _channel_table(inspection: Inspection) -> Any:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title="channels", title_justify="left")
-    for name in ("channel", "source"):
-        table.add_column(name, overflow="fold")
-    for name in ("rate (Hz)", "samples", "from (s)", "to (s)", "gaps", "longest gap (s)", "dropped"):
-        table.add_column(name, justify="right")
+    table = Table(title="channels", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("channel", no_wrap=True)
+    table.add_column("source", overflow="fold")
+    for name in ("rate (Hz)", "samples", "from-to (s)", "gaps", "gap (s)", "dropped"):
+        table.add_column(name, justify="right", no_wrap=True)
     for f in inspection.channels:
         table.add_row(
-            f.name, _plain(f.source), f"{f.rate:.4g}", str(f.count), f"{f.first:.3f}", f"{f.last:.3f}", str(f.gaps),
+            f.name, _plain(f.source), f"{f.rate:.4g}", str(f.count), f"{f.first:.1f}-{f.last:.1f}", str(f.gaps),
             f"{f.longest_gap:.3g}" if f.gaps else "", str(sum(f.dropped.values()) or ""),
         )  # fmt: skip
     return table
