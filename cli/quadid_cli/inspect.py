@@ -154,7 +154,7 @@ def _channel_table(inspection: Inspection) -> Any:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title="channels", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(title="channels", title_justify="left", box=SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
     table.add_column("channel", no_wrap=True)
     table.add_column("source", overflow="fold")
     for name in ("rate (Hz)", "samples", "from-to (s)", "gaps", "gap (s)", "dropped"):
