@@ -41,6 +41,9 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 NOISE_ROSE = 1.5
 """When it rises by more than this the flexible fit has lost its way, and the first estimate stands."""
+SENSOR_EFFECTS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
+BELIEVABLE = 10.0
+"""Typical sizes beyond which an error of a sensor is not believed."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.01
@@ -133,13 +136,14 @@ def diagnose(
     verdict = judge(search.nominal, search.model, left)
     report("validation", 0.0)
     outcome, per_finding = validate(decisive, search, validation, listed)
-    if search.model.causes and (outcome.contradicted or any(f.kind == "saturated" for f in faults)):
+    beyond = _beyond_belief(short, search.model)
+    if search.model.causes and (outcome.contradicted or beyond or any(f.kind == "saturated" for f in faults)):
         verdict = Verdict.UNKNOWN
     findings = describe(decisive, search, per_finding, verdict is not Verdict.UNKNOWN)
     text = extended_vehicle(vehicle, decisive, search.model)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
-    result = Diagnosis(verdict, findings, outcome, left, text, name, tuple(f.text for f in faults))
+    result = Diagnosis(verdict, findings, outcome, left, text, name, (*(f.text for f in faults), *beyond))
     return result, Workings(search, short, decisive, left)
 
 
@@ -158,6 +162,19 @@ def _with_noise(noise: NoiseModel, ladder: Sequence[Shooting], search: Search) -
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
     return replace(search, model=replace(model, worth=search.model.worth), nominal=nominal)
+
+
+def _beyond_belief(shooting: Shooting, model: Model) -> list[str]:
+    """Sentences about sensor errors so large that they must stand for something else."""
+    out = []
+    for e in shooting.free([n for c in model.causes if c.effect in SENSOR_EFFECTS for n in c.names]).entries:
+        value = float(model.theta[e.index])
+        if abs(value - e.neutral) > BELIEVABLE * e.typical:
+            out.append(
+                f"{e.name} = {value:.3g} {e.unit} is more than a sensor that works can have "
+                f"({BELIEVABLE * e.typical:.3g} {e.unit}): it stands for something else, and no finding is confident"
+            )
+    return out
 
 
 def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:
