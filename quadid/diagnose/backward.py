@@ -50,10 +50,9 @@ def eliminate(shooting: Shooting, theta: FloatArray, listed: Sequence[Candidate]
 def _missed(model: Model) -> tuple[Candidate, ...]:
     """Causes whose loss the others could not make up for, by the linearised problem."""
     h = model.lin.gram.sum(axis=0) + np.diag(1.0 / model.prior.sigma**2)
-    entries = model.free.entries
-    z = np.array([(model.theta[e.index] - e.neutral) / e.typical for e in entries])
+    z = model.free.from_neutral(model.theta)
     kept = list(model.causes)
-    alive = np.ones(len(entries), dtype=bool)
+    alive = np.ones(len(z), dtype=bool)
     least = MISSED * model.rows
     place = {n: i for i, n in enumerate(model.free.names)}
     # Half of what is left at most: the linear picture does not hold for all at once.
@@ -63,7 +62,7 @@ def _missed(model: Model) -> tuple[Candidate, ...]:
             if any(c.requires == cause.effect for c in kept):
                 continue
             mine = np.array([place[n] for n in cause.names])
-            rest = np.flatnonzero(alive & ~np.isin(np.arange(len(entries)), mine))
+            rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))
             cross = h[np.ix_(rest, mine)]
             schur = h[np.ix_(mine, mine)] - cross.T @ np.linalg.solve(h[np.ix_(rest, rest)], cross)
             losses.append((float(z[mine] @ schur @ z[mine]), cause, mine))

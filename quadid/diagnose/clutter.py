@@ -19,7 +19,7 @@ from quadid.diagnose.exchange import left_over
 from quadid.diagnose.models import Model, as_model, free_names
 from quadid.identify.free import Free
 from quadid.identify.linearised import Linearised
-from quadid.identify.polish import bounded_step, default_prior, polish
+from quadid.identify.polish import bounded_step, default_prior, polish, scaled_difference
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 
@@ -89,7 +89,7 @@ def _predicted(
     mine = np.array([place[n] for n in free.names])
     lost = np.array([place[n] for n in gone], dtype=np.intp)
     h, g = everything.gram.sum(axis=0), everything.grad.sum(axis=0)
-    z = np.array([(theta[e.index] - model.theta[e.index]) / e.typical for e in shooting.free(gone).entries], float)
+    z = scaled_difference(shooting.free(gone), model.theta, theta)
     prior = default_prior(shooting, free)
     return bounded_step(
         free, theta, h[np.ix_(mine, mine)] + np.diag(1.0 / prior.sigma**2), g[mine] + h[np.ix_(mine, lost)] @ z

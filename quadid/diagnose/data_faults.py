@@ -62,7 +62,7 @@ def without_copies(windows: Sequence[Window]) -> list[Window]:
             values = getattr(window, name)
             if values is None:
                 continue
-            copies = np.flatnonzero(np.all(values[1:] == values[:-1], axis=1)) + 1
+            copies = np.flatnonzero(_copied(values)) + 1
             if len(copies) >= LEAST_COPIES * len(values):
                 kept = values.copy()
                 kept[copies] = np.nan
@@ -89,8 +89,13 @@ def _saturated(name: str, unit: str, values: FloatArray) -> list[DataFault]:
     return found
 
 
+def _copied(values: FloatArray) -> NDArray[np.bool_]:
+    """Which rows, from the second on, equal the row before exactly, shape (n - 1,)."""
+    return np.asarray(np.all(values[1:] == values[:-1], axis=1))
+
+
 def _repeated(name: str, parts: Sequence[FloatArray]) -> list[DataFault]:
-    same = sum(int(np.count_nonzero(np.all(p[1:] == p[:-1], axis=1))) for p in parts)
+    same = sum(int(np.count_nonzero(_copied(p))) for p in parts)
     rows = sum(max(len(p) - 1, 0) for p in parts)
     share = same / max(rows, 1)
     if share < LEAST_COPIES:

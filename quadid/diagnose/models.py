@@ -73,8 +73,7 @@ class Model:
         widen = np.sqrt(np.maximum(ratio, 1.0))
         covariance = covariance * np.outer(widen, widen)
         place = [self.free.names.index(n) for n in cause.names]
-        entries = [self.free.entries[i] for i in place]
-        z = np.array([(self.theta[e.index] - e.neutral) / e.typical for e in entries])
+        z = self.free.from_neutral(self.theta)[place]
         return float(z @ np.linalg.solve(covariance[np.ix_(place, place)], z))
 
     @property

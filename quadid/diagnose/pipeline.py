@@ -115,8 +115,7 @@ def diagnose(
     if search.model.misfit > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
         general = eliminate(short, flexible.theta, listed)
-        known = Search(short, general, general, (), len(listed))
-        other = select(ladder, first.theta, listed, report, elsewhere, known)
+        other = select(ladder, first.theta, listed, report, elsewhere, general)
         search = min(search, other, key=lambda s: (-s.shooting.length, s.model.misfit))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
@@ -129,7 +128,7 @@ def diagnose(
         search = _with_noise(noise, ladder, search)
         if np.all(noise.variance > NOISE_FELL * before):
             break
-        again = select(ladder, first.theta, listed, report, elsewhere, search)
+        again = select(ladder, first.theta, listed, report, elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
     decisive = search.shooting
     left = remainder(decisive, search.model, seed)

@@ -59,7 +59,7 @@ class Search:
 
 def select(
     ladder: Sequence[Shooting], theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None],
-    elsewhere: Sequence[FloatArray] = (), known: Search | None = None,
+    elsewhere: Sequence[FloatArray] = (), known: Model | None = None,
 ) -> Search:  # fmt: skip
     """Selects the causes that the data support, most gain first.
 
@@ -82,7 +82,7 @@ def select(
     if known is None:
         climb.place(climb.nominal_on)
     else:
-        climb.place(lambda rung: replace(climb.refitted(rung, known.model), worth=known.model.worth))
+        climb.place(lambda rung: climb.refitted(rung, known))
         climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
     while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
@@ -177,7 +177,7 @@ def _drafts(
             drafts.append(_Draft(score, score.drop, None))
         elif score.candidate.starts or far:
             drawn = sketch(shooting, model, score.candidate, elsewhere if far else ())
-            drafts.append(_Draft(score, max(drawn.drop, score.drop if far else drawn.drop), drawn.theta))
+            drafts.append(_Draft(score, max(drawn.drop, score.drop) if far else drawn.drop, drawn.theta))
         else:
             drafts.append(_Draft(score, score.drop, model.theta))
     drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)

@@ -15,7 +15,6 @@ from quadid.errors import NotIdentifiableError
 from quadid.identify.fit import SWARM_SECONDS, SWARM_SEGMENTS
 from quadid.identify.shooting import Shooting
 from quadid.model.kernel import LANES
-from quadid.model.rollout import Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -42,9 +41,7 @@ class BoxProblem:
         if not shooting.rollouts:
             raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
         every = -(-shooting.count // SWARM_SEGMENTS)
-        shooting.segments = [
-            Segments(s.length, s.lead, np.ascontiguousarray(s.starts[::every])) for s in shooting.segments
-        ]
+        shooting.segments = [s.every(every) for s in shooting.segments]
         self._shooting = shooting
         self._theta = shooting.layout.initial(vehicle)
         none = shooting.free([])

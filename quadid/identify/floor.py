@@ -13,7 +13,6 @@ from quadid.identify.polish import FloatArray, Polished, polish
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.spectrum import shaped_noise
 from quadid.model.layout import LOSS, Layout
-from quadid.model.rollout import Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
 
@@ -115,5 +114,5 @@ def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: No
     out.local = like.local
     every = -(-out.count // most)
     if every > 1:
-        out.segments = [Segments(s.length, s.lead, np.ascontiguousarray(s.starts[::every])) for s in out.segments]
+        out.segments = [s.every(every) for s in out.segments]
     return out

@@ -45,6 +45,10 @@ class Free:
         """Size of one unit of a linear parameter."""
         return np.array([e.typical for e in self.entries])
 
+    def from_neutral(self, theta: FloatArray) -> FloatArray:
+        """How far effects are from neutral at `theta`, in typical sizes, shape (parameters,)."""
+        return np.asarray((theta[self.index] - np.array([e.neutral for e in self.entries])) / self.scale)
+
     def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
         """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
         out = theta.copy()

@@ -131,7 +131,7 @@ class Shooting:
         every = -(-self.count // most)
         jobs = []
         for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
-            cut = Segments(segments.length, segments.lead, np.ascontiguousarray(segments.starts[::every]))
+            cut = segments.every(every)
             x0 = np.ascontiguousarray(self.states(n_pre)[i][::every])
             rolled, steps = self._roll_directions(rollout, cut, theta, self.free([]), x0, n_pre, k)
             weights = _weights(rollout, cut, self.channels) / np.sqrt(self.noise.variance)

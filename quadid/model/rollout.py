@@ -62,6 +62,10 @@ class Segments:
             raise WindowError(f"window of {rows} rows", f"at least {length + lead + 1} rows", "use a longer stretch")
         return cls(length, lead, starts)
 
+    def every(self, n: int) -> Segments:
+        """Returns every n-th segment, the first included."""
+        return Segments(self.length, self.lead, np.ascontiguousarray(self.starts[::n]))
+
 
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
