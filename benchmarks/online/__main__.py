@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--refit", type=float, default=10.0, help="time between refits of the memory part [s]")
     parser.add_argument("--load-seconds", type=float, default=60.0, help="length of each flight of the load part [s]")
     given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
     known = parts(given)
     unknown = set(given.only) - set(known)
     if unknown:
