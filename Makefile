@@ -117,6 +117,10 @@ test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and 
 test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
 	$(BIN)/pytest -m browser tests/browser
 
+.PHONY: faults
+faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/results/faults.md
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser" --faults-page docs/results/faults.md tests
+
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow
 

@@ -8,11 +8,27 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.faults.evidence import Collector
+from tests.faults.evidence import happened as happened  # a fixture for every folder
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # The first call of a numba kernel compiles it: an example's time says nothing. In CI every run draws the same examples.
 hypothesis.settings.register_profile("quadid", deadline=None, print_blob=True, derandomize=bool(os.environ.get("CI")))
 hypothesis.settings.load_profile("quadid")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--faults-page FILE`: run the tests that give evidence on faults and write their table (`make faults`)."""
+    parser.addoption("--faults-page", metavar="FILE", type=Path, help="write what the tests of faults measured")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Collects evidence where asked; worker processes only pass on what their tests said."""
+    page = config.getoption("--faults-page")
+    if page is not None:
+        collector = Collector(page, "make faults", writes=not hasattr(config, "workerinput"))
+        config.pluginmanager.register(collector, "faults")
 
 
 def in_ci() -> bool:

@@ -1,0 +1,115 @@
+"""What tests measured against the rows of `tests.faults.rows`: collected, and written as one page.
+
+A test asks for the fixture `happened` and says what it saw, in one sentence with figures, next to the assertion that
+holds it.  `pytest --faults-page FILE tests` (`make faults`) runs the tests that do so, and writes the table.  Only what
+a passed test said gets into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.faults.rows import FAULTS
+
+Happened = Callable[[int, str], None]
+
+_KEY = "fault"
+
+
+class Evidence(NamedTuple):
+    """One sentence of a test about one row."""
+
+    row: int
+    text: str
+    test: str
+
+
+@pytest.fixture
+def happened(request: pytest.FixtureRequest) -> Happened:
+    """`happened(row, text)`: records what was measured against that row of the table, should the test pass."""
+
+    def say(row: int, text: str) -> None:
+        if row not in FAULTS:
+            raise ValueError(f"no row {row} among the faults {min(FAULTS)}..{max(FAULTS)} of tests/faults/rows.py")
+        request.node.user_properties.append((_KEY, [row, " ".join(text.split())]))
+
+    return say
+
+
+class Collector:
+    """Pytest plugin: keeps the tests that give evidence, gathers what passed ones said, and writes the page."""
+
+    def __init__(self, page: Path, command: str, writes: bool) -> None:
+        self.page, self.command, self.writes = page, command, writes
+        self.evidence: list[Evidence] = []
+        self.failed: list[str] = []
+        self.skipped: list[str] = []
+
+    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
+        """Deselects the tests that say nothing of faults."""
+        silent = [item for item in items if "happened" not in getattr(item, "fixturenames", ())]
+        if silent:
+            config.hook.pytest_deselected(items=silent)
+            items[:] = [item for item in items if item not in set(silent)]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Takes a test's sentences once it has passed; with xdist this runs where the reports come together."""
+        if report.failed:
+            self.failed.append(report.nodeid)
+        elif report.skipped:
+            self.skipped.append(report.nodeid)
+        elif report.when == "call":
+            self.evidence += [
+                Evidence(value[0], value[1], report.nodeid)
+                for key, value in report.user_properties
+                if key == _KEY and isinstance(value, (list, tuple))
+            ]
+
+    def pytest_sessionfinish(self) -> None:
+        """Writes the page when all tests are done."""
+        if not self.writes:
+            return
+        self.page.parent.mkdir(parents=True, exist_ok=True)
+        self.page.write_text(page(self.evidence, self.failed, self.skipped, self.command), encoding="utf-8")
+
+
+def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[str], command: str) -> str:
+    """Markdown of the whole page: date, command, the table, and what failed or was skipped."""
+    rows: Mapping[int, list[Evidence]] = {n: [e for e in evidence if e.row == n] for n in FAULTS}
+    green = sum(1 for said in rows.values() if said)
+    lines = [
+        "# Faults, what is promised, what happened",
+        "",
+        f"Written {datetime.now(UTC):%Y-%m-%d} by `{command}`: tests with the real thing failing "
+        "(`tests/faults` and the tests named below). A sentence stands here only when its test passed.",
+        "",
+        f"{green} of {len(FAULTS)} rows have evidence.",
+        "",
+        "| # | fault | promise | what happened | test |",
+        "|---|---|---|---|---|",
+    ]
+    for number, (fault, promise) in FAULTS.items():
+        lines += _rows(number, fault, promise, rows[number])
+    for title, names in (("Failed", failed), ("Skipped", skipped)):
+        if names:
+            lines += ["", f"{title}: " + ", ".join(f"`{name}`" for name in sorted(set(names))) + "."]
+    return "\n".join(lines) + "\n"
+
+
+def _rows(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> list[str]:
+    if not said:
+        return [f"| {number} | {_cell(fault)} | {_cell(promise)} | **no test of this row passed** | |"]
+    lines, left = [], (str(number), _cell(fault), _cell(promise))
+    for e in sorted(said, key=lambda e: e.test):
+        lines.append(f"| {' | '.join(left)} | {_cell(e.text)} | `{e.test}` |")
+        left = ("", "", "")
+    return lines
+
+
+def _cell(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")

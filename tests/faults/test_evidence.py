@@ -1,0 +1,53 @@
+"""The page of faults: only passed tests speak, and rows without evidence say so."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.faults.evidence import Evidence, page
+from tests.faults.rows import FAULTS
+
+TESTS = """
+from tests.faults.evidence import Collector, happened
+from pathlib import Path
+import pytest
+
+def test_green(happened): happened(1, "cut at | 300 places\\n of <b>")
+def test_red(happened):
+    happened(2, "never true"); assert False
+def test_absent(happened):
+    happened(3, "never seen"); pytest.skip("not here")
+def test_silent(): raise AssertionError("does not run")
+"""
+CONFTEST = """
+from pathlib import Path
+from tests.faults.evidence import Collector, happened
+def pytest_configure(config):
+    config.pluginmanager.register(Collector(Path("page.md"), "make faults", not hasattr(config, "workerinput")))
+"""
+
+
+def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, repository: Path) -> None:
+    (tmp_path / "test_x.py").write_text(TESTS)
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-c", str(tmp_path / "none.ini"), str(tmp_path)]
+    (tmp_path / "none.ini").write_text("[pytest]\n" + f"pythonpath = {repository}\n")
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert "1 failed, 1 passed, 1 skipped" in done.stdout, done.stdout
+    text = (tmp_path / "page.md").read_text()
+    assert "cut at \\| 300 places of &lt;b>" in text
+    assert "never true" not in text
+    assert "never seen" not in text
+    assert f"1 of {len(FAULTS)} rows have evidence" in text
+    assert "Failed: `test_x.py::test_red`" in text
+    assert "Skipped: `test_x.py::test_absent`" in text
+
+
+def test_every_row_is_listed_once_with_its_number() -> None:
+    text = page([Evidence(7, "second", "b"), Evidence(7, "first", "a")], [], [], "make faults")
+    assert sum(line.startswith("| 7 |") for line in text.splitlines()) == 1
+    assert text.index("first") < text.index("second")
+    assert text.count("no test of this row passed") == len(FAULTS) - 1
+    assert list(FAULTS) == list(range(1, 23))
