@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 FloatArray = NDArray[np.float64]
 
@@ -71,11 +70,35 @@ def interpolate(t: FloatArray, values: FloatArray, at: FloatArray, smooth: bool)
     out = np.full((len(at), values.shape[1]), np.nan)
     inside = (at >= t[0]) & (at <= t[-1])
     if smooth and len(t) >= 4:
-        out[inside] = CubicHermiteSpline(t, values, np.gradient(values, t, axis=0), axis=0)(at[inside])
+        out[inside] = _hermite(t, values, at[inside])
     else:
         for column in range(values.shape[1]):
             out[inside, column] = np.interp(at[inside], t, values[:, column])
     return out
+
+
+def _hermite(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
+    """Cubic Hermite interpolation with slopes by central differences at times within [t[0], t[-1]]."""
+    slopes = np.gradient(values, t, axis=0)
+    k = np.minimum(np.searchsorted(t, at, side="right") - 1, len(t) - 2)
+    step = (t[k + 1] - t[k])[:, None]
+    u = (at - t[k])[:, None] / step
+    rise, begin, end = values[k + 1] - values[k], step * slopes[k], step * slopes[k + 1]
+    bend = end + begin - 2.0 * rise
+    return np.asarray(values[k] + u * (begin + u * ((rise - begin - bend) + u * bend)))
+
+
+def moving_mean(values: FloatArray, width: int, mirrored: bool = False) -> FloatArray:
+    """Mean of `width` neighbouring rows (the middle one at index width // 2), shape as `values`: (n,) or (n, columns).
+
+    Beyond the ends the last value goes on, or the signal is mirrored.
+    """
+    before = width // 2
+    pad = [(before, width - 1 - before), *([(0, 0)] * (values.ndim - 1))]
+    padded = np.pad(values, pad, mode="symmetric" if mirrored else "edge")
+    weights = np.full(width, 1.0 / width)
+    columns = padded.reshape(len(padded), -1).T
+    return np.column_stack([np.convolve(c, weights, mode="valid") for c in columns]).reshape(values.shape)
 
 
 def hold_mean(t: FloatArray, values: FloatArray, at: FloatArray, step: float) -> FloatArray:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from quadid.model.rollout import Rollout, Segments
 from quadid.vehicle import GRAVITY
@@ -38,8 +39,9 @@ def dead_reckoning(window: Window) -> FloatArray:
     cross = np.cross(v, f)
     acceleration = f + 2.0 * (w * cross + np.cross(v, cross)) + np.array([0.0, 0.0, GRAVITY])
     acceleration[~good] = 0.0
-    keep = np.exp(-window.dt / LEAK_SECONDS)
-    return np.asarray(lfilter([window.dt], [1.0, -keep], acceleration, axis=0), dtype=np.float64)
+    keep = float(np.exp(-window.dt / LEAK_SECONDS))
+    steps = (window.dt * acceleration).T.tolist()
+    return np.column_stack([list(accumulate(column, lambda v, step: keep * v + step)) for column in steps])
 
 
 def retract(x0: FloatArray, da: FloatArray) -> FloatArray:

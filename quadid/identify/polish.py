@@ -7,7 +7,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.shooting import Free, Linearised, Shooting
@@ -209,6 +208,8 @@ def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) ->
     z = np.asarray(axes @ (target / root) / scale)
     if np.all((z >= low) & (z <= high)):
         return z
+    from scipy.optimize import lsq_linear  # slow to import, and most steps end inside the bounds
+
     box = (low * scale - _ROOM, high * scale + _ROOM)
     solved = lsq_linear(root[:, None] * axes.T, target, box, method="bvls", tol=1e-12, max_iter=20 * len(g))
     return np.clip(solved.x / scale, low, high)

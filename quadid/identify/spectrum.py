@@ -8,10 +8,10 @@ on, because what stands there is more likely dynamics than noise, and must stay 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dct
 
 from quadid.identify.noise import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
@@ -61,8 +61,17 @@ def _powers(residual: FloatArray, basis: FloatArray) -> FloatArray:
     flat = residual.reshape(count, -1)
     inside = np.matmul(basis.transpose(0, 2, 1), flat[..., None])
     flat = flat - np.matmul(basis, inside)[..., 0]
-    modes = dct(flat.reshape(count, length, channels), axis=1, norm="ortho")
+    modes = np.matmul(_cosines(length), flat.reshape(count, length, channels))
     return np.asarray((modes**2).transpose(0, 2, 1))
+
+
+@lru_cache(maxsize=8)
+def _cosines(length: int) -> FloatArray:
+    """Orthonormal cosine modes as rows (DCT-II), shape (length, length)."""
+    modes = np.cos(np.pi / length * np.outer(np.arange(length), np.arange(length) + 0.5))
+    modes *= np.sqrt(2.0 / length)
+    modes[0] *= np.sqrt(0.5)
+    return np.asarray(modes)
 
 
 def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, seed: int = 0) -> NoiseModel:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from quadid.parameters import NOMINAL_NAMES
 from quadid.stabiliser import GAIN_NAMES
@@ -185,6 +184,8 @@ def _fit_axis(rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool) -> 
     start[1:3] += np.log(scale / max(float(np.std(told(start))), 1e-12))
     bounds = np.full((2, len(start)), 20.0) * np.array([[-1.0], [1.0]])
     bounds[1, 3] = np.log(_NO_LIMIT)
+    from scipy.optimize import least_squares  # slow to import, and many logs hold no references
+
     found = least_squares(residual, start, bounds=bounds, loss="soft_l1", max_nfev=60)
     p, rate_p, rate_i, limit = np.exp(found.x[:4])
     asked = p * max(float(np.max(np.abs(e))) for e in error)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
-from quadid.resample import sample_period
+from quadid.resample import moving_mean, sample_period
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
 
@@ -68,13 +67,13 @@ def _felt(accel: Channel) -> FloatArray:
     usual = np.median(accel.values, axis=0)
     share = accel.values @ usual / float(usual @ usual or 1.0)
     width = max(1, round(0.5 / sample_period(accel.t)))
-    return np.asarray(uniform_filter1d(share, width, mode="nearest") > 0.3, dtype=np.float64)
+    return np.asarray(moving_mean(share, width) > 0.3, dtype=np.float64)
 
 
 def _vibrates(accel: Channel) -> NDArray[np.bool_]:
     """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
     length = np.linalg.norm(accel.values, axis=1)
-    mean, square = uniform_filter1d(length, 25, mode="nearest"), uniform_filter1d(length**2, 25, mode="nearest")
+    mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
 
 

@@ -6,12 +6,12 @@ from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from quadid.errors import QuadidError
 from quadid.grid import to_windows
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
+from quadid.resample import moving_mean
 from quadid.rotor_signal import rotor_signal
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Recording, Window
@@ -93,8 +93,8 @@ def _quick_motion(windows: list[Window], lag: int) -> tuple[FloatArray, FloatArr
         )
         gained = (w.gyro[2:] - w.gyro[:-2]) / (2.0 * w.dt)
         acted, gained = acted[: len(acted) - lag], gained[lag:]
-        squares.append(acted - uniform_filter1d(acted, width, axis=0))
-        gains.append(gained - uniform_filter1d(gained, width, axis=0))
+        squares.append(acted - moving_mean(acted, width, mirrored=True))
+        gains.append(gained - moving_mean(gained, width, mirrored=True))
     if not squares:
         return np.empty((0, 0)), np.empty((0, 3))
     return np.concatenate(squares), np.concatenate(gains)

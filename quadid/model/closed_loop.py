@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, cont2discrete, lfilter, lfiltic
 
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
@@ -110,6 +109,8 @@ def _telemetry(flown: Flown, i: int, theta: FloatArray, dt: float) -> None:
 
 def _lagged(values: FloatArray, cutoff: float, dt: float) -> FloatArray:
     """Second-order Butterworth of columns known at the rows, linear in between; settled at the first row."""
+    from scipy.signal import butter, cont2discrete, lfilter, lfiltic  # slow to import, rarely needed
+
     matrix, bottom, _ = cont2discrete(butter(2, 2.0 * np.pi * cutoff, analog=True), dt, method="foh")
     top = np.ravel(matrix)
     out = np.empty_like(values)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from quadid.chi_square import exceeded, survival
 from quadid.errors import QuadidError
 from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import Prior, polish
@@ -115,7 +115,7 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     outcomes = _without_idle(outcomes)
     best = outcomes[0] if outcomes else nothing
     drop = nothing.deviance - best.deviance
-    if not outcomes or drop < float(chi2.isf(1e-3 / len(outcomes), max(len(best.cause.names), 1))):
+    if not outcomes or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1)):
         return ChangeReply(request.number, problem="no known cause explains it")
     return ChangeReply(request.number, _finding(request, nothing, outcomes))
 
@@ -178,7 +178,7 @@ def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]
     lead = min((r.deviance - best.deviance for r in rivals.values()), default=np.inf) / scale
     drop = (nothing.deviance - best.deviance) / scale
     values, sigma, units = _numbers(request, best)
-    p_value = float(min(1.0, chi2.sf(drop, len(best.cause.names)) * len(outcomes)))
+    p_value = min(1.0, survival(drop, len(best.cause.names)) * len(outcomes))
     alternatives = tuple(Alternative(name, r.mse) for name, r in rivals.items())
     finding = OnlineFinding(
         best.cause.effect, values, sigma, units, nothing.mse, best.mse, p_value, alternatives, "", lead > CLEAR

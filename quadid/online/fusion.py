@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+
+from quadid.chi_square import exceeded
 
 FloatArray = NDArray[np.float64]
 
@@ -135,7 +136,7 @@ class Fusion:
     def judge(self, window: WindowEstimate) -> Verdict:
         """Compares a window with the estimate from data before it (chi-square with the honest drift allowed)."""
         earlier = self._before(window.start)
-        limit = float(chi2.isf(CHANGE_PROBABILITY, len(self._mean)))
+        limit = exceeded(CHANGE_PROBABILITY, len(self._mean))
         if earlier is None:
             return Verdict(0.0, limit, known=False)
         before, own = self._solve(earlier), self._alone(window)

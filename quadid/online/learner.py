@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from quadid.chi_square import exceeded
 from quadid.identify.noise import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.identify.uncertainty import Uncertainty, parameter_set
@@ -200,7 +200,7 @@ class Learner:
         return newest.mse, newest.mse + newest.deviance(earlier) / newest.scale / max(newest.rows, 1.0)
 
     def _agreement(self, fused: Fused, most: int) -> tuple[int, str]:
-        limit = float(chi2.isf(AGREEMENT_PROBABILITY, len(fused.z)))
+        limit = exceeded(AGREEMENT_PROBABILITY, len(fused.z))
         agreeing = 0
         for window in self.fusion.disjoint(most):
             if self.fusion.distance(window, fused.z) > limit:

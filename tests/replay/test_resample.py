@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.interpolate import CubicHermiteSpline
 
 from quadid.resample import (
     fresh_rows,
@@ -15,6 +17,7 @@ from quadid.resample import (
     lowpass,
     lowpass_span,
     matching_rows,
+    moving_mean,
     sample_period,
     split_stretches,
 )
@@ -129,3 +132,20 @@ def test_fresh_rows_of_a_staircase_and_of_a_resting_signal() -> None:
     assert len(fresh_rows(noise)) == 100
     resting = np.concatenate([np.zeros((60, 1)), slow])
     assert set(range(60)) <= set(fresh_rows(resting))
+
+
+@pytest.mark.parametrize("width", [1, 2, 24, 25])
+def test_moving_mean_is_that_of_scipy(width: int) -> None:
+    values = np.random.default_rng(4).normal(size=(100, 3))
+    mirrored = ndimage.uniform_filter1d(values, width, axis=0)
+    np.testing.assert_allclose(moving_mean(values, width, mirrored=True), mirrored, atol=1e-14)
+    held = ndimage.uniform_filter1d(values[:, 0], width, mode="nearest")
+    np.testing.assert_allclose(moving_mean(values[:, 0], width), held, atol=1e-14)
+
+
+def test_smooth_interpolation_is_scipys_hermite_spline() -> None:
+    rng = np.random.default_rng(5)
+    t, values = np.cumsum(rng.uniform(0.5, 1.5, 50)), rng.normal(size=(50, 3))
+    at = np.array([t[0], *np.sort(rng.uniform(t[0], t[-1], 99)), t[-1]])
+    spline = CubicHermiteSpline(t, values, np.gradient(values, t, axis=0), axis=0)
+    np.testing.assert_allclose(interpolate(t, values, at, smooth=True), spline(at), atol=1e-12)
