@@ -121,6 +121,14 @@ test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install
 faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/results/faults.md
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser" --faults-page docs/results/faults.md tests
 
+.PHONY: fuzz
+fuzz: $(DEV) ## mutated logs through the four binary readers for an hour; goes on where it stopped, into docs/results/fuzz.md
+	OPENBLAS_NUM_THREADS=1 nice -n 19 $(BIN)/python -m tests.fuzz
+
+.PHONY: soak
+soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, into docs/results/soak.md (hours)
+	$(STUDY) studies.soak --out docs/results
+
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow
 

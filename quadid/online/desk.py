@@ -66,6 +66,10 @@ class Desk:
             self._voice.note(request.stop, Phase.NOT_EXCITED, why)
             return
         self.fits += 1
+        if not reply.estimate.finite:
+            # Information adds up: one such window would spoil every estimate after it.
+            self._voice.note(request.stop, Phase.FAILED, "the fit of the newest window gave values that are no numbers")
+            return
         if not self._learner.fusion.judge(reply.estimate).agrees:
             self._odd(request)
             return

@@ -58,6 +58,12 @@ class WindowEstimate:
         """Factor on its information: residuals above the noise floor make it count less."""
         return 1.0 / max(self.mse, 1.0)
 
+    @property
+    def finite(self) -> bool:
+        """Whether every number of it is one."""
+        arrays = (self.z, self.information, self.score)
+        return math.isfinite(self.cost) and all(bool(np.isfinite(a).all()) for a in arrays)
+
     def deviance(self, z: FloatArray) -> float:
         """Cost of `z` in this window above that of its own estimate, in units of its residual level."""
         step = z - self.z

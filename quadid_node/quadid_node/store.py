@@ -36,7 +36,7 @@ CREATE TABLE IF NOT EXISTS events (
     t REAL, wall REAL NOT NULL, data TEXT);
 """
 VERSION = 1
-KEPT = {"candidates": 100_000, "events": 20_000}
+KEPT = {"candidates": 20_000, "events": 20_000}
 """Rows kept; older ones are forgotten, numbered sets never."""
 PRUNE_EVERY = 1000
 MOST_WAITING = 5000

@@ -1,0 +1,150 @@
+"""A day of flight as fast as it can be taken in: session, fits, diagnoses and history on disk, in one process."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from quadid_node.service import Service
+from quadid_node.store import Store
+from quadid_node.worker import InlineWorker, Trouble
+
+from benchmarks.online.accuracy import PELICAN, flown
+from benchmarks.online.driving import samples
+from benchmarks.online.memory import resident
+from quadid.online import Publish, SessionSettings
+from quadid.online.answering import Reply
+from quadid.window import Sample
+from quadid_node import store as storing
+
+FLIGHT, GROUND = 120.0, 5.0
+"""A flight of so long [s] over and over, with a pause of so long between two."""
+STEP_EVERY = 50
+"""Samples between two looks at the session."""
+
+
+class TimedWorker(InlineWorker):
+    """Fits inline, and keeps apart what the fits cost.
+
+    Attributes:
+        spent: processor time of all fits and diagnoses [s]; fits: how many.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spent, self.fits = 0.0, 0
+
+    def poll(self) -> list[Reply | Trouble]:
+        """Does what waits, and times it."""
+        begin = time.thread_time()
+        done = super().poll()
+        if done:
+            self.spent += time.thread_time() - begin
+            self.fits += len(done)
+        return done
+
+    def sibling(self) -> InlineWorker:
+        """Diagnoses count with the fits."""
+        return self
+
+
+def day(
+    hours: float, refit: float, diagnose: float, tell: Callable[[str], None], limit: float, kept: int
+) -> dict[str, Any]:  # fmt: skip
+    """Takes in `hours` of flight.
+
+    Args:
+        hours: flight time, pauses included.
+        refit: between two fits [s].
+        diagnose: between two diagnoses [s].
+        tell: takes a line now and then.
+        limit: stops after so much wall time [s] and says how far it came.
+        kept: candidates and events that the history keeps; fewer than in service, so that the limit is reached.
+
+    Returns:
+        One entry an hour of flight: memory, files, time a sample and a fit, samples sent, taken and dropped.
+    """
+    flight = list(samples(flown(FLIGHT, 3).recording))
+    storing.KEPT.update(candidates=kept, events=kept)
+    begin, points = time.monotonic(), []
+    with tempfile.TemporaryDirectory() as folder:
+        worker = TimedWorker()
+        store = Store(Path(folder) / "history.sqlite", "pelican")
+        service = Service(PELICAN, SessionSettings(refit=refit, diagnose=diagnose), worker, store)
+        tally = _Tally(service, worker, flight)
+        last = round(hours * 3600.0 / (FLIGHT + GROUND))
+        every = max(round(3600.0 / (FLIGHT + GROUND)), 1)
+        for loop in range(last):
+            tally.fly(loop * (FLIGHT + GROUND))
+            if (loop + 1) % every and loop + 1 != last:
+                continue
+            points.append(
+                {**tally.point(), "hours": (loop + 1) * (FLIGHT + GROUND) / 3600.0, "files_mib": _size(folder)}
+            )
+            tell(f"{points[-1]['hours']:.1f} h of flight, {points[-1]['memory_mib']:.0f} MiB")
+            if time.monotonic() - begin > limit:
+                break
+        service.close()
+    return {
+        "asked_hours": hours,
+        "refit": refit,
+        "diagnose": diagnose,
+        "kept": kept,
+        "wall_seconds": time.monotonic() - begin,
+        "points": points,
+    }
+
+
+class _Tally:
+    """Flies, and counts since the last point."""
+
+    def __init__(self, service: Service, worker: TimedWorker, flight: list[Sample]) -> None:
+        self._service, self._worker, self._flight = service, worker, flight
+        self._sent = self._published = 0
+        self._own = self._fits_spent = 0.0
+        self._fits = 0
+
+    def fly(self, shift: float) -> None:
+        """One flight, `shift` [s] later than the recording."""
+        service, spent = self._service, self._worker.spent
+        begin = time.thread_time()
+        for k, sample in enumerate(self._flight):
+            service.push(Sample(sample.t + shift, sample.channel, sample.values))
+            if k % STEP_EVERY == 0:
+                self._note(service.step())
+                while service.session.running is not None:
+                    self._note(service.step())
+        self._sent += len(self._flight)
+        self._own += time.thread_time() - begin - (self._worker.spent - spent)
+
+    def _note(self, outputs: list[Any]) -> None:
+        self._published += sum(isinstance(o, Publish) and o.topic == "parameters" for o in outputs)
+
+    def point(self) -> dict[str, Any]:
+        """What was counted since the last point, and memory now."""
+        buffer, worker = self._service.session.buffer, self._worker
+        taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
+        out = {
+            "memory_mib": resident(), "sent": self._sent, "taken": taken, "dropped": dropped,
+            "us_a_sample": 1e6 * self._own / max(self._sent - getattr(self, "_before", 0), 1),
+            "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits, 1),
+            "fits": worker.fits, "published": self._published,
+        }  # fmt: skip
+        self._before, self._own, self._fits_spent, self._fits = self._sent, 0.0, worker.spent, worker.fits
+        return out
+
+
+def slope(points: list[dict[str, Any]], name: str) -> float:
+    """Least-squares slope of a column over the last three quarters [1/h]; NaN for fewer than three points."""
+    late = [p for p in points if p["hours"] > 0.25 * points[-1]["hours"]]
+    if len(late) < 3:
+        return float("nan")
+    return float(np.polyfit([p["hours"] for p in late], [p[name] for p in late], 1)[0])
+
+
+def _size(folder: str) -> float:
+    return sum(f.stat().st_size for f in Path(folder).rglob("*") if f.is_file()) / 2**20

@@ -1,0 +1,68 @@
+"""The node itself, with a count of what its callbacks take in and how late they are, a line a minute."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import sys
+import time
+from array import array
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import quadid_node.node
+from quadid_node.convert import Decoder
+from quadid_node.identify import main
+from quadid_node.presets import Input
+
+OUT, EVERY = "QUADID_SOAK_OUT", 60.0
+_LAST_DOUBLE = struct.Struct("<d")
+
+
+class CountingNode(quadid_node.node.IdentifyNode):
+    """Counts messages by topic and notes latencies; everything else is the node's own."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
+
+    def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
+        begin = time.time()
+        super()._on_message(decoder, entry, data)
+        self.counted[entry.topic] += 1
+        if entry.topic == "imu":
+            self.late.append(begin - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
+
+    def _report(self) -> None:
+        super()._report()
+        if time.monotonic() - self.noted >= EVERY and self.late:
+            self.note()
+
+    def note(self) -> None:
+        """Appends a line to the file of the counts."""
+        self.noted = time.monotonic()
+        ms = 1e3 * np.array(self.late)
+        session = self._service.session if self._service is not None else None
+        line = {
+            "t": time.time(), "messages": dict(self.counted), "p50": float(np.median(ms)) if len(ms) else None,
+            "p99": float(np.quantile(ms, 0.99)) if len(ms) else None, "max": float(ms.max()) if len(ms) else None,
+            "taken": dict(session.buffer.counts) if session else {},
+            "dropped": dict(session.buffer.faults) if session else {},
+            "fits": session.status().fits if session else 0, "in_force": session.status().in_force if session else 0,
+        }  # fmt: skip
+        self.late = array("d")
+        with Path(os.environ[OUT]).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def on_shutdown(self, state: Any) -> Any:
+        """Notes the last counts."""
+        self.note()
+        return super().on_shutdown(state)
+
+
+if __name__ == "__main__":
+    quadid_node.node.IdentifyNode = CountingNode  # type: ignore[misc]
+    sys.exit(main())
