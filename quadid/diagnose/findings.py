@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from scipy.stats import chi2
 
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.exchange import Trial
 from quadid.diagnose.models import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
 from quadid.diagnose.search import Search
@@ -25,10 +25,12 @@ TIME_SIGMA = 0.1
 """Standard deviation [s] given to a change time, the resolution of its scan."""
 
 
-def describe(shooting: Shooting, search: Search, worth: tuple[Worth, ...], confident: bool) -> tuple[Finding, ...]:
-    """Findings in the order of their worth."""
+def describe(
+    shooting: Shooting, search: Search, worth: Sequence[Worth], believed: Sequence[Candidate]
+) -> tuple[Finding, ...]:
+    """Findings in the order of their worth; those `believed` are confident."""
     sigma = _sigmas(search.model)
-    return tuple(_finding(shooting, search, w, sigma, confident) for w in worth)
+    return tuple(_finding(shooting, search, w, sigma, w.cause in believed) for w in worth)
 
 
 def _sigmas(model: Model) -> dict[str, float]:
@@ -48,7 +50,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         parameters=numbers,
         gain=benefit,
         p_value=_p_value(search, cause),
-        alternatives=_alternatives(search, cause),
+        alternatives=_alternatives(search, cause, benefit.mse_after),
         evidence=evidence(cause.effect, values, benefit.mse_before, benefit.mse_after),
         per_log=EFFECTS[cause.effect].per_log,
     )
@@ -91,18 +93,18 @@ def _sigma(name: str, from_data: float) -> float:
     return math.hypot(from_data, STEP_SIGMA) if name in ("tau", "delay") else from_data
 
 
-def _alternatives(search: Search, cause: Candidate) -> tuple[Alternative, ...]:
-    """Other causes refitted in place of `cause` on the same blocks, each effect once, best first."""
+def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[Alternative, ...]:
+    """Other causes refitted in place of `cause` on the same blocks, each effect once, best first.
+
+    Their errors lie above `mse_after`, the finding's own, by what they were worse when both were last compared.
+    """
     found: dict[str, Alternative] = {}
     for step in search.rounds:
         if step.accepted is None or step.accepted.candidate.label != cause.label:
             continue
-        losers: list[Trial] = [t for t in step.trials if t.candidate.effect != cause.effect and t.gain.total > 0.0]
-        losers.sort(key=lambda t: -t.gain.total)
-        for t in losers:
-            found.setdefault(t.candidate.effect, Alternative(t.candidate.effect, _mse(t)))
+        mine = step.accepted.model
+        for t in step.trials:
+            if t.candidate.effect != cause.effect and t.gain.total > 0.0:
+                worse = float(t.model.held_out.sum() - mine.held_out.sum()) / mine.rows
+                found[t.candidate.effect] = Alternative(t.candidate.effect, mse_after + worse)
     return tuple(sorted(found.values(), key=lambda a: a.mse_after)[:MOST_ALTERNATIVES])
-
-
-def _mse(trial: Trial) -> float:
-    return float(trial.model.held_out.sum()) / trial.model.rows

@@ -165,6 +165,14 @@ def _walk(shooting: Shooting, model: Model, free: Free, theta: FloatArray) -> Sk
     return Sketch(result.theta, model.deviance - result.cost - float(result.lin.occam.sum()))
 
 
+def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Model, int]:
+    """Every n-th segment of the problem, so that at most about `most` stay, the model refitted there, and n."""
+    every = max(shooting.count // most, 1)
+    shooting.restore(model.states)
+    thin = shooting.thinned(every)
+    return thin, fit_model(thin, model.theta, model.causes, iterations=FAR_STEPS), every
+
+
 def extend(
     shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | None = None, iterations: int = 6
 ) -> Model:

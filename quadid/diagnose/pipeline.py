@@ -12,6 +12,7 @@ from quadid.diagnose.backward import eliminate
 from quadid.diagnose.candidates import candidates
 from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
+from quadid.diagnose.form import inconstant
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
@@ -45,7 +46,9 @@ SENSOR_EFFECTS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
 BELIEVABLE = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
 SHARE_TO_NAME = 0.8
-"""Named causes must account for this share of all structure, else the answer is `unknown`."""
+"""Named causes must account for this share of all structure, else the answer is `unknown` …"""
+SHARE_ALONE = 0.9
+"""… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
 LEAST_STRUCTURE = 0.01
 """Structure below this share of the noise is not worth a word …"""
 LEAST_OF_EXPLAINED = 1e-3
@@ -138,11 +141,17 @@ def diagnose(
     beyond = _beyond_belief(short, search.model)
     if search.model.causes and (outcome.contradicted or beyond or any(f.kind == "saturated" for f in faults)):
         verdict = Verdict.UNKNOWN
-    findings = describe(decisive, search, per_finding, verdict is not Verdict.UNKNOWN)
+    doubts = dict(inconstant(search.model, left))
+    if search.model.causes and len(doubts) == len(search.model.causes):
+        verdict = Verdict.UNKNOWN
+    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
+    findings = describe(decisive, search, per_finding, believed)
     text = extended_vehicle(vehicle, decisive, search.model)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
-    result = Diagnosis(verdict, findings, outcome, left, text, name, (*(f.text for f in faults), *beyond))
+    result = Diagnosis(
+        verdict, findings, outcome, left, text, name, (*(f.text for f in faults), *beyond, *doubts.values())
+    )
     return result, Workings(search, short, decisive, left)
 
 
@@ -185,4 +194,5 @@ def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:
         return Verdict.EXPLAINED
-    return Verdict.PARTLY_EXPLAINED if explained >= SHARE_TO_NAME * (explained + structure) else Verdict.UNKNOWN
+    share = SHARE_TO_NAME if len(model.effects) > 1 else SHARE_ALONE
+    return Verdict.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Verdict.UNKNOWN

@@ -68,6 +68,15 @@ class Follows:
         return self.gain.total > max(ERRORS * self.gain.error, LEAST_GAIN)
 
 
+@dataclass(frozen=True)
+class Alone:
+    """What one signal alone explains at one site: names of both, chi-square with one degree of freedom."""
+
+    site: str
+    signal: str
+    chi_square: float
+
+
 def _sites() -> tuple[Site, ...]:
     out = []
     for i, axis in enumerate(_AXES):
@@ -82,8 +91,12 @@ def _sites() -> tuple[Site, ...]:
 SITES = _sites()
 
 
-def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
-    """Holds what `model` leaves against all signals at all sites; the best site of each group, strongest first."""
+def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tuple[Alone, ...]]:
+    """Holds what `model` leaves against all signals at all sites.
+
+    Returns:
+        All signals together, at the best site of each group, strongest first; and every signal alone at every site.
+    """
     shooting.restore(model.states)
     parts = list(shooting.columns(model.theta, model.free))
     named = [signals(part) for part in parts]
@@ -94,25 +107,29 @@ def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
     stacked = [s / np.where(scale > 0.0, scale, 1.0) for s in stacked]
     labels = block_labels(model.lin)
     best: dict[str, Follows] = {}
+    alone: list[Alone] = []
     for site in SITES:
-        found = _judge(site, names, parts, stacked, model, labels)
+        found, each = _judge(site, names, parts, stacked, model, labels)
+        alone += each
         if site.group not in best or found.gain.total > best[site.group].gain.total:
             best[site.group] = found
-    return tuple(sorted(best.values(), key=lambda f: -f.gain.total))
+    return tuple(sorted(best.values(), key=lambda f: -f.gain.total)), tuple(alone)
 
 
 def _judge(
     site: Site, names: tuple[str, ...], parts: list[Columns], stacked: list[FloatArray], model: Model,
     labels: NDArray[np.intp],
-) -> Follows:  # fmt: skip
+) -> tuple[Follows, list[Alone]]:  # fmt: skip
     pieces = [_products(site, p, s) for p, s in zip(parts, stacked, strict=True)]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
     own = model.lin.gram.shape[1]
     precision = np.concatenate([1.0 / model.prior.sigma**2, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
     both = replace(model.lin, gram=gram, grad=grad)
-    alone = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
-    gain = paired_gain(held_out_deviance(alone, precision[:own], labels), held_out_deviance(both, precision, labels))
-    return Follows(site, gain, names[_strongest(gram.sum(axis=0), grad.sum(axis=0), precision, own)])
+    none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
+    gain = paired_gain(held_out_deviance(none, precision[:own], labels), held_out_deviance(both, precision, labels))
+    each = _chi_squares(gram.sum(axis=0), grad.sum(axis=0), precision, own)
+    alone = [Alone(site.name, n, float(c)) for n, c in zip(names, each, strict=True)]
+    return Follows(site, gain, names[int(np.argmax(each))]), alone
 
 
 def _products(site: Site, part: Columns, signal: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -150,11 +167,11 @@ def _integrated(signal: FloatArray, times: int, dt: float) -> FloatArray:
     return signal
 
 
-def _strongest(gram: FloatArray, grad: FloatArray, precision: FloatArray, own: int) -> int:
-    """Index of the probe that alone lowers the deviance most."""
+def _chi_squares(gram: FloatArray, grad: FloatArray, precision: FloatArray, own: int) -> FloatArray:
+    """How much each probe alone lowers the deviance, the model's own parameters refitted."""
     h_oo = gram[:own, :own] + np.diag(precision[:own])
     solved = np.linalg.solve(h_oo, np.column_stack([gram[:own, own:], grad[:own]]))
     s = np.diag(gram[own:, own:]) - np.sum(gram[:own, own:] * solved[:, :-1], axis=0)
     g = grad[own:] - gram[own:, :own] @ solved[:, -1]
     informed = s > 1e-6 * np.diag(gram[own:, own:])
-    return int(np.argmax(np.where(informed, g * g / np.maximum(s, 1e-12), 0.0)))
+    return np.asarray(np.where(informed, g * g / np.maximum(s, 1e-12), 0.0))

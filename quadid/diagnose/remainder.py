@@ -16,15 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.models import Model
-from quadid.diagnose.probes import Follows, follows
+from quadid.diagnose.probes import Alone, Follows, follows
+from quadid.identify.floor import SPECTRUM_SECONDS
 from quadid.identify.shooting import Shooting
-from quadid.identify.spectrum import mode_power
+from quadid.identify.spectrum import LOWEST, mode_power
+from quadid.identify.spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.model.rollout import CHANNEL_NAMES
 
 FloatArray = NDArray[np.float64]
 
 SMOOTH = 3
-"""Neighbouring modes averaged before they are judged."""
+"""Neighbouring modes averaged before they are judged …"""
+RESOLVED = SPECTRUM_SMOOTH / (2.0 * SPECTRUM_SECONDS)
+"""… and, where the spectrum of the noise was taken from the data, as many as lie within this width [Hz], which is what
+that spectrum resolves: a line of vibration narrower than it is noise."""
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
 _ATTITUDE = (3, 4, 5)
@@ -57,11 +62,13 @@ class Remainder:
         channels: power above the noise, one entry a channel.
         follows: what can be predicted on unseen blocks, strongest first.
         rows: independent residuals.
+        alone: what every signal alone explains at every site.
     """
 
     channels: tuple[Structure, ...]
     follows: tuple[Follows, ...]
     rows: float
+    alone: tuple[Alone, ...] = ()
 
     @property
     def deviance(self) -> float:
@@ -100,20 +107,31 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
         if c in _ATTITUDE or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
         out.append(_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
-    return Remainder(tuple(out), follows(shooting, model), model.rows)
+    followed, alone = follows(shooting, model)
+    return Remainder(tuple(out), followed, model.rows, alone)
 
 
 def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
-    frequency = 0.5 * np.arange(len(found)) * rate / len(found)
+    spacing = 0.5 * rate / len(found)
+    frequency = spacing * np.arange(len(found))
     usable = null > 0.3  # modes the initial state takes away say nothing
-    kernel = np.ones(SMOOTH)
+    wide = max(SMOOTH, 2 * round(0.5 * RESOLVED / spacing) + 1)
+    own = [_band(found, null, usable, segments, width) for width in (SMOOTH, wide)]
+    ratio, z = (np.where(frequency < LOWEST, slow, fast) for slow, fast in zip(*own, strict=True))
+    k = int(np.argmax(z))
+    excess = np.where(usable & (z > 2.0), null * (ratio - 1.0), 0.0)
+    deviance = float(segments * max(np.sum(excess), 0.0))
+    share = deviance / max(float(segments * np.sum(found)), 1e-12)
+    return Structure(name, share, deviance, float(frequency[k]), float(z[k]))
+
+
+def _band(
+    found: FloatArray, null: FloatArray, usable: NDArray[np.bool_], segments: int, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Power over `width` modes relative to noise, and by how many standard errors it stands above it."""
+    kernel = np.ones(width)
     weight = np.convolve(usable * null, kernel, mode="same")
     ratio = np.convolve(usable * found, kernel, mode="same") / np.maximum(weight, 1e-9)
     modes = np.convolve(usable.astype(float), kernel, mode="same")
     error = np.sqrt(2.0 / (segments * np.maximum(modes, 1.0)))
-    z = np.where(usable, (ratio - 1.0) / error, 0.0)
-    k = int(np.argmax(z))
-    excess = np.where(usable & (z > 2.0), found - null, 0.0)
-    deviance = float(segments * max(np.sum(excess), 0.0))
-    share = deviance / max(float(segments * np.sum(found)), 1e-12)
-    return Structure(name, share, deviance, float(frequency[k]), float(z[k]))
+    return ratio, np.where(usable, (ratio - 1.0) / error, 0.0)

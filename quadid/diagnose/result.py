@@ -62,7 +62,7 @@ class Finding:
 
     Attributes:
         effect: contract name.
-        confident: False when the verdict is `unknown`.
+        confident: False when the verdict is `unknown`, or the finding has not the form that its name claims.
         parameters: numbers of the effect.
         gain: what it is worth on unseen data, given all other findings.
         p_value: chance of numbers so far from neutral without the effect, corrected for how many causes were tried.

@@ -12,7 +12,7 @@ from scipy import stats
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
-from quadid.diagnose.models import Model, extend, fit_model, sketch
+from quadid.diagnose.models import Model, extend, fit_model, sketch, thinned
 from quadid.diagnose.screen import Score, screen
 from quadid.identify.shooting import Shooting
 
@@ -22,6 +22,8 @@ LINEAR_MISFIT = 4.0
 """Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
 MOST_SKETCHES = 10
 """Most linear candidates whose gain is predicted while the misfit is large."""
+FAR_SEGMENTS = 60
+"""Segments on which candidates are compared while the misfit is large, and so any difference shows on a few."""
 FEWEST_REFITS, MOST_REFITS = 3, 7
 """Fewest and most candidates refitted in one round."""
 MOST_CAUSES = 12
@@ -171,13 +173,14 @@ def _drafts(
     far = model.misfit > LINEAR_MISFIT
     least = 0.5 * max(float(stats.chi2.isf(FALSE_ALARM / tests, 1)), LEAST_GAIN, LEAST_SHARE * model.rows)
     linear = [s for s in scores if not s.candidate.starts and s.drop > least][:MOST_SKETCHES]
+    thin, base, every = thinned(shooting, model, FAR_SEGMENTS) if far else (shooting, model, 1)
     drafts = []
     for score in _one_corner([s for s in scores if s.candidate.starts or s in linear]):
         if score.candidate.timed is not None:
             drafts.append(_Draft(score, score.drop, None))
         elif score.candidate.starts or far:
-            drawn = sketch(shooting, model, score.candidate, elsewhere if far else ())
-            drafts.append(_Draft(score, max(drawn.drop, score.drop) if far else drawn.drop, drawn.theta))
+            drawn = sketch(thin, base, score.candidate, elsewhere if far else ())
+            drafts.append(_Draft(score, max(every * drawn.drop, score.drop) if far else drawn.drop, drawn.theta))
         else:
             drafts.append(_Draft(score, score.drop, model.theta))
     drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)

@@ -9,6 +9,7 @@ the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +118,15 @@ class Shooting:
     def restore(self, kept: dict[int, list[FloatArray]]) -> None:
         """Puts back what `snapshot` gave."""
         self._x0 = dict(kept)
+
+    def thinned(self, every: int) -> Shooting:
+        """The same problem on every n-th segment of each window, the first included; states are its own copy."""
+        thin = copy(self)
+        thin.segments = [s.every(every) for s in self.segments]
+        thin.robust = [None if r is None else r[::every] for r in self.robust]
+        thin._x0 = {n: [x[::every].copy() for x in states] for n, states in self._x0.items()}
+        thin._reckoned = {n: [v[::every] for v in velocities] for n, velocities in self._reckoned.items()}
+        return thin
 
     def swarm_cost(self, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
         """Cost of many parameter vectors at once on at most `most` segments, spread evenly.

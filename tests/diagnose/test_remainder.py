@@ -84,6 +84,10 @@ class Stub:
     held_out: FloatArray
     rows: float = ROWS
 
+    @property
+    def effects(self) -> set[str]:
+        return {f"effect {i}" for i in range(len(self.causes))}
+
 
 def verdict(explained: float, left: float, causes: int) -> Verdict:
     nominal, model = Stub((), np.full(10, ROWS / 10 + explained / 10)), Stub(("x",) * causes, np.full(10, ROWS / 10))
@@ -99,8 +103,9 @@ def verdict(explained: float, left: float, causes: int) -> Verdict:
         (0.0, 0.05 * ROWS, 0, Verdict.UNKNOWN),
         (1e4, 0.0, 1, Verdict.EXPLAINED),
         (1e4, 0.1e4, 1, Verdict.PARTLY_EXPLAINED),
-        (1e4, 0.24e4, 1, Verdict.PARTLY_EXPLAINED),
-        (1e4, 0.26e4, 1, Verdict.UNKNOWN),
+        (1e4, 0.12e4, 1, Verdict.UNKNOWN),
+        (1e4, 0.24e4, 2, Verdict.PARTLY_EXPLAINED),
+        (1e4, 0.26e4, 2, Verdict.UNKNOWN),
         (1e4, 9e4, 2, Verdict.UNKNOWN),
     ],
 )

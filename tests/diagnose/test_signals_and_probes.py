@@ -32,7 +32,7 @@ def thrust_before(problem: Problem) -> FloatArray:
 
 
 def strongest(problem: Problem) -> Follows:
-    return follows(problem.shooting, problem.nominal)[0]
+    return follows(problem.shooting, problem.nominal)[0][0]
 
 
 def planted(channel: str, axis: int, values: FloatArray) -> Problem:
@@ -43,7 +43,7 @@ def planted(channel: str, axis: int, values: FloatArray) -> Problem:
 
 
 def test_without_effects_no_site_is_structured() -> None:
-    found = follows(clean().shooting, clean().nominal)
+    found = follows(clean().shooting, clean().nominal)[0]
     assert len(found) == len({s.group for s in SITES}) == 6
     assert not [f for f in found if f.significant]
     # Some fifty signals fitted to noise lose on blocks that they were not fitted to.
@@ -58,7 +58,7 @@ def test_a_gyro_error_that_follows_thrust_is_found_on_its_axis(axis: int) -> Non
     assert found.site.group == f"rotation {'xyz'[axis]}"
     assert found.site.name == f"gyro {'xyz'[axis]}"
     assert "thrust" in found.signal or found.signal.startswith("a_z")
-    others = [f for f in follows(problem.shooting, problem.nominal) if f.significant]
+    others = [f for f in follows(problem.shooting, problem.nominal)[0] if f.significant]
     assert [f.site.group for f in others] == [found.site.group]
 
 
@@ -86,7 +86,7 @@ def test_what_happens_once_and_follows_nothing_is_not_said_to_follow() -> None:
     knock = np.zeros(len(clean().window))
     knock[1500:1525] = 0.2
     problem = planted("gyro", 1, knock)
-    assert not [f for f in follows(problem.shooting, problem.nominal) if f.significant]
+    assert not [f for f in follows(problem.shooting, problem.nominal)[0] if f.significant]
 
 
 def test_inputs_are_those_of_the_step_before() -> None:
