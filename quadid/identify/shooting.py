@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quadid.identify.columns import Columns
 from quadid.identify.free import Free as Free
-from quadid.identify.gram_kernel import segment_grams
+from quadid.identify.gram_kernel import Whitening, segment_grams
 from quadid.identify.initial_states import first_states, retract
 from quadid.identify.linearised import Linearised as Linearised
 from quadid.identify.linearised import join, log_determinant_beyond
@@ -205,11 +205,11 @@ class Shooting:
         """Products of all weighted, whitened columns of each segment, the residual last: (segments, k+P+1, k+P+1)."""
         count, width = out.shape[1], len(steps)
         grams = np.empty((count, width + 1, width + 1))
-        whitener = self.noise.whitener(self.length, self.dt)
-        sigma, coloured = np.sqrt(self.noise.variance), self.noise.coloured
+        noise = self.noise
+        whitening = Whitening(np.sqrt(noise.variance), noise.coloured, noise.whitener(self.length, self.dt))
 
         def run(first: int, last: int) -> None:
-            segment_grams(out, steps, weights, sigma, coloured, whitener, first, last, grams)
+            segment_grams(out[:, first:last], steps, weights[first:last], whitening, grams[first:last])
 
         halves = [(0, count // 2), (count // 2, count)] if count > 20 else [(0, count)]
         list(worker_threads().map(lambda half: run(*half), halves))
