@@ -25,7 +25,6 @@ from quadid.model import layout as ix
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
-from quadid.model.rollout import _threads as worker_threads
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -169,24 +168,17 @@ class Shooting:
             if robust is not None and robust.shape == weights.shape:
                 weights = weights * robust
             both = Free((*self.free(self.local).entries, *free.entries))
-            out, steps = self._roll_directions(rollout, segments, theta, both, states[i], n_pre, k)
-            grams = self._grams(out, steps, weights)
-            base = np.ascontiguousarray(out[0, ..., : self.channels, 0])
+            grams, base, moved = self._grams(rollout, segments, theta, both, states[i], weights, n_pre, k)
             away = states[i][:, 7:10] - self._reckoned[n_pre][i]
             part = self._eliminate(i, grams, base, weights, away, segments, k)
-            for j in range(k, k + len(self.local)):
-                # What the local parameters explain is no residual: lane 1 + j holds their direction.
-                lane = out[(1 + j) // LANES, ..., : self.channels, (1 + j) % LANES]
-                part.residuals[...] -= (lane - out[0, ..., : self.channels, 0]) * (part.back[0][:, j] / steps[j])[
-                    :, None, None
-                ]
+            if self.local:
+                # What the local parameters explain is no residual.
+                part.residuals[...] -= np.einsum("silj,sj->sil", moved, part.back[0][:, k:])
             parts.append(part)
         return join(parts)
 
-    def _roll_directions(
-        self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, n_pre: int, k: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Rolls the base and one lane a direction; returns the residuals (blocks, …, LANES) and the steps (k + P,)."""
+    def _directions(self, theta: FloatArray, free: Free, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""
         m = 1 + k + len(free.entries)
         thetas = np.repeat(theta[None], m, axis=0)
         dx = np.zeros((m, 12))
@@ -199,21 +191,38 @@ class Shooting:
             h = _STEP_FRACTION if theta[e.index] + scale[j] * _STEP_FRACTION <= e.upper else -_STEP_FRACTION
             thetas[1 + k + j, e.index] += h * scale[j]
             steps[k + j] = h
+        return thetas, dx, steps
+
+    def _roll_directions(
+        self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, n_pre: int, k: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Rolls the base and one lane a direction; returns the residuals (blocks, …, LANES) and the steps (k + P,)."""
+        thetas, dx, steps = self._directions(theta, free, k)
         return rollout.roll(segments, thetas, x0, dx, n_pre)[0], steps
 
-    def _grams(self, out: FloatArray, steps: FloatArray, weights: FloatArray) -> FloatArray:
-        """Products of all weighted, whitened columns of each segment, the residual last: (segments, k+P+1, k+P+1)."""
-        count, width = out.shape[1], len(steps)
-        grams = np.empty((count, width + 1, width + 1))
-        noise = self.noise
+    def _grams(
+        self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, weights: FloatArray,
+        n_pre: int, k: int,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+        """Products of all weighted, whitened columns of each segment, residual last: (segments, k+P+1, k+P+1).
+
+        Also the residual itself, in channel units, and the columns of the local parameters, which come first in `free`.
+        """
+        thetas, dx, steps = self._directions(theta, free, k)
+        noise, local = self.noise, len(self.local)
         whitening = Whitening(np.sqrt(noise.variance), noise.coloured, noise.whitener(self.length, self.dt))
+        grams = np.empty((len(x0), len(steps) + 1, len(steps) + 1))
+        base, moved = np.empty(weights.shape), np.empty((*weights.shape, local))
 
-        def run(first: int, last: int) -> None:
-            segment_grams(out[:, first:last], steps, weights[first:last], whitening, grams[first:last])
+        def use(which: slice, out: FloatArray) -> None:
+            segment_grams(out, steps, weights[which], whitening, grams[which])
+            base[which] = out[0, ..., : self.channels, 0]
+            for j in range(local):
+                lane = out[(1 + k + j) // LANES, ..., : self.channels, (1 + k + j) % LANES]
+                moved[which][..., j] = (lane - base[which]) / steps[k + j]
 
-        halves = [(0, count // 2), (count // 2, count)] if count > 20 else [(0, count)]
-        list(worker_threads().map(lambda half: run(*half), halves))
-        return grams
+        rollout.roll_parts(segments, thetas, x0, dx, n_pre, use)
+        return grams, base, moved
 
     def _eliminate(
         self, i: int, grams: FloatArray, base: FloatArray, weights: FloatArray, v: FloatArray, segments: Segments,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +31,10 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
 _TABLES_KEPT = 4
+_PART_ROWS = 1600
+"""Rows simulated before their residuals are used: they stay in cache."""
+_FORGOTTEN = 40.0
+"""Time constants after which nothing is left in double precision: exp(-40) = 4e-18."""
 
 
 @lru_cache(maxsize=1)
@@ -151,6 +157,42 @@ class Rollout:
         self._each_block(segments, n_pre, theta, dx, self.channels, one)
         return residuals, ends
 
+    def roll_parts(
+        self, segments: Segments, theta: FloatArray, x0: FloatArray, dx: FloatArray, n_pre: int,
+        use: Callable[[slice, FloatArray], None],
+    ) -> None:  # fmt: skip
+        """Simulates as `roll` does, a few segments at a time, so that residuals are used while they are in cache.
+
+        Args:
+            segments: the cut.
+            theta: parameter vectors, shape (m, size).
+            x0: initial states, as for `roll`.
+            dx: tangent offsets, as for `roll`.
+            n_pre: rows rolled before the first scored one.
+            use: called with which segments, and their residuals (blocks, segments, length, channels, LANES), which
+                are overwritten afterwards; called from several threads.
+        """
+        count, width = len(segments.starts), segments.length * self.channels * LANES
+        step = max(_PART_ROWS // segments.length, 1)
+        lanes = self._prepared(segments, n_pre, theta, dx, self.channels)
+        room: SimpleQueue[FloatArray] = SimpleQueue()
+
+        def part(first: int) -> None:
+            which = slice(first, min(first + step, count))
+            some = Segments(segments.length, segments.lead, segments.starts[which])
+            shape = (len(lanes), len(some.starts), segments.length, self.channels, LANES)
+            space = aligned((len(lanes) * step * width,)) if room.empty() else room.get()
+            out = space[: math.prod(shape)].reshape(shape)
+            ends = aligned((len(some.starts), N_STATE, LANES))
+            for block, one in enumerate(lanes):
+                rows = out[block].reshape(len(some.starts), segments.length, -1)
+                self._run(some, n_pre, x0[which], one, self._mask, None, rows, ends, _NOTHING)
+            use(which, out)
+            room.put(space)
+
+        starts = range(0, count, step)
+        list(_threads().map(part, starts) if len(starts) > 1 else map(part, starts))
+
     def costs(
         self, segments: Segments, theta: FloatArray, x0: FloatArray, weights: FloatArray, basis: FloatArray,
         n_pre: int = 1,
@@ -194,6 +236,16 @@ class Rollout:
         run: Callable[[int, _Lanes], None],
     ) -> None:  # fmt: skip
         """Cuts parameter vectors into blocks of lanes and runs the blocks, several at a time."""
+        lanes = self._prepared(segments, n_pre, theta, dx, channels)
+        if len(lanes) == 1:
+            run(0, lanes[0])
+        else:
+            list(_threads().map(run, range(len(lanes)), lanes))
+
+    def _prepared(
+        self, segments: Segments, n_pre: int, theta: FloatArray, dx: FloatArray | None, channels: int
+    ) -> list[_Lanes]:
+        """Cuts parameter vectors into blocks of lanes; raises ValueError for what cannot be simulated."""
         if not 1 <= n_pre <= segments.lead:
             raise ValueError(f"n_pre = {n_pre}; allowed: 1 to the segments' lead, {segments.lead}")
         if not np.isfinite(theta).all():
@@ -206,11 +258,7 @@ class Rollout:
         offsets = np.zeros((blocks * LANES, N_TANGENT))
         if dx is not None:
             offsets[:m] = dx
-        lanes = [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]
-        if blocks == 1:
-            run(0, lanes[0])
-        else:
-            list(_threads().map(run, range(blocks), lanes))
+        return [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]
 
     def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
         need = needs_of(theta, channels)
@@ -234,11 +282,17 @@ class Rollout:
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
         w = self.window
+        begin = max(int(segments.starts[0]) - n_pre - self._memory(lanes.theta), 0)
         roll_segments(
             w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, scale,
-            segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length,
+            begin, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length,
             basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
+
+    def _memory(self, theta: FloatArray) -> int:
+        """Rows after which rotors have forgotten how they began, to the last digit of their speed."""
+        lag, late = float(theta[:, ix.TAU].max()), float(theta[:, ix.DELAY].max())
+        return math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:
         """First guess of the states `n_pre` rows before each segment from the measurements, shape (segments, 13).

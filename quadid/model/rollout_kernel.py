@@ -198,14 +198,14 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 @nb.njit(**jit)
 def _march(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
+    scale: FloatArray, begin: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
     channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
     s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray, total: FloatArray, inside: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
     steps = n_pre + n_seg
-    turned = 0  # rotor steps already taken
+    turned = begin  # rotor steps already taken
     for seg in range(len(starts)):
         first = starts[seg] - n_pre
         following = starts[seg + 1] - n_pre if seg + 1 < len(starts) else -1
@@ -268,15 +268,15 @@ def _march(
 @nb.njit(**allocating)
 def _roll_segments(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray, dx: FloatArray,
-    need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray,
-    cost: FloatArray,
+    scale: FloatArray, begin: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray,
+    dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
+    ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
 
     Each segment starts from its own initial state, `n_pre` steps before its first scored sample, and ends one step
     after the last, because a logged acceleration is the mean over one sample centred on its time.  Rotor speeds do not
-    depend on the vehicle's state; they run through the whole window.
+    depend on the vehicle's state; they run through from row `begin`.
 
     Args:
         u: rotor input (n, rotors) [rad/s].
@@ -286,6 +286,7 @@ def _roll_segments(
         table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
         measured: (n, 16), see `compare`.
         scale: (n, channels), factor on residuals: 1 where measured, else 0; or weights.
+        begin: row from which rotors run, early enough before the first segment that they forget how they began.
         starts: first scored row of each segment, rising; rows start - n_pre to start + n_seg must exist.
         n_pre: steps rolled before the first scored row, at least 1.
         x0: initial state at start - n_pre, (segments, 13).
@@ -316,10 +317,10 @@ def _roll_segments(
     body_constants(theta, flight.mass, rotors, flight.reach, s)
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
-    rotors_start(u, rot)
+    rotors_start(u, begin, rot)
     _march(
-        u, held, geometry, flight, table, measured, scale, starts, n_pre, x0, dx, need, channels, n_seg, sums, basis,
-        out, ends, cost, s, rot, ahead, past, total, inside,
+        u, held, geometry, flight, table, measured, scale, begin, starts, n_pre, x0, dx, need, channels, n_seg, sums,
+        basis, out, ends, cost, s, rot, ahead, past, total, inside,
     )  # fmt: skip
 
 

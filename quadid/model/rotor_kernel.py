@@ -63,12 +63,12 @@ def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray
 
 
 @nb.njit(**jit)
-def rotors_start(u: FloatArray, rot: FloatArray) -> None:
-    """Sets all rotors to the first input, as if it had acted for ever."""
+def rotors_start(u: FloatArray, k: int, rot: FloatArray) -> None:
+    """Sets all rotors to the input of row k, as if it had acted for ever."""
     for r in range(len(rot)):
         for lane in range(LANES):
             for row in (R_SPEED, R_PAST, R_NOW, R_NEXT):
-                rot[r, row + lane] = u[0, r]
+                rot[r, row + lane] = u[k, r]
 
 
 @nb.njit(**inlined)
@@ -253,7 +253,7 @@ def _table(
     s = cache_aligned(N_ROWS * LANES)
     rot = cache_aligned(len(geometry) * ROTOR).reshape(len(geometry), ROTOR)
     rotor_constants(theta, dt, rot, s)
-    rotors_start(u, rot)
+    rotors_start(u, 0, rot)
     s[A_S2 : A_S2 + 2 * HALF] = 0.0
     for k in range(len(u)):
         rotors_step(u, k, held, delayed, geometry, dt, rot, s)
