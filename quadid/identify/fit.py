@@ -30,6 +30,8 @@ Progress = Callable[[str, float], None]
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SWARM_SEGMENTS = 400
+SHORT_SEGMENTS = 3000
+"""Most short segments of the first polish, whose result only starts the last one."""
 SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
 """Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
 MOMENT_MISFIT = 1.5
@@ -140,6 +142,8 @@ def fit(
     if not options.polish:
         return _finish(short, theta, free_names, Convergence.BUDGET, evaluations)
     report("polish", 0.0)
+    if short.count > SHORT_SEGMENTS:
+        short = short.thinned(-(-short.count // SHORT_SEGMENTS))
     free = short.free(free_names)
     first = polish(short, theta, free, iterations=8)
     short.noise = residual_noise(short, first)

@@ -23,13 +23,25 @@ GROWS = 3.0
 """Growth of a channel's residual variance, from short segments to longer ones, that no sensor noise shows."""
 SHORT_SEGMENTS = 400
 """Most short segments the flexible model is fitted to at first."""
+LONG_SEGMENTS = 300
+"""Most longer segments it is fitted to afterwards: its parameters need no more."""
+MOST_SEGMENTS = 4000
+"""Most longer segments that the noise is measured on; they tell it to a thousandth."""
+_SETTLING = ("imu_lag.period", "rotor_drag.k_x")
 
 
-def residual_noise(shooting: Shooting, polished: Polished) -> NoiseModel:
-    """Noise from the residuals of a polish, all structure counted as noise (a starting point)."""
+def residual_noise(shooting: Shooting, polished: Polished, parameters: int | None = None) -> NoiseModel:
+    """Noise from the residuals of a polish, all structure counted as noise (a starting point).
+
+    Args:
+        shooting: the problem.
+        polished: its optimum.
+        parameters: how many were fitted to these data; by default those of the polish.
+    """
     lin = polished.lin
     used = float(lin.rows.sum())
-    freedom = max(used - lin.gram.shape[1], 1.0) / max(used, 1.0)
+    fitted = lin.gram.shape[1] if parameters is None else parameters
+    freedom = max(used - fitted, 1.0) / max(used, 1.0)
     return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
 
 
@@ -96,12 +108,19 @@ def flexible_fit(
         tried.append((polish(few, start, few.free(names), iterations=iterations), few))
     first, few = min(tried, key=lambda t: t[0].cost)
     wide = few.free(names)
-    # All of them: the level of the noise decides every score and interval.
     brief = residual_noise(few, first)
-    longer = Shooting(windows, short.vehicle, SPECTRUM_SECONDS, brief, short.layout)
-    second = polish(longer, first.theta, wide, iterations=3)
-    longer.noise = residual_noise(longer, second)
+    longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
+    longer.local = ()
+    every = -(-longer.count // LONG_SEGMENTS)
+    second = polish(longer.thinned(every) if every > 1 else longer, first.theta, wide, iterations=3)
     simulated = (sum(t.iterations for t, _ in tried) + second.iterations) * (len(names) + 10)
+    if every > 1:
+        # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial
+        # states, so that segments are started and filters warmed up as for all.
+        settled = longer.free([n for n in _SETTLING if n in names])
+        second = polish(longer, second.theta, settled, iterations=3)
+        simulated += second.iterations * (len(settled.entries) + 10)
+    longer.noise = residual_noise(longer, second, len(names))
     # Noise does not grow with the length of a segment; what does is the model losing its way.
     if np.any(longer.noise.variance > GROWS * brief.variance):
         return Flexible(brief, first.theta, simulated)

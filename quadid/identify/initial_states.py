@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import accumulate
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +13,7 @@ FloatArray = NDArray[np.float64]
 
 LEAK_SECONDS = 8.0
 """Time in which dead-reckoned velocity is forgotten."""
+_BLOCK = 256
 
 
 def first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray:
@@ -40,8 +39,15 @@ def dead_reckoning(window: Window) -> FloatArray:
     acceleration = f + 2.0 * (w * cross + np.cross(v, cross)) + np.array([0.0, 0.0, GRAVITY])
     acceleration[~good] = 0.0
     keep = float(np.exp(-window.dt / LEAK_SECONDS))
-    steps = (window.dt * acceleration).T.tolist()
-    return np.column_stack([list(accumulate(column, lambda v, step: keep * v + step)) for column in steps])
+    out = window.dt * acceleration
+    # v_k = keep v_k-1 + step_k, a block of rows at a time: there keep^-k is a number of moderate size.
+    fading = keep ** np.arange(_BLOCK)[:, None]
+    for first in range(0, n, _BLOCK):
+        part = out[first : first + _BLOCK]
+        if first:
+            part[0] += keep * out[first - 1]
+        part[:] = np.cumsum(part / fading[: len(part)], axis=0) * fading[: len(part)]
+    return np.asarray(out)
 
 
 def retract(x0: FloatArray, da: FloatArray) -> FloatArray:

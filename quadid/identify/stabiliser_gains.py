@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 
 EXPLAINED = 0.9
 """Least share of the variance of every command that the law must explain to be believed."""
+TRIAL_ROWS = 6000
+"""Rows of the first window on which a law is tried before it is fitted to all."""
 SHORTEST = 500
 """Rows needed for an answer."""
 FAST = 4
@@ -77,11 +79,15 @@ def find_autopilot(windows: Sequence[Window], vehicle: Vehicle) -> Autopilot | N
     throttle, ceiling = _throttle(rows)
     positions = vehicle.rotor_positions
     arms = (-b * positions[:, 1], b * positions[:, 0], d * vehicle.spins)
+    # The first minutes tell whether it runs faster than the log, and the gains to begin with.
+    some = [_Rows(*(values[:TRIAL_ROWS] for values in rows[0]))] if len(rows[0].rate) >= SHORTEST else rows
     found = []
     for late in (False, True):
-        axes = [_fit_axis(rows, axis, arms[axis], late) for axis in range(3)]
+        axes = [_fit_axis(some, axis, arms[axis], late) for axis in range(3)]
         found.append((min(a.explained for a in axes), late, axes))
     _, late, axes = max(found, key=lambda f: f[0])
+    if sum(len(r.rate) for r in rows) > sum(len(r.rate) for r in some):
+        axes = [_fit_axis(rows, axis, arms[axis], late, axes[axis]) for axis in range(3)]
     explained = (throttle, *(a.explained for a in axes))
     if not min(explained) >= EXPLAINED:
         return None
@@ -154,8 +160,13 @@ def _explained(values: FloatArray, told: FloatArray) -> float:
     return 1.0 - float(np.sum((values - told) ** 2)) / spread if spread > 0.0 else 0.0
 
 
-def _fit_axis(rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool) -> _Axis:
-    """Fits one axis; `late`: a row's command, the mean of faster ones, follows what is measured half a row later."""
+def _fit_axis(
+    rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool, known: _Axis | None = None
+) -> _Axis:  # fmt: skip
+    """Fits one axis, from what is known if anything.
+
+    With `late`, a row's command, the mean of faster ones, follows what is measured half a row later.
+    """
     error, rate, torque = [], [], []
     for r in rows:
         e, w = r.error[:, axis], r.rate[:, axis]
@@ -182,11 +193,15 @@ def _fit_axis(rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool) -> 
     start = np.concatenate([np.log([4.0, 1.0, 1.0, 3.0]), np.zeros(len(rows))])
     # The guesses of both rate gains follow from the size of the commands.
     start[1:3] += np.log(scale / max(float(np.std(told(start))), 1e-12))
+    if known is not None and min(known[:4]) > 0.0:
+        start[:4] = np.log(known[:4])
+    evaluations = 60 if known is None else 20  # it begins near its end
     bounds = np.full((2, len(start)), 20.0) * np.array([[-1.0], [1.0]])
     bounds[1, 3] = np.log(_NO_LIMIT)
+    start[:4] = np.clip(start[:4], bounds[0, :4] + 1e-6, bounds[1, :4] - 1e-6)
     from scipy.optimize import least_squares  # slow to import, and many logs hold no references
 
-    found = least_squares(residual, start, bounds=bounds, loss="soft_l1", max_nfev=60)
+    found = least_squares(residual, start, bounds=bounds, loss="soft_l1", max_nfev=evaluations)
     p, rate_p, rate_i, limit = np.exp(found.x[:4])
     asked = p * max(float(np.max(np.abs(e))) for e in error)
     if asked <= limit:
