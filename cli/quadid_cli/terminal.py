@@ -34,9 +34,10 @@ def console(quiet: bool = False, stderr: bool = False, markup: bool = False) -> 
 
 
 def warn(messages: tuple[str, ...] | list[str]) -> None:
-    """Prints warnings on stderr, one line each."""
+    """Prints warnings on stderr, one line each, without control characters that a name in a log may hold."""
     for message in messages:
-        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        line = " ".join(str(message).split())
+        print(f"warning: {''.join(c if c.isprintable() else '?' for c in line)}", file=sys.stderr)
 
 
 @contextmanager

@@ -111,9 +111,7 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
 
 
-def assemble(
-    name: str, kind: str, raw: Sequence[RawChannel], clock: LogClock, notes: Sequence[str], sha256: str
-) -> Recording:
+def assemble(name: str, kind: str, raw: Sequence[RawChannel], clock: LogClock, notes: Sequence[str]) -> Recording:
     """Cleans the channels and makes the recording; of several sources of one channel the first usable one is kept.
 
     Raises:
@@ -133,7 +131,7 @@ def assemble(
             "see docs/logs.md for the messages that are read",
         )  # fmt: skip
     warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
-    return Recording(name, kind, channels, tuple(clock.breaks), warnings, sha256)
+    return Recording(name, kind, channels, tuple(clock.breaks), warnings)
 
 
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:

@@ -17,6 +17,7 @@ from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble
 from quadid_replay.frames import from_euler
+from quadid_replay.plain import plain
 from quadid_replay.recognise import HEAD_BYTES, header_line
 
 FloatArray = NDArray[np.float64]
@@ -33,9 +34,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
 EULER = ("phi", "theta", "psi")
 _ROTOR = {"rotor_speed": re.compile(r"w([1-9]\d?)"), "motor_command": re.compile(r"u([1-9]\d?)")}
 _LINES = 4096
+LONGEST_LINE = 1 << 20
+"""Characters; a row of numbers has some hundreds."""
 
 
-def read_csv(path: Path, sha256: str = "") -> Recording:
+def read_csv(path: Path) -> Recording:
     """Reads a CSV log.
 
     Raises:
@@ -47,7 +50,7 @@ def read_csv(path: Path, sha256: str = "") -> Recording:
     if len(table) == 0:
         raise LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
     if ignored:
-        notes.append(f"columns not used: {', '.join(ignored)} ({nearest(ignored[0], _known())})")
+        notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
     clock = LogClock()
     t, accepted = clock.times(table[:, names.index("t")])
     refused = len(t) - int(np.count_nonzero(accepted))
@@ -60,7 +63,7 @@ def read_csv(path: Path, sha256: str = "") -> Recording:
             notes += _suspect_degrees(values)
             values = from_euler(values)
         raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(columns), refused))
-    recording = assemble(path.name, "csv", raw, clock, notes, sha256)
+    recording = assemble(path.name, "csv", raw, clock, notes)
     return replace(recording, grid=_uniform_step(recording.channels))
 
 
@@ -81,7 +84,7 @@ def _header(path: Path) -> tuple[list[str], str]:
     names = [cell.strip().strip('"') for cell in line.split(delimiter)]
     doubles = sorted({n for n in names if names.count(n) > 1})
     if doubles:
-        raise LogError(f"{path.name}: column {', '.join(doubles)} appears twice", "each column once")
+        raise LogError(f"{path.name}: column {plain(', '.join(doubles))} appears twice", "each column once")
     if "t" not in names:
         raise LogError(f"{path.name}: no column t among {', '.join(names)[:120]}", "a column t with the time [s]")
     return names, delimiter
@@ -148,7 +151,12 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[str], bool]]:
     lines: list[str] = []
     seen_header, first, last = False, 0, ""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, last in enumerate(file, 1):
+        for number, last in enumerate(iter(lambda: file.readline(LONGEST_LINE), ""), 1):
+            if len(last) == LONGEST_LINE:
+                raise LogError(
+                    f"{path.name}: line {number} is longer than {LONGEST_LINE >> 20} MiB", "one row of numbers a line",
+                    "check the export, or whether the file is text at all",
+                )  # fmt: skip
             if not last.strip() or last.lstrip().startswith("#"):
                 continue
             if not seen_header:

@@ -36,7 +36,7 @@ class _Source(NamedTuple):
     refused: int
 
 
-def read_dataflash(path: Path, sha256: str = "") -> Recording:
+def read_dataflash(path: Path) -> Recording:
     """Reads a DataFlash log, whole or damaged.
 
     Raises:
@@ -56,7 +56,7 @@ def read_dataflash(path: Path, sha256: str = "") -> Recording:
         *_outputs(index, times, parameters),
         *_esc(index, times, parameters),
     ]
-    return assemble(path.name, "dataflash", raw, clock, _damage(index), sha256)
+    return assemble(path.name, "dataflash", raw, clock, _damage(index))
 
 
 def _damage(index: DataflashIndex) -> list[str]:
@@ -225,7 +225,7 @@ def _frame(index: DataflashIndex) -> str:
 def _esc(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
     """ESC telemetry comes one motor at a time; instances are output columns."""
     number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
-    if number is None or not index.has("ESC", "RPM"):
+    if number is None or "ESC" not in times or not index.has("ESC", "RPM"):
         return []
     instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
     motors = ardupilot_motor_outputs(parameters, _frame(index)) or sorted({int(i) for i in instance})

@@ -1,6 +1,7 @@
 """Frames and units at the door of the core: ROS (ENU, FLU) and degrees become NED, FRD and SI.
 
-All functions take arrays with one sample a row and return new arrays.
+All functions take arrays with one sample a row and return new arrays.  Rows that are not finite (damage) come out as
+not finite and are dropped further on.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ def flip_attitude(q: FloatArray) -> FloatArray:
 def from_euler(angles: FloatArray) -> FloatArray:
     """Turns roll, pitch, yaw [rad] (z-y-x), shape (n, 3), into quaternions wxyz body to world, shape (n, 4)."""
     half = 0.5 * angles
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half).T, np.sin(half).T
+    with np.errstate(invalid="ignore"):
+        (cr, cp, cy), (sr, sp, sy) = np.cos(half).T, np.sin(half).T
     return np.column_stack(
         [
             cr * cp * cy + sr * sp * sy,
@@ -52,9 +54,10 @@ def from_euler(angles: FloatArray) -> FloatArray:
 def to_euler(q: FloatArray) -> FloatArray:
     """Turns quaternions wxyz, shape (n, 4), into roll, pitch, yaw [rad], shape (n, 3)."""
     w, x, y, z = q.T
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    with np.errstate(over="ignore", invalid="ignore"):
+        roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return np.column_stack([roll, pitch, yaw])
 
 

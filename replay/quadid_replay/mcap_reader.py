@@ -6,6 +6,7 @@ import contextlib
 import io
 import struct
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,9 +20,11 @@ from quadid.window import Recording
 from quadid_replay.cdr_blocks import BlockReader, Read
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
+from quadid_replay.definition_check import DefinitionError, check_definition
 from quadid_replay.mcap_messages import SIGNALS, TYPES, MessageType, type_name
 from quadid_replay.mcap_records import McapFile, Topic
 from quadid_replay.motors import active_outputs
+from quadid_replay.plain import plain
 from quadid_replay.presets import AUTO, preset_rank
 
 _EPOCH_NS = 10**17
@@ -62,12 +65,11 @@ class _Stamps:
         return self.clock.time(stamped + offset)
 
 
-def read_mcap(path: Path, sha256: str = "", preset: str = AUTO) -> Recording:
+def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     """Reads a ROS 2 MCAP log, whole or damaged.
 
     Args:
         path: the file.
-        sha256: hash of its bytes.
         preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
 
     Raises:
@@ -77,14 +79,14 @@ def read_mcap(path: Path, sha256: str = "", preset: str = AUTO) -> Recording:
     notes: list[str] = []
     sources = _sources(file, preset, notes)
     if not sources:
-        raise _no_topic(path, file, preset)
+        raise _no_topic(path, file, preset, notes)
     columns, stamps, failed = _decode(file, sources)
     notes = [*file.damage(), *notes]
     if failed:
         notes.append(f"{failed} messages could not be decoded and were dropped")
     if stamps.base_ns:
         notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
-    return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes, sha256)
+    return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
 
 
 def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source]:
@@ -98,13 +100,24 @@ def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source
         if all(rank is None for rank in listed):
             continue
         try:
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):  # it prints
-                decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+            decode = _decoder(topic.type, topic.definition)
+        except DefinitionError as error:
+            notes.append(f"{topic.name}: its message definition is damaged ({error}): not used")
+            continue
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
         sources[number] = _Source(topic, kind, _reader(kind, decode))
     return sources
+
+
+@lru_cache(maxsize=64)
+def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
+    """The library's decoder of a type; making one costs more than decoding a hundred messages."""
+    check_definition(definition)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):  # it prints
+        decode: Callable[[bytes], Any] = generate_dynamic(kind, definition)[kind]
+    return decode
 
 
 def _reader(kind: MessageType, decode: Callable[[bytes], Any]) -> Callable[[bytes], Read]:
@@ -135,6 +148,9 @@ def _decode(file: McapFile, sources: dict[int, _Source]) -> tuple[dict[tuple[int
         t = stamps.time(group, message.seconds, message.nanoseconds, log_time)
         for name, values in signals:
             kept = columns.get((number, name))
+            if len(values) == 0:
+                failed += 1
+                continue
             if kept is None:
                 kept = columns[number, name] = Columns(len(values))
             if len(values) == kept.width:
@@ -192,9 +208,9 @@ def _repeats(entry: RawChannel) -> bool:
     return len(fresh_rows(entry.values)) < 0.9 * len(entry.values)
 
 
-def _no_topic(path: Path, file: McapFile, preset: str) -> LogError:
-    found = ", ".join(f"{t.name} [{type_name(t.type) or t.encoding}]" for t in list(file.topics.values())[:8])
-    damage = "; ".join(file.damage())
+def _no_topic(path: Path, file: McapFile, preset: str, notes: list[str]) -> LogError:
+    found = ", ".join(f"{t.name} [{type_name(t.type) or t.encoding}]" for t in list(file.topics.values())[:5])
+    damage = plain("; ".join([*file.damage(), *notes[:4]]), 600)
     reason = f" ({damage})" if damage else ""
     return LogError(
         f"{path.name}: no topic to read with preset '{preset}' among: {found or 'none'}{reason}",

@@ -22,6 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 
 from quadid.errors import LogError
+from quadid_replay.plain import plain
 
 MAGIC = b"\x89MCAP0\r\n"
 RATIO, FLOOR, CEILING = 200, 64 << 20, 4 << 30
@@ -34,7 +35,7 @@ _FOOTER_SIZE = 9 + 20 + len(MAGIC)
 
 
 class Topic(NamedTuple):
-    """One channel of the file."""
+    """One channel of the file; name, type and encoding are fit to be shown."""
 
     name: str
     type: str
@@ -81,7 +82,7 @@ class McapFile:
             schema = self._schemas.get(channel.schema_id)
             text = schema.data.decode("utf-8", "replace") if schema else ""
             kind = schema.name if schema and schema.encoding == "ros2msg" else ""
-            out[number] = Topic(channel.topic, kind, text, channel.message_encoding)
+            out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding))
         return out
 
     def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:

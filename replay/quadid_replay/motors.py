@@ -13,6 +13,7 @@ RPM = 2.0 * np.pi / 60.0
 """One revolution per minute [rad/s]."""
 _LOWEST_PULSE, _HIGHEST_PULSE = 700.0, 2300.0
 _FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8, "OCTAQUAD": 8, "OCTA_QUAD": 8, "DODECAHEXA": 12}
+_MOST_ROTORS, _LARGEST_WHOLE = 12, 1e9
 _PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
 
 
@@ -27,7 +28,7 @@ def ardupilot_motor_outputs(parameters: Mapping[str, float], frame: str = "") ->
     """
     motors: dict[int, int] = {}
     for output in range(1, 33):
-        function = int(parameters.get(f"SERVO{output}_FUNCTION", 0))
+        function = _whole(parameters, f"SERVO{output}_FUNCTION")
         if 33 <= function <= 40:
             motors[function - 33] = output - 1
         elif 82 <= function <= 85:
@@ -48,7 +49,7 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
     """
     motors = {}
     for output in range(1, 17):
-        function = int(parameters.get(f"PWM_{bank}_FUNC{output}", 0))
+        function = _whole(parameters, f"PWM_{bank}_FUNC{output}")
         if 101 <= function <= 112:
             motors[function - 101] = output - 1
     return [motors[i] for i in range(len(motors))] if sorted(motors) == list(range(len(motors))) else []
@@ -56,8 +57,14 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
-    count = int(parameters.get("CA_ROTOR_COUNT", 0))
-    return count or _PX4_TYPES.get(int(parameters.get("MAV_TYPE", 0)), 0)
+    count = _whole(parameters, "CA_ROTOR_COUNT")
+    return count if 0 < count <= _MOST_ROTORS else _PX4_TYPES.get(_whole(parameters, "MAV_TYPE"), 0)
+
+
+def _whole(parameters: Mapping[str, float], name: str) -> int:
+    """A parameter as a whole number; 0, which tells nothing, where it is absent or damaged beyond any number."""
+    value = parameters.get(name, 0.0)
+    return int(value) if abs(value) < _LARGEST_WHOLE else 0
 
 
 def active_outputs(pulses: FloatArray) -> list[int]:

@@ -3,37 +3,61 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from quadid.errors import LogError
 from quadid.window import Recording
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
+LARGE: Mapping[Format, int] = MappingProxyType(
+    {"mcap": 4 << 20, "tlog": 64 << 20, "dataflash": 64 << 20, "ulog": 64 << 20, "csv": 64 << 20}
+)
+"""Files of this size [bytes] are read in a child process with limits; MCAP earlier, because it may inflate."""
+
 
 def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
+
+    A large one (`LARGE`) is read in a child process with limited memory and time, see `quadid_replay.reading`.
 
     Args:
         path: the file; its format is told by its content, never by its suffix.
         preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
 
     Raises:
-        LogError: no such file, a directory, an empty file, an unknown format, or nothing readable in it.
+        LogError: no such file, a directory, an empty file, an unknown format, nothing readable in it, or a file whose
+            reading takes more memory or time than is allowed.
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    head, sha256 = _head_and_hash(file)
-    kind = recognise(head, file.name)
-    if kind == "mcap":
-        from quadid_replay.mcap_reader import read_mcap
+    kind = recognise(_head(file), file.name)
+    if file.stat().st_size >= LARGE[kind]:
+        from quadid_replay.reading import read_in_child
 
-        return read_mcap(file, sha256, preset)
-    return _reader(kind)(file, sha256)
+        return read_in_child(file, preset)
+    return read_here(file, preset)
 
 
-def _reader(kind: Format) -> Callable[[Path, str], Recording]:
+def read_here(file: Path, preset: str) -> Recording:
+    """Reads a log in this process, whatever its size; else as `open_log`."""
+    kind = recognise(_head(file), file.name)
+    try:
+        if kind == "mcap":
+            from quadid_replay.mcap_reader import read_mcap
+
+            recording = read_mcap(file, preset=preset)
+        else:
+            recording = _reader(kind)(file)
+        return replace(recording, sha256=_sha256(file))
+    except OSError as error:
+        raise _unreadable(file, error) from error
+
+
+def _reader(kind: Format) -> Callable[[Path], Recording]:
     """Imports only the library that this format needs."""
     if kind == "csv":
         from quadid_replay.csv_reader import read_csv as read
@@ -46,20 +70,26 @@ def _reader(kind: Format) -> Callable[[Path, str], Recording]:
     return read
 
 
-def _head_and_hash(file: Path) -> tuple[bytes, str]:
-    if file.is_dir():
-        raise LogError(f"{file} is a directory", ALLOWED, "name one log file; for a folder use `quadid fleet`")
-    if file.exists() and not file.is_file():
-        raise LogError(f"{file} is no regular file", ALLOWED, "copy what it yields to a file first")
-    digest = hashlib.sha256()
-    head = b""
+def _head(file: Path) -> bytes:
     try:
+        if file.is_dir():
+            raise LogError(f"{file} is a directory", ALLOWED, "name one log file; for a folder use `quadid fleet`")
+        if file.exists() and not file.is_file():
+            raise LogError(f"{file} is no regular file", ALLOWED, "copy what it yields to a file first")
         with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                head = head or block[:HEAD_BYTES]
-                digest.update(block)
+            return stream.read(HEAD_BYTES)
     except FileNotFoundError as error:
         raise LogError(f"no file {file}", ALLOWED, "check the path") from error
     except OSError as error:
-        raise LogError(f"{file} cannot be read ({error.strerror})", ALLOWED, "check its permissions") from error
-    return head, digest.hexdigest()
+        raise _unreadable(file, error) from error
+    except ValueError as error:  # a NUL in its name
+        raise LogError(f"no file {str(file)!r}", ALLOWED, "check the path") from error
+
+
+def _unreadable(file: Path, error: OSError) -> LogError:
+    return LogError(f"{file} cannot be read ({error.strerror})", ALLOWED, "check its permissions")
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -5,6 +5,8 @@ Names are relative: they match a topic that ends with them, so that a namespace 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from quadid.errors import LogError, nearest
 
 PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -63,6 +65,7 @@ PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
 AUTO = "auto"
 
 
+@lru_cache(maxsize=1024)
 def preset_rank(preset: str, channel: str, topic: str) -> int | None:
     """Returns the place of a topic in a preset's list for a channel; None when it is not in it.
 

@@ -111,7 +111,7 @@ class _VehicleLog:
                 columns.add(started, row)
 
 
-def read_tlog(path: Path, sha256: str = "") -> Recording:
+def read_tlog(path: Path) -> Recording:
     """Reads a telemetry log, whole or damaged; of several vehicles the one that tells most.
 
     Raises:
@@ -143,7 +143,7 @@ def read_tlog(path: Path, sha256: str = "") -> Recording:
     if others:
         notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")
     raw = _channels(vehicles[who], notes)
-    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, sha256)
+    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes)
 
 
 def _notes(count: FrameCount, bad: int, size: int) -> list[str]:

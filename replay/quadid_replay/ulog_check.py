@@ -13,6 +13,7 @@ from io import BytesIO
 from pathlib import Path
 
 from quadid.errors import LogError
+from quadid_replay.plain import plain
 
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
 _DEFINITIONS = frozenset(b"FP")
@@ -150,7 +151,7 @@ def _check_sizes(found: UlogRecords, path: str) -> None:
     for name in found.formats:
         if _expanded(name, found.formats, {}, 0) > MOST_FIELDS:
             raise LogError(
-                f"{path}: message '{name[:40]}' expands to more than {MOST_FIELDS} numbers",
+                f"{path}: message '{plain(name, 40)}' expands to more than {MOST_FIELDS} numbers",
                 "messages as PX4 writes them", "this file is damaged or was made to harm: do not trust it",
             )  # fmt: skip
 

@@ -22,6 +22,7 @@ from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.plain import plain
 from quadid_replay.ulog_check import UlogRecords, collect_records
 
 FloatArray = NDArray[np.float64]
@@ -42,7 +43,7 @@ class _Log(NamedTuple):
     clock: LogClock
 
 
-def read_ulog(path: Path, sha256: str = "") -> Recording:
+def read_ulog(path: Path) -> Recording:
     """Reads a ULog, whole or damaged.
 
     Raises:
@@ -61,7 +62,7 @@ def read_ulog(path: Path, sha256: str = "") -> Recording:
         *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
         *_esc(log),
     ]
-    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), sha256)
+    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size))
 
 
 def _notes(records: UlogRecords, size: int) -> list[str]:
@@ -79,7 +80,7 @@ def _load(path: Path, records: UlogRecords) -> _Log:
             ulog = ULog(records.clean)
     except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, OSError) as error:
         raise LogError(
-            f"{path.name}: its definitions are damaged ({type(error).__name__}: {str(error)[:80]})",
+            f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
             "a PX4 ULog", "copy the file again from the vehicle",
         ) from error  # fmt: skip
     topics = {(d.name, d.multi_id): d.data for d in reversed(ulog.data_list)}

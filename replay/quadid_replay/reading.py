@@ -1,0 +1,118 @@
+"""Reads a large log in a child process with a limit of memory and time, so that no file can take the caller down.
+
+Small logs are read where they are asked for: the readers bound what they keep by what the file holds.  A large one, or
+an MCAP that may inflate, could still take more memory than there is; the child is stopped then and the log is refused.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from quadid.errors import LogError, QuadidError
+from quadid.window import Recording
+
+MEMORY, SECONDS = "QUADID_READ_MEMORY_MB", "QUADID_READ_SECONDS"
+"""Environment variables that override the limits."""
+LARGEST_MEMORY_MB = 8192
+LEAST_SECONDS, SECONDS_A_MIB = 60.0, 3.0
+_MIB = 1 << 20
+
+
+class Limits(NamedTuple):
+    """What reading one log may take: memory [MiB], time [s]."""
+
+    memory: int
+    seconds: float
+
+
+def limits(size: int) -> Limits:
+    """Limits for a file of `size` bytes: half of this machine's memory, at most 8 GiB, and 60 s plus 3 s a MiB.
+
+    Raises:
+        LogError: an environment variable that is no positive number.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // _MIB
+    memory = _given(MEMORY, float(min(machine // 2, LARGEST_MEMORY_MB)))
+    return Limits(int(memory), _given(SECONDS, LEAST_SECONDS + SECONDS_A_MIB * size / _MIB))
+
+
+def _given(name: str, otherwise: float) -> float:
+    text = os.environ.get(name, "")
+    if not text:
+        return otherwise
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e9:
+        raise LogError(f"{name}={text[:40]!r}", "a positive number", f"unset {name} or correct it")
+    return value
+
+
+def read_in_child(path: Path, preset: str) -> Recording:
+    """Reads a log as `quadid_replay.open_log` does, in a child process within `limits`.
+
+    Raises:
+        LogError: what the reader says; or the log needs more memory or time than the limits, which the error names.
+    """
+    allowed = limits(path.stat().st_size)
+    command = [sys.executable, "-m", __name__, str(path.absolute()), preset, str(allowed.memory)]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as child:
+        try:
+            answer, _ = child.communicate(timeout=allowed.seconds)
+        except subprocess.TimeoutExpired as error:
+            raise LogError(
+                f"{path.name}: reading it takes longer than {allowed.seconds:.0f} s", "logs that are read faster",
+                f"cut it into parts, or allow more time with {SECONDS}",
+            ) from error  # fmt: skip
+        finally:
+            child.kill()
+    try:
+        result = pickle.loads(answer)  # written by our own child
+    except (EOFError, pickle.UnpicklingError) as error:
+        raise _too_large(path, allowed, f" (the reader ended with {child.returncode})") from error
+    if isinstance(result, MemoryError):
+        raise _too_large(path, allowed)
+    if isinstance(result, tuple):
+        raise LogError(*result)
+    recording: Recording = result
+    # Made anew, because arrays lose their write protection on the way.
+    return replace(recording, channels={name: replace(channel) for name, channel in recording.channels.items()})
+
+
+def _too_large(path: Path, allowed: Limits, how: str = "") -> LogError:
+    return LogError(
+        f"{path.name}: reading it takes more than {allowed.memory} MiB of memory{how}", "logs that fit",
+        f"cut it into parts or drop topics that are not needed, or allow more with {MEMORY}",
+    )  # fmt: skip
+
+
+def _child(path: Path, preset: str, memory: int) -> None:
+    """What the child does: the answer goes to stdout, and whatever a library prints to stderr."""
+    from quadid_replay.opening import read_here
+
+    resource.setrlimit(resource.RLIMIT_DATA, (memory * _MIB, memory * _MIB))
+    with os.fdopen(os.dup(1), "wb") as out:
+        os.dup2(2, 1)
+        try:
+            result: object = read_here(path, preset)
+            answer = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+        except QuadidError as error:
+            answer = pickle.dumps((error.found, error.allowed, error.fix))
+        except MemoryError:
+            result = None
+            answer = pickle.dumps(MemoryError())
+        with contextlib.suppress(BrokenPipeError):  # the parent gave up
+            out.write(answer)
+
+
+if __name__ == "__main__":
+    _child(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

@@ -1,0 +1,80 @@
+"""The account of all fuzzing: which inputs were tried when, with how many findings; kept as JSON, shown as a page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.fuzz.formats import FORMATS
+
+GOAL = 1_000_000
+"""Inputs of each format that are wanted."""
+Run = dict[str, Any]
+
+
+def load(path: Path) -> dict[str, list[Run]]:
+    """Reads the runs by format; none where there is no account yet."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def next_input(runs: Sequence[Run]) -> int:
+    """The first number that no run has tried."""
+    return max((run["stop"] for run in runs), default=0)
+
+
+def note(runs: list[Run], run: Run) -> None:
+    """Adds a run; one that goes on where the last one of the same day and revision stopped is joined to it."""
+    last = runs[-1] if runs else None
+    if last and (last["stop"], last["date"], last["revision"]) == (run["start"], run["date"], run["revision"]):
+        for key in ("read", "refused", "findings", "seconds"):
+            last[key] += run[key]
+        last["stop"] = run["stop"]
+    else:
+        runs.append(run)
+
+
+def save(path: Path, book: Mapping[str, Sequence[Run]]) -> None:
+    """Writes the account, and beside it the page that shows it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(book, indent=1) + "\n", encoding="utf-8")
+    path.with_suffix(".md").write_text(page(book), encoding="utf-8")
+
+
+def page(book: Mapping[str, Sequence[Run]]) -> str:
+    """Markdown: counts by format, then every run."""
+    lines = [
+        "# Fuzzing of the binary readers",
+        "",
+        "Written by `make fuzz`. Small whole logs are mutated with knowledge of their format (bits, integers, records "
+        "lost, doubled, swapped or spliced, length fields, checksums repaired or not, cuts) and opened in process, "
+        "each under a guard of 5 s, 64 MiB of growth and 1 GiB in all. Allowed is a recording that keeps its promises "
+        "(finite values, rising times) or one line of a documented error; anything else, a warning of numpy included, "
+        "is a finding. Input number n is the same everywhere; findings become tests (`tests/fuzz/test_findings.py`).",
+        "",
+        f"Goal: {GOAL:,} inputs of each format.",
+        "",
+        "| format | inputs | of the goal | read | refused | findings | inputs/s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for kind in FORMATS:
+        runs = book.get(kind, [])
+        read, refused, findings = (sum(int(run[k]) for run in runs) for k in ("read", "refused", "findings"))
+        tried, seconds = sum(run["stop"] - run["start"] for run in runs), sum(run["seconds"] for run in runs)
+        rate = f"{tried / seconds:.0f}" if seconds else ""
+        lines.append(
+            f"| {kind} | {tried:,} | {tried / GOAL:.0%} | {read:,} | {refused:,} | {findings} | {rate} |"
+        )  # fmt: skip
+    lines += [
+        "",
+        "## Runs",
+        "",
+        "| format | inputs from | to | findings | date | revision |",
+        "|---|---|---|---|---|---|",
+    ]
+    for kind in FORMATS:
+        for run in book.get(kind, []):
+            span = f"{run['start']:,} | {run['stop'] - 1:,}"
+            lines.append(f"| {kind} | {span} | {run['findings']} | {run['date']} | {run['revision']} |")
+    return "\n".join(lines) + "\n"

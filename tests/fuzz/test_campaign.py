@@ -1,0 +1,85 @@
+"""A short campaign over each reader, the guards themselves, and the account of what was tried."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import quadid_replay
+
+from quadid.errors import LogError
+from quadid.window import Recording
+from tests.faults.evidence import Happened
+from tests.fuzz import book, campaign
+from tests.fuzz.formats import FORMATS
+from tests.fuzz.seeds import seeds
+
+COUNT = 400
+FROM = 10**9
+"""Numbers that `make fuzz` does not reach: these inputs are others than those of the page."""
+ROW = {"mcap": 1, "tlog": 3, "dataflash": 3, "ulog": 4}
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_mutated_logs_are_read_or_refused_in_one_line(kind: str, happened: Happened) -> None:
+    outcome = campaign.run(kind, FROM, COUNT)
+    assert outcome.findings == ()
+    assert outcome.read > 0.1 * COUNT
+    assert outcome.refused > 0.05 * COUNT
+    happened(
+        ROW[kind],
+        f"{COUNT} {kind} logs mutated in records, lengths and checksums, each under time and memory guard: "
+        f"{outcome.read} read, {outcome.refused} refused with a reason, nothing else",
+    )
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_seeds_are_whole_logs_whose_records_are_known(kind: str) -> None:
+    for seed in seeds(kind):
+        assert b"".join(FORMATS[kind].split(seed)) == seed
+    assert campaign.input_of(kind, 7) == campaign.input_of(kind, 7)
+    assert len({campaign.input_of(kind, n) for n in range(50)}) > 40
+
+
+def _greedy(path: Path) -> Recording:
+    bytearray(campaign.LIMIT)
+    raise AssertionError("the limit did not hold")
+
+
+def _slow(path: Path) -> Recording:
+    while time.process_time() < 1e9:
+        pass
+    raise AssertionError("the guard did not strike")
+
+
+def _growing(path: Path) -> Recording:
+    keep = bytearray(b"x") * (campaign.GROWTH + (16 << 20))
+    raise LogError(f"{len(keep)} bytes taken")
+
+
+@pytest.mark.parametrize(
+    ("reader", "word"), [(_greedy, "MemoryError"), (_slow, "more than 0.2 s"), (_growing, "MiB more")]
+)
+def test_guards_strike(monkeypatch: pytest.MonkeyPatch, reader: object, word: str) -> None:
+    monkeypatch.setattr(campaign, "open_log", reader)
+    if reader is _slow:
+        monkeypatch.setattr(campaign, "SECONDS", 0.2)
+    (finding,) = campaign.run("tlog", FROM, 1).findings
+    assert word in finding.what
+    assert signal.getitimer(signal.ITIMER_PROF)[0] == 0.0
+    assert quadid_replay.open_log is not reader
+
+
+def test_the_account_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    path = tmp_path / "fuzz.json"
+    entry = {"read": 1, "refused": 1, "findings": 0, "seconds": 1.0, "date": "2026-01-01", "revision": "abc"}
+    account = book.load(path)
+    for start in (0, 10, 20):
+        runs = account.setdefault("mcap", [])
+        assert book.next_input(runs) == start
+        book.note(runs, {**entry, "start": start, "stop": start + 10, "date": f"2026-01-0{1 + start // 20}"})
+    book.save(path, account)
+    assert [run["stop"] for run in book.load(path)["mcap"]] == [20, 30]
+    assert "| mcap | 30 |" in path.with_suffix(".md").read_text(encoding="utf-8")

@@ -1,0 +1,86 @@
+"""What fuzzing has found, each as the smallest log that shows it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quadid_replay import open_log
+from quadid_replay.frames import from_euler, to_euler
+from quadid_replay.motors import ardupilot_motor_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.schemas import schema_text
+
+from quadid.errors import LogError
+from tests.faults.evidence import Happened
+from tests.fuzz.seeds import mcap_of
+from tests.replay.test_dataflash import Dataflash
+from tests.replay.test_mcap import header
+
+
+def opened(tmp_path: Path, data: bytes) -> Path:
+    path = tmp_path / "log"
+    path.write_bytes(data)
+    return path
+
+
+def test_a_message_whose_list_of_numbers_is_empty_is_no_sample(tmp_path: Path) -> None:
+    kind = "quadid_msgs/msg/MotorCommand"
+    empty = mcap_of([("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": []})], True)
+    with pytest.raises(LogError, match="no usable flight data.*4 messages could not be decoded"):
+        open_log(opened(tmp_path, empty))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "uint8 POWER_SUPPLY_HEALTH_UNSPEC_FAILURE_AND_SO_ON__X=1",  # exponential in the library's pattern
+        "uint8 " + "A" * 100 + "!=1",
+        "float64[4000000000] x",
+        "Nothing[2000000000] x\n=====\nMSG: quadid_msgs/Nothing\n# no field",
+        "float64 " + "x" * 200_000,
+    ],
+)
+def test_definitions_made_to_stall_the_parser_are_refused_at_once(
+    tmp_path: Path, line: str, happened: Happened
+) -> None:
+    kind = "quadid_msgs/msg/MotorCommand"
+    good = schema_text(kind)
+    first, rest = good.split("=" * 80, 1)
+    message = ("motor_command", kind, good, lambda ns: {"header": header(ns), "values": [0.5] * 4})
+    assert open_log(opened(tmp_path, mcap_of([message], True))).channels
+    hostile = opened(tmp_path, mcap_of([message], True, shown=f"{first}{line}\n{'=' * 80}{rest}"))
+    began = time.process_time()
+    with pytest.raises(LogError, match="no topic.*definition is damaged"):
+        open_log(hostile)
+    seconds = time.process_time() - began
+    happened(5, f"MCAP definition '{line[:24]}…', which stalls the library, refused after {seconds:.2f} s of CPU")
+
+
+def test_esc_records_without_a_stamp_are_not_used(tmp_path: Path) -> None:
+    log = Dataflash()
+    log.describe(2, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    log.describe(3, "ESC", "QBf", "TimeXS,Instance,RPM")
+    for k in range(10):
+        log.add("IMU", 1_000_000 + 20_000 * k, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8)
+        log.add("ESC", 1_000_000 + 20_000 * k, 0, 6000.0)
+    assert set(open_log(opened(tmp_path, bytes(log.data))).channels) == {"gyro", "accel"}
+
+
+def test_parameters_that_are_no_numbers_tell_nothing() -> None:
+    damaged = {"SERVO1_FUNCTION": float("nan"), "PWM_MAIN_FUNC1": float("inf"), "MAV_TYPE": float("-inf")}
+    assert ardupilot_motor_outputs(damaged) == []
+    assert px4_motor_outputs(damaged, "MAIN") == []
+    assert px4_rotor_count(damaged) == 0
+    for count in (-3.0, 0.5, 1e9, 2.0**100, float("nan")):
+        assert px4_rotor_count({"CA_ROTOR_COUNT": count, "MAV_TYPE": 13.0}) == 6
+
+
+def test_attitudes_that_are_no_numbers_pass_without_a_warning() -> None:
+    bad = np.array([[np.inf, np.nan, 0.0, 1e300], [1e200, 1e200, 1e200, 1e200]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not np.isfinite(to_euler(bad)[0]).all()
+        assert not np.isfinite(from_euler(bad[:1, :3])).all()
