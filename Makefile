@@ -75,7 +75,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed
+.PHONY: truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -108,6 +108,9 @@ control: venv ## tracking with guessed, identified, extended and true parameters
 
 kernel-speed: venv ## nanoseconds per particle and step
 	$(STUDY) benchmarks.kernel --out docs/results
+
+bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (half an hour on an idle machine)
+	$(STUDY) benchmarks.speed --out docs/results
 
 # --- check
 

@@ -275,9 +275,12 @@ class Shooting:
             out, steps = self._roll_directions(rollout, segments, theta, free, self.states(n_pre)[i], n_pre, k)
             weights = _weights(rollout, segments, self.channels)
             lanes = out[..., : self.channels, :].transpose(1, 2, 3, 0, 4).reshape(*weights.shape, -1)
-            base = lanes[..., :1]
-            moved = (lanes[..., 1 : 1 + len(steps)] - base) / steps
-            white = self.whiten(np.concatenate([moved, base], axis=3), weights)
+            del out  # of a long log each of these is a large part of all memory
+            base = lanes[..., :1].copy()
+            rows = np.concatenate([(lanes[..., 1 : 1 + len(steps)] - base) / steps, base], axis=3)
+            del lanes
+            white = self.whiten(rows, weights)
+            del rows
             flat = white.reshape(len(white), -1, len(steps) + 1)
             ridge = np.repeat(np.diag(1.0 / _RIDGE[:k])[None], len(flat), axis=0)
             basis = np.linalg.qr(np.concatenate([flat[..., :k], ridge], axis=1))[0][:, :-k]

@@ -1,0 +1,176 @@
+"""The measured speeds as a page for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+Result = Mapping[str, Any]
+
+INTRODUCTION = (
+    "Cases of a table run in turn, round by round; medians, quartiles in brackets. Other programs share the machine, "
+    "so ratios within a table mean more than its seconds; processor time is that of all threads and child processes. "
+    "Every number is in `speed.json`."
+)
+
+
+def page(results: Result) -> str:
+    """Markdown of all parts that were measured."""
+    out = ["# Speed", "", "`make bench`, that is `python -m benchmarks.speed --out docs/results`", "", INTRODUCTION, ""]
+    for name, (title, write) in PARTS.items():
+        found = results.get(name)
+        out += [f"## {title}", ""]
+        if found is None:
+            out += ["Not measured.", ""]
+            continue
+        out += [*write(found), "", f"_{_machine(found['machine'])}_", ""]
+    return "\n".join(out)
+
+
+def _machine(m: Result) -> str:
+    versions = ", ".join(f"{name} {number}" for name, number in m["versions"].items())
+    return f"{m['date']}; {m['processor']}, {m['cores']} cores, load {m['load']:.1f}; Python {m['python']}, {versions}"
+
+
+def _times(found: Result, extra: Callable[[str, Result], str] | None = None, head: str = "") -> list[str]:
+    rows = [f"| what | wall [s] | processor [s] |{head}", "|---|---|---|" + "---|" * head.count("|")]
+    for name, t in found["times"].items():
+        low, high = t["wall_quartiles"]
+        more = extra(name, t) if extra else ""
+        rows.append(f"| {name} | {t['wall']:.3g} ({low:.3g} … {high:.3g}) | {t['processor']:.3g} |{more}")
+    return rows
+
+
+def _kernel(r: Result) -> list[str]:
+    rows = [
+        "| nanoseconds per particle and step | one core (processor time) | both cores (wall, best) |",
+        "|---|---|---|",
+    ]
+    for t in r["timings"]:
+        one, both = t["one_core"], t["all_cores"]
+        rows.append(
+            f"| {t['name']} | {one['median']:.1f} ({one['low']:.1f} … {one['high']:.1f}) | {both['least']:.1f} |"
+        )
+    rows += [f"| {name} | {t['median']:.0f} ({t['low']:.0f} … {t['high']:.0f}) | |" for name, t in r["numpy"].items()]
+    return [
+        *rows, "",
+        f"Measured peak of one core: {r['fma_per_ns']:.1f} fused multiply-adds of float64 per ns. The nominal rollout "
+        f"does {r['operations']} operations a step, which is {r['share_of_peak']:.0%} of that peak "
+        f"({r['share_of_peak_best']:.0%} in the best runs). The same step in NumPy at its best takes "
+        f"{r['gain_over_numpy']:.0f} times as long; the full equations take {r['extended_over_nominal']:.1f} times the "
+        "nominal. All in float64: there is no float32 kernel.",
+    ]  # fmt: skip
+
+
+def _instructions(r: Result) -> list[str]:
+    rows = [
+        "Machine code of one Runge-Kutta step for one vector of lanes (a loop over lanes without branches):", "",
+        "| step | register [bit] | instructions | arithmetic | of it fused | moves | with memory operand "
+        "| divisions, roots |", "|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, c in r["steps"].items():
+        cells = (
+            "register_bits",
+            "instructions",
+            "arithmetic",
+            "fused",
+            "moves",
+            "memory_operands",
+            "divisions_and_roots",
+        )
+        rows.append(f"| {name} | {' | '.join(str(c[key]) for key in cells)} |")
+    return [
+        *rows, "",
+        "Nearly all of it is arithmetic on full-width registers, and about half of that is fused: the arithmetic units "
+        "are the limit of the steps. Between them and the peak stand sums that are not fused, loads and stores of "
+        "states for which no register is left, and for the full equations divisions and roots, which take many cycles "
+        "each; the rollout adds rotors, sensors and the writing of residuals.",
+    ]  # fmt: skip
+
+
+def _peers(r: Result) -> list[str]:
+    return [
+        f"{r['particles']} particles, {r['evaluations']} evaluations over all {r['samples']} samples; the NumPy "
+        f"objective is the same simulation, weights and projection (costs agree to "
+        f"{max(abs(1.0 - c) for c in r['cost_ratio']):.1e}).", "",
+        *_times(r, lambda n, t: f" {t['ms_per_evaluation']:.3g} |", " ms per evaluation |"), "",
+        f"pyswarms with a vectorised NumPy objective takes {r['gain']:.0f} times as long for the same number of "
+        f"evaluations (processor time: {r['gain_processor']:.0f} times).",
+    ]  # fmt: skip
+
+
+def _optimum(r: Result) -> list[str]:
+    rows = [
+        f"Six parameters, 500 s thinned as for the swarm, {r['seeds']} random starts in the bounds, the same kernel "
+        "for all; until the cost is within 0.1 % of the optimum.", "",
+        "| method | reached | seconds | evaluations |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for name, m in r["methods"].items():
+        if m["reached"]:
+            low, high = m["quartiles"]
+            told = f"{m['seconds']:.2f} ({low:.2f} … {high:.2f}) | {m['evaluations']:.0f}"
+        else:
+            told = "– | –"
+        rows.append(f"| {name} | {m['reached']}/{r['seeds']} | {told} |")
+    return rows
+
+
+def _identification(r: Result) -> list[str]:
+    return ["500 s at 50 Hz, warm.", "", *_times(r, lambda n, t: f" {r['evaluations'][n]} |", " evaluations |")]
+
+
+def _starts(r: Result) -> list[str]:
+    first = r["first"]
+    return [
+        "Processes of their own, from their start to the end of a first fit of 10 s of flight.", "", *_times(r), "",
+        f"Very first start, which compiles every kernel: {first['wall']:.0f} s ({first['processor']:.0f} s of "
+        "processor time).",
+    ]  # fmt: skip
+
+
+def _memory(r: Result) -> list[str]:
+    return [f"`quadid identify` of a 500 s MCAP: peak {r['peak_mb']:.0f} MB."]
+
+
+def _logs(r: Result) -> list[str]:
+    def more(name: str, t: Result) -> str:
+        return f" {t['megabytes']:.1f} | {t['ms_per_mb']:.0f} |"
+
+    return [
+        "500 s of the simulated Pelican as MCAP, tlog and CSV; the largest recorded DataFlash and ULog where "
+        "`QUADID_DATA` names recorded flights.", "", *_times(r, more, " MB | ms per MB |"),
+    ]  # fmt: skip
+
+
+def _size(r: Result) -> list[str]:
+    return [f"{r['seconds']:g} s of flight in segments of 0.2 s.", "", *_times(r), "", "![](speed-size.png)"]
+
+
+def _scaling(r: Result) -> list[str]:
+    rows = ["| hours of flight at 50 Hz | fit, wall [s] | processor [s] | peak memory [MB] |", "|---|---|---|---|"]
+    for hours, run in zip(r["hours"], r["runs"], strict=True):
+        rows.append(f"| {hours:.1f} | {run['fit']:.1f} | {run['fit_processor']:.1f} | {run['peak_mb']:.0f} |")
+    e = r["exponents"]
+    return [
+        *rows, "",
+        f"Processor time grows with the {e['fit_processor']:.2f}th power of the length, memory with the "
+        f"{e['peak_mb']:.2f}th: the swarm, the first polish and the noise use a bounded number of segments, the last "
+        "polish all.", "", "![](speed-scaling.png)",
+    ]  # fmt: skip
+
+
+PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
+    "kernel": ("The kernel", _kernel),
+    "instructions": ("What limits it", _instructions),
+    "peers": ("Particle swarms", _peers),
+    "optimum": ("Time to the optimum", _optimum),
+    "identification": ("Identification of a 500 s set", _identification),
+    "refits": ("Refit of a 10 s window", _times),
+    "help": ("Commands that say something at once", _times),
+    "commands": ("Commands", _times),
+    "starts": ("Start-up", _starts),
+    "memory": ("Memory", _memory),
+    "logs": ("Reading of logs", _logs),
+    "size": ("Particles, parameters, windows", _size),
+    "scaling": ("Length of the log", _scaling),
+}

@@ -1,0 +1,186 @@
+"""Whole commands and services: identification, diagnosis, refits, logs, reports, start-up, scaling."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.speed.flights import flight, logged
+from benchmarks.speed.timing import child, command, interleaved
+from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.swarm import SwarmOptions
+from quadid.model.layout import Layout
+from quadid.online.fitting import FitRequest, fit_window
+from quadid.vehicle import Vehicle
+
+FULL = FitOptions(64, 100, SwarmOptions(tolerance=0.0, patience=None), seed=1)
+"""Every one of 64 x 100 evaluations, polish, noise, intervals."""
+
+FIRST_FIT = """
+import pickle, sys, json
+from quadid.identify.fit import FitOptions, fit
+from quadid.vehicle import Vehicle
+found = fit([pickle.load(open(sys.argv[1], "rb"))], Vehicle.shipped("pelican"), FitOptions(seed=1))
+print(json.dumps({"evaluations": found.evaluations}))
+"""
+LONG_FIT = """
+import pickle, sys, json, time, numpy as np
+from dataclasses import replace
+from quadid.identify.fit import FitOptions, fit
+from quadid.vehicle import Vehicle
+window = pickle.load(open(sys.argv[1], "rb"))
+times = int(sys.argv[2])
+def piece(i):
+    channels = {n: v.copy() for n, v in vars(window).items() if isinstance(v, np.ndarray)}
+    return replace(window, t0=400.0 * i, log_span=(400.0 * i, 400.0 * i + 360.0), **channels)
+windows = [piece(i) for i in range(times)]
+begin, spent = time.perf_counter(), time.process_time()
+found = fit(windows, Vehicle.shipped("pelican"), FitOptions(seed=1))
+print(json.dumps({"fit": time.perf_counter() - begin, "fit_processor": time.process_time() - spent,
+                  "rows": sum(map(len, windows))}))
+"""
+
+
+def identification(rounds: int) -> dict[str, Any]:
+    """A 500 s set: 64 particles, 100 iterations, polish, noise and intervals; warm.  And of the standard search."""
+    vehicle, window = Vehicle.shipped("pelican"), flight(500.0)
+    kept: dict[str, Fit] = {}
+
+    def run(name: str, options: FitOptions) -> None:
+        kept[name] = fit([window], vehicle, options)
+
+    cases = {"64 x 100, polish, intervals": FULL, "standard search": FitOptions(seed=1)}
+    times = interleaved({n: lambda n=n, o=o: run(n, o) for n, o in cases.items()}, rounds)  # type: ignore[misc]
+    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}}
+
+
+def refits(rounds: int) -> dict[str, Any]:
+    """A window of 10 s: from nothing (swarm, noise), and refitted from the last estimate."""
+    vehicle, window = Vehicle.shipped("pelican"), flight(60.0).slice(500, 1000)
+    start = Layout(vehicle).initial(vehicle)
+    cold = FitRequest(1, vehicle, (window,), 10.0, 20.0, start, None, True, 1)
+    first = fit_window(cold)
+    if first.theta is None:
+        raise AssertionError(first.problem)
+    warm = replace(cold, theta=first.theta, noise=first.noise, search=False)
+    later = replace(warm, windows=(flight(60.0).slice(550, 1050),))
+    cases = {"cold": lambda: fit_window(cold), "warm, one second later": lambda: fit_window(later)}
+    return {"times": interleaved(cases, rounds)}
+
+
+def logs(rounds: int, folder: Path) -> dict[str, Any]:
+    """Reading of logs by format."""
+    from quadid_replay import open_log
+
+    paths = [logged(folder, 500.0, suffix) for suffix in (".mcap", ".tlog", ".csv")]
+    recorded = Path(os.environ.get("QUADID_DATA", ""))
+    for pattern in ("ardupilot/**/*.bin", "px4/**/*.ulg"):
+        paths += sorted(recorded.glob(pattern), key=lambda p: p.stat().st_size)[-1:]
+    times = interleaved({p.suffix: lambda p=p: open_log(p) for p in paths}, rounds)  # type: ignore[misc]
+    for path in paths:
+        size = path.stat().st_size / 1e6
+        times[path.suffix] |= {"megabytes": size, "ms_per_mb": 1e3 * times[path.suffix]["wall"] / size}
+    return {"times": times}
+
+
+def commands(rounds: int, folder: Path) -> dict[str, Any]:
+    """Commands as a user calls them, each in a process of its own."""
+    flown, short = logged(folder, 500.0, ".mcap"), logged(folder, 120.0, ".mcap")
+    out = str(folder)
+    model = ("--vehicle", "pelican", "--out", out)
+    cases = {
+        "quadid identify, 500 s MCAP": ("identify", str(flown), *model),
+        "... with --report": ("identify", str(flown), *model, "--report", str(folder / "report.html")),
+        "quadid diagnose, 120 s MCAP": ("diagnose", str(short), *model),
+    }
+    return {"times": interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)}  # type: ignore[misc]
+
+
+def sayings(rounds: int) -> dict[str, Any]:
+    """Commands that only say something."""
+    cases = {
+        "quadid --help": ("--help",),
+        "quadid --version": ("--version",),
+        "quadid identify --help": ("identify", "--help"),
+    }
+    return {"times": interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)}  # type: ignore[misc]
+
+
+def starts(rounds: int, folder: Path) -> dict[str, Any]:
+    """First start (kernels are compiled) and later ones (read from disk) up to the end of a first fit of 10 s."""
+    import pickle
+
+    path = folder / "window.pkl"
+    path.write_bytes(pickle.dumps(flight(60.0).slice(500, 1000)))
+    with tempfile.TemporaryDirectory() as cache:
+        first = child(FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})
+        times = interleaved(
+            {"import of the fit": lambda: child("import quadid.identify.fit\nprint('{}')"),
+             "second start to first fit": lambda: child(FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})},
+            rounds,
+        )  # fmt: skip
+    return {"first": first, "times": times}
+
+
+def scaling(folder: Path, longest: int) -> dict[str, Any]:
+    """Time and memory of a fit against length of the log, each in a process of its own."""
+    import pickle
+
+    path = folder / "base.pkl"
+    path.write_bytes(pickle.dumps(flight(360.0)))
+    child(FIRST_FIT, str(path))  # kernels are on disk afterwards
+    rows = [child(LONG_FIT, str(path), str(n)) for n in (1, 3, 10, 30, 100) if n <= longest]
+    hours = [r["rows"] / 50.0 / 3600.0 for r in rows]
+    return {"hours": hours, "runs": rows, "exponents": _exponents(rows)}
+
+
+def _exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
+    length = np.log([r["rows"] for r in rows])
+    return {
+        name: float(np.polyfit(length, np.log([r[name] for r in rows]), 1)[0]) for name in ("fit_processor", "peak_mb")
+    }
+
+
+def particles_and_parameters(rounds: int) -> dict[str, Any]:
+    """The swarm's cost against particles, the linearisation against free parameters and against windows."""
+    from quadid.identify.fit import SWARM_SECONDS
+    from quadid.identify.floor import flexible_names
+    from quadid.identify.shooting import Shooting
+    from quadid.parameters import NOMINAL_NAMES
+
+    vehicle, window = Vehicle.shipped("pelican"), flight(120.0)
+    shooting = Shooting([window], vehicle, SWARM_SECONDS)
+    theta, free = shooting.layout.initial(vehicle), shooting.free(NOMINAL_NAMES)
+    cost = shooting.swarm_cost(theta, free, shooting.count)
+    names = list(dict.fromkeys([*NOMINAL_NAMES, *flexible_names(shooting.layout, shooting)]))
+    pieces = {n: [window.slice(i * len(window) // n, (i + 1) * len(window) // n) for i in range(n)] for n in (1, 4, 16)}
+    split = {n: Shooting(parts, vehicle, SWARM_SECONDS) for n, parts in pieces.items()}
+    cases: dict[str, Any] = {}
+    for m in (16, 64, 256, 1024):
+        cases[f"cost, {m} particles"] = lambda m=m: cost(np.repeat(theta[None], m, axis=0))
+    for p in (2, 6, 20, len(names)):
+        cases[f"linearisation, {p} parameters"] = lambda p=p: shooting.linearise(theta, shooting.free(names[:p]))
+    for n, problem in split.items():
+        cases[f"linearisation, {n} windows"] = lambda s=problem: s.linearise(theta, s.free(NOMINAL_NAMES))
+    return {"seconds": 120.0, "times": interleaved(cases, rounds)}
+
+
+def memory(folder: Path) -> dict[str, Any]:
+    """Peak memory of `quadid identify` of a 500 s log."""
+    code = (
+        "import sys\nfrom quadid_cli.main import app_main\n"
+        "sys.argv = ['quadid', 'identify', sys.argv[1], '--vehicle', 'pelican', '--out', sys.argv[2]]\n"
+        "import contextlib, io\nwith contextlib.redirect_stdout(io.StringIO()):\n    app_main()\nprint('{}')"
+    )
+    return child(code, str(logged(folder, 500.0, ".mcap")), str(folder))
+
+
+def written(value: object) -> str:
+    """JSON text."""
+    return json.dumps(value, indent=1) + "\n"
