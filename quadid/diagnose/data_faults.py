@@ -12,14 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.saturation import at_limit
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
 
-LEAST_AT_LIMIT = 0.005
-"""Share of samples at exactly the largest or smallest value that makes a saturated sensor …"""
-PILE = 4.0
-"""… if they are this many times as many as lie on the next value, which coarse steps alone would not bring about."""
 LEAST_COPIES = 0.03
 """Share of inertial rows that equal the row before exactly."""
 _AXES = "xyz"
@@ -73,19 +70,12 @@ def without_copies(windows: Sequence[Window]) -> list[Window]:
 
 def _saturated(name: str, unit: str, values: FloatArray) -> list[DataFault]:
     found = []
-    for i, axis in enumerate(_AXES):
-        column = values[np.isfinite(values[:, i]), i]
-        levels, counts = np.unique(column, return_counts=True)
-        if len(levels) < 3:
-            continue
-        for end, beside in ((0, 1), (-1, -2)):
-            share = counts[end] / len(column)
-            if share > LEAST_AT_LIMIT and counts[end] > PILE * counts[beside]:
-                text = (
-                    f"{name} {axis} stays at exactly {levels[end]:.4g} {unit} in {share:.1%} of the samples: the "
-                    "sensor saturates; log it with a wider range, or fly more gently"
-                )
-                found.append(DataFault("saturated", f"{name} {axis}", float(share), text))
+    for axis, level, _, share in at_limit(values):
+        text = (
+            f"{name} {_AXES[axis]} stays at exactly {level:.4g} {unit} in {share:.1%} of the samples: the sensor "
+            "saturates; log it with a wider range, or fly more gently"
+        )
+        found.append(DataFault("saturated", f"{name} {_AXES[axis]}", share, text))
     return found
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from quadid.inspection.airborne import flying_spans
+from quadid.inspection.airborne import Spans, flying_spans
 from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
 from quadid.inspection.findings import ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
+from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import hover_check, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
 from quadid.inspection.timing import channel_facts, timing_checks
@@ -32,7 +33,7 @@ def inspect(
     checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
     checks += [gravity_check(recording, spans), gyro_check(recording), velocity_check(recording)]
     if vehicle is not None:
-        checks += [hover_check(recording, vehicle, spans), motor_order_check(recording, vehicle, spans)]
+        checks += _against_vehicle(recording, vehicle, spans)
     return Inspection(
         name=recording.name,
         format=recording.format,
@@ -47,3 +48,13 @@ def inspect(
         excitation=tuple(excitation or ()),
         warnings=recording.warnings,
     )
+
+
+def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[Check]:
+    """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
+    hover, order = hover_check(recording, vehicle, spans), motor_order_check(recording, vehicle, spans)
+    checks = [hover, order]
+    if Verdict.ERROR not in (hover.verdict, order.verdict):
+        mass = mass_check(recording, vehicle, spans, hover.numbers.get("b_from_hover"))
+        checks += [check for check in (mass, geometry_check(recording, vehicle, spans)) if check is not None]
+    return checks

@@ -60,21 +60,27 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
 
 def motor_order_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     """Correlates roll, pitch and yaw torque of every motor order with angular acceleration."""
-    name = "motor_order"
+    lagged = lagged_motion(recording, vehicle, spans)
+    return Check("motor_order", Verdict.UNKNOWN, lagged) if isinstance(lagged, str) else _judge_order(lagged, vehicle)
+
+
+def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[tuple[FloatArray, FloatArray]] | str:
+    """Squared rotor speeds (n, rotors) and angular acceleration (n, 3) in flight, slow parts left out.
+
+    One pair for each lag of 0, 1, 2 … rows by which the motors may answer late; or why there is none.
+    """
     if "gyro" not in recording.channels or not spans:
-        return Check(name, Verdict.UNKNOWN, "needs gyro and rotor signal in flight")
+        return "needs gyro and rotor signal in flight"
     try:
         signal = rotor_signal(recording, vehicle)
         windows = to_windows(recording, vehicle, _RATE, spans[0][0], spans[-1][1])
     except QuadidError as error:
-        return Check(name, Verdict.UNKNOWN, error.found)
+        return error.found
     rate = 1.0 / float(np.median(np.diff(signal.t)))
     if rate < _LEAST_RATE:
-        return Check(name, Verdict.UNKNOWN, f"rotor signal at {rate:.3g} Hz is too slow to tell the motor order")
+        return f"rotor signal at {rate:.3g} Hz is too slow to tell the motor order"
     lagged = [_quick_motion(windows, lag) for lag in range(_LAGS)]
-    if len(lagged[0][0]) < 100:
-        return Check(name, Verdict.UNKNOWN, "too little flight to tell the motor order")
-    return _judge_order(lagged, vehicle)
+    return lagged if len(lagged[0][0]) >= 100 else "too little flight to tell the motor order"
 
 
 def _quick_motion(windows: list[Window], lag: int) -> tuple[FloatArray, FloatArray]:

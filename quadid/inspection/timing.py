@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
 from quadid.resample import sample_period
+from quadid.saturation import at_limit
 from quadid.tracks import CSV_GAP, GAP
 from quadid.window import CHANNELS, Channel, Recording
 
@@ -14,8 +15,6 @@ FloatArray = NDArray[np.float64]
 
 _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
-_CLIPPED = 5
-"""A channel that reaches its extreme this often is clipped there."""
 _UNSTEADY = 0.25
 """Jitter above which the log's timing is worth a warning."""
 
@@ -45,7 +44,9 @@ def _facts(channel: Channel, gap: float) -> ChannelFacts:
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
         stuck=_longest_rest(channel.t, same),
-        saturated=_saturated(channel.values) if channel.name in ("gyro", "accel", "motor_command") else 0,
+        saturated=sum(end.count for end in at_limit(channel.values))
+        if channel.name in ("gyro", "accel", "motor_command")
+        else 0,
         dropped=dict(channel.faults),
     )
 
@@ -56,19 +57,6 @@ def _longest_rest(t: FloatArray, same: NDArray[np.bool_]) -> float:
         return 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     return float(np.max(t[edges[1::2]] - t[edges[::2]]))
-
-
-def _saturated(values: FloatArray) -> int:
-    """Counts samples at a column's largest or smallest value, where that is hit `_CLIPPED` times after motion."""
-    count = 0
-    for column in values.T:
-        if np.ptp(column) == 0.0:
-            continue
-        for extreme in (column.min(), column.max()):
-            arrivals = np.count_nonzero((column[1:] == extreme) & (column[:-1] != extreme))
-            if arrivals >= _CLIPPED:
-                count += int(np.count_nonzero(column == extreme))
-    return count
 
 
 def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying: float) -> list[Check]:

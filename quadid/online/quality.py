@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.saturation import at_limit
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -15,8 +16,6 @@ FloatArray = NDArray[np.float64]
 
 STUCK_SECONDS = 1.0
 """A sensor that repeats itself to the bit for longer than this [s] is stuck."""
-SATURATED_SHARE = 0.02
-"""More than this share of samples at exactly the largest value: the sensor is at its limit."""
 DEGREES = 180.0 / np.pi
 THRUST_KNOWN = (0.5, 2.0)
 """Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
@@ -67,9 +66,8 @@ def _broken(window: Window) -> str:
         rows = values[np.isfinite(values).all(axis=1)]
         if len(rows) > still and _longest_repeat(rows) > still:
             return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
-        if name in ("gyro", "accel") and len(rows) and (axis := _saturated(rows)) is not None:
-            top = float(np.max(np.abs(rows[:, axis])))
-            return f"{name} axis {'xyz'[axis]} is saturated at {top:.4g}: widen its range"
+        if name in ("gyro", "accel") and (ends := at_limit(rows)):
+            return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
     return ""
 
 
@@ -77,14 +75,6 @@ def _longest_repeat(rows: FloatArray) -> int:
     same = np.concatenate([[False], np.all(rows[1:] == rows[:-1], axis=1), [False]])
     edges = np.flatnonzero(np.diff(same.astype(np.int8)))
     return int(np.max(edges[1::2] - edges[::2], initial=0))
-
-
-def _saturated(rows: FloatArray) -> int | None:
-    size = np.abs(rows)
-    top = size.max(axis=0)
-    share = np.mean(size >= top * (1.0 - 1e-9), axis=0)
-    bad = np.flatnonzero((share > SATURATED_SHARE) & (top > 0.0) & (len(rows) * share > 5))
-    return int(bad[0]) if len(bad) else None
 
 
 def _units(window: Window) -> str:

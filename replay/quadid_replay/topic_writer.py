@@ -46,6 +46,7 @@ class TopicWriter:
         self._channels: dict[str, int] = {}
         self._sequence: dict[int, int] = {}
         self._open = True
+        self._flushed = 0
 
     def write(self, topic: str, kind: str, message: Any, stamp_ns: int) -> None:
         """Writes one message.
@@ -76,6 +77,10 @@ class TopicWriter:
         sequence = self._sequence.get(channel, 0)
         self._sequence[channel] = sequence + 1
         self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+        if self._owned is not None and self._owned.tell() != self._flushed:
+            # A chunk was written: its end must not wait in a buffer, or a killed process would lose two chunks.
+            self._owned.flush()
+            self._flushed = self._owned.tell()
 
     def define(self, kind: str, text: str) -> None:
         """Gives the definition of a type that `quadid_replay.schemas` does not hold (form ros2msg)."""

@@ -11,6 +11,7 @@ from quadid_replay import write_tlog
 
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+from tests.faults.evidence import Happened
 
 
 def _pelican(**changes: object) -> str:
@@ -276,7 +277,8 @@ def test_impossible_horizons(inside: Cli, flights: Flights) -> None:
     assert "no run of 1900 samples fits" in line
 
 
-def test_control_characters_in_names_do_not_reach_the_terminal(inside: Cli, tmp_path: Path) -> None:
+def test_control_characters_in_names_do_not_reach_the_terminal(inside: Cli, tmp_path: Path, happened: Happened) -> None:
     run = inside("score", str(tmp_path / "evil\x1b[31m\nname.csv"), "--vehicle", "pelican")
     assert "\x1b" not in run.err
     one_line(run, 2)
+    happened(20, "ANSI and line ends in a file name: none on the terminal, one line")

@@ -16,6 +16,7 @@ from quadid_node.codec import set_from_dict, set_to_dict
 from quadid_node.store import Store, StoreError, read_history
 
 from quadid.online.records import Diagnosed, Event, OnlineFinding, SetState
+from tests.faults.evidence import Happened
 from tests.online.test_gate import TRUE, online_set
 
 
@@ -162,12 +163,13 @@ def test_a_place_that_cannot_be_written_is_told_and_the_service_goes_on(tmp_path
     store.close()
 
 
-def test_hostile_names_and_texts_are_only_text(tmp_path: Path) -> None:
+def test_hostile_names_and_texts_are_only_text(tmp_path: Path, happened: Happened) -> None:
     name = "x'); DROP TABLE sets; --\x00\x1b[31m<script>"
     store = Store(tmp_path / "h.sqlite", name)
     store.numbered(replace(online_set(TRUE), sequence=1, reason="'; DELETE FROM sets; --", approved_by="auto"))
     store.close()
     assert [s["reason"] for s in read_history(tmp_path / "h.sqlite", name)["sets"]] == ["'; DELETE FROM sets; --"]
+    happened(20, "vehicle name with SQL, NUL, ANSI and HTML: stored and found again as text, no statement run")
 
 
 def test_a_power_cut_leaves_the_last_committed_set(tmp_path: Path) -> None:

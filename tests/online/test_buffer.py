@@ -15,6 +15,7 @@ from quadid.online.buffer import BLOCK, SETTLE, Buffer, Rows
 from quadid.online.rows import RowStore
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
+from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, flight, samples
 
 PELICAN = Vehicle.shipped("pelican")
@@ -104,17 +105,20 @@ def taken(buffer: Buffer) -> list[Rows]:
     return list(iter(buffer.next_rows, None))
 
 
-def test_duplicates_are_dropped_and_counted() -> None:
+def test_duplicates_are_dropped_and_counted(happened: Happened) -> None:
     stream = samples(flight(4.0).recording)
     doubled = [s for sample in stream for s in (sample, sample)]
     plain, _ = run(stream)
     rows, buffer = run(doubled)
     assert same(plain, rows)
     assert buffer.faults["gyro: duplicate"] > 100
+    happened(
+        8, f"every sample twice: rows bit for bit the same, {buffer.faults['gyro: duplicate']} gyro duplicates counted"
+    )
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
-def test_values_that_are_no_numbers_never_reach_a_row(bad: float) -> None:
+def test_values_that_are_no_numbers_never_reach_a_row(bad: float, happened: Happened) -> None:
     stream = samples(flight(4.0).recording)
     broken = [
         Sample(s.t, s.channel, (bad, *s.values[1:])) if s.channel == "accel" and i % 7 == 0 else s
@@ -124,6 +128,10 @@ def test_values_that_are_no_numbers_never_reach_a_row(bad: float) -> None:
     assert buffer.faults["accel: not finite"] > 0
     assert np.isfinite(stacked(rows, "gyro")).all()
     assert not np.isinf(stacked(rows, "accel")).any()
+    happened(
+        6,
+        f"{bad} in every seventh accelerometer sample online: {buffer.faults['accel: not finite']} dropped and counted",
+    )
 
 
 def test_wrong_width_unknown_channel_and_zero_quaternion_are_counted() -> None:
@@ -146,7 +154,7 @@ def test_a_gap_is_not_bridged() -> None:
     assert cut.windows[1].t0 >= 6.0 - 1e-9
 
 
-def test_a_third_of_lost_packets_leaves_usable_rows() -> None:
+def test_a_third_of_lost_packets_leaves_usable_rows(happened: Happened) -> None:
     dense = fly(PELICAN, seconds=6.0, seed=3, log_rate=250.0, command_rate=250.0)
     rng = np.random.default_rng(0)
     rows, _ = run([s for s in samples(dense.recording) if rng.random() > 0.3])
@@ -157,14 +165,18 @@ def test_a_third_of_lost_packets_leaves_usable_rows() -> None:
     assert good.mean() > 0.9
     error = gyro[good] - np.column_stack([np.interp(at[good], dense.truth.t, c) for c in truth.T])
     assert np.sqrt(np.mean(error**2)) < 0.05
+    happened(
+        8, f"30 % of packets lost at 250 Hz: {good.mean():.1%} of 50 Hz rows usable, gyro within 0.05 rad/s of truth"
+    )
 
 
-def test_a_reboot_begins_a_new_stretch() -> None:
+def test_a_reboot_begins_a_new_stretch(happened: Happened) -> None:
     stream = samples(flight(6.0).recording)
     rows, buffer = run([*[Sample(s.t + 300.0, s.channel, s.values) for s in stream], *stream])
     assert [r.fresh for r in rows].count(True) == 2
     assert len(buffer.time.steps) == 1
     assert all(np.diff(r.t).min() > 0.0 for r in rows)
+    happened(7, "stamps that fall by 300 s online: a new stretch, nothing mixed")
 
 
 def test_too_many_rotors_are_told_as_a_fault() -> None:

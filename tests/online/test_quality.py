@@ -10,6 +10,7 @@ import pytest
 from quadid.online.quality import Quality, judge
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
+from tests.faults.evidence import Happened
 from tests.online.driving import flight
 
 PELICAN = Vehicle.shipped("pelican")
@@ -42,42 +43,47 @@ def on_the_floor(speed: np.ndarray, shake: float = 0.2) -> Window:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_idling_and_taxiing_are_not_flight(known: bool) -> None:
+def test_idling_and_taxiing_are_not_flight(known: bool, happened: Happened) -> None:
     hover = PELICAN.hover_speed(B)
     assert "ground" in verdict(on_the_floor(np.full(500, 0.2 * hover)), known).grounded
     spool = hover * (0.75 + 0.2 * np.sin(np.arange(500) * 0.05))
     assert verdict(on_the_floor(spool), known).grounded
+    happened(18, f"idling and spooling on the floor (b {'known' if known else 'guessed'}): not flying, with the reason")
 
 
-def test_carried_by_hand_is_not_flight() -> None:
+def test_carried_by_hand_is_not_flight(happened: Happened) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     off = changed(window, "rotor_speed", np.zeros_like(window.rotor_speed))
     assert "ground" in verdict(off).grounded
     idle = changed(window, "rotor_speed", 0.25 * window.rotor_speed)
     assert verdict(idle).grounded
+    happened(18, "moved about with rotors off or idling (carried by hand): not flying")
 
 
-def test_a_crash_is_named() -> None:
+def test_a_crash_is_named(happened: Happened) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     assert window.accel is not None
     knock = window.accel.copy()
     knock[300] = [90.0, 10.0, 60.0]
     assert "knock" in verdict(changed(window, "accel", knock)).grounded
+    happened(18, "a knock of more than 8 g: 'landing or crash', the window is not used")
 
 
 @pytest.mark.parametrize("name", ["gyro", "accel", "attitude", "rotor_speed"])
-def test_a_stuck_sensor_is_named(name: str) -> None:
+def test_a_stuck_sensor_is_named(name: str, happened: Happened) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     values = getattr(window, name).copy()
     values[200:280] = values[200]
     assert f"{name} is stuck" in verdict(changed(window, name, values)).fault
+    happened(6, f"{name} stuck for 1.6 s in flight: the window is refused and the sensor named")
 
 
-def test_a_saturated_gyro_is_named() -> None:
+def test_a_saturated_gyro_is_named(happened: Happened) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     assert window.gyro is not None
     top = 0.6 * np.abs(window.gyro[:, 1]).max()
     assert "is saturated" in verdict(changed(window, "gyro", np.clip(window.gyro, -top, top))).fault
+    happened(6, "gyro clipped at 60 % of its peak: the window is refused, axis and limit named")
 
 
 @pytest.mark.parametrize(

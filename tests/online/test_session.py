@@ -16,6 +16,7 @@ from quadid.online.voice import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
+from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, answer, diagnosed, drive, events, flight, published, samples
 
 PELICAN = Vehicle.shipped("pelican")
@@ -192,7 +193,7 @@ def test_a_failed_fit_is_told_and_the_session_goes_on() -> None:
     assert session.status().fits > 3
 
 
-def test_the_ground_before_and_after_a_flight_is_not_learned_from() -> None:
+def test_the_ground_before_and_after_a_flight_is_not_learned_from(happened: Happened) -> None:
     made = flight(16.0, 6)
     rng = np.random.default_rng(0)
     idle = [
@@ -213,6 +214,10 @@ def test_the_ground_before_and_after_a_flight_is_not_learned_from() -> None:
     sets = published(actions)
     assert sets
     assert min(s.start for s in sets) >= 12.0
+    happened(
+        18,
+        f"12 s on the ground, then flight: learned only from data after {min(s.start for s in sets):g} s",
+    )
 
 
 def test_a_missing_motor_signal_is_told_with_the_fix() -> None:
@@ -224,7 +229,7 @@ def test_a_missing_motor_signal_is_told_with_the_fix() -> None:
     assert "fix" in status.reason
 
 
-def test_a_reboot_in_flight_begins_anew_and_mixes_nothing() -> None:
+def test_a_reboot_in_flight_begins_anew_and_mixes_nothing(happened: Happened) -> None:
     stream = samples(flight(16.0, 6).recording, 100.0)
     again = samples(flight(16.0, 6).recording, 1.0)
     session = Session(PELICAN, QUICK)
@@ -233,6 +238,7 @@ def test_a_reboot_in_flight_begins_anew_and_mixes_nothing() -> None:
     sets = published(actions)
     assert sets
     assert sets[0].stop < 100.0, "stamps of the new time base"
+    happened(7, "reboot in flight online: two streams, no set mixes them")
 
 
 def test_an_explained_change_needs_no_fit_when_nothing_was_known() -> None:

@@ -10,6 +10,7 @@ from quadid_replay import open_log
 from quadid_replay.frames import from_euler
 
 from quadid.errors import LogError
+from tests.faults.evidence import Happened
 
 HEADER = "t,p,q,r,ax,ay,az,phi,theta,psi,w1,w2,w3,w4\n"
 
@@ -85,7 +86,7 @@ def test_a_cut_last_line_is_no_measurement(tmp_path: Path) -> None:
     assert len(whole.channels["gyro"].t) == 100  # no line end, but nothing seems missing
 
 
-def test_nan_and_inf_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_nan_and_inf_are_dropped_and_counted(tmp_path: Path, happened: Happened) -> None:
     lines = rows()
     cells = lines[10].split(",")
     lines[10] = ",".join([*cells[:1], "nan", "0", "inf", *cells[4:]])
@@ -93,9 +94,10 @@ def test_nan_and_inf_are_dropped_and_counted(tmp_path: Path) -> None:
     assert dict(recording.channels["gyro"].faults) == {"not_finite": 1}
     assert len(recording.channels["accel"].t) == 100
     assert any("gyro" in w and "1 not finite" in w for w in recording.warnings)
+    happened(6, "NaN and Inf in a CSV: dropped and counted by the reader")
 
 
-def test_repeated_and_backward_rows_are_dropped_a_reboot_is_a_break(tmp_path: Path) -> None:
+def test_repeated_and_backward_rows_are_dropped_a_reboot_is_a_break(tmp_path: Path, happened: Happened) -> None:
     lines = rows(200)
     mixed = [*lines[:100], lines[99], lines[98], *lines[100:]]
     recording = open_log(written(tmp_path, HEADER + "".join(mixed)))
@@ -103,6 +105,7 @@ def test_repeated_and_backward_rows_are_dropped_a_reboot_is_a_break(tmp_path: Pa
     twice = open_log(written(tmp_path, HEADER + "".join(lines + lines), "twice.csv"))
     assert len(twice.breaks) == 1
     assert any("reboot" in w for w in twice.warnings)
+    happened(7, "rows running backwards dropped and counted; a reboot becomes a break that nothing crosses")
 
 
 def test_columns_nobody_knows_are_reported(tmp_path: Path) -> None:

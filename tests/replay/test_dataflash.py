@@ -13,6 +13,8 @@ from quadid_replay.dataflash_index import index_dataflash
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
 
+from tests.faults.evidence import Happened
+
 CODES = {"Q": "Q", "f": "f", "B": "B", "H": "H", "c": "h", "N": "16s", "Z": "64s", "I": "I"}
 
 
@@ -110,7 +112,7 @@ def test_values_are_those_of_pymavlink(data_dir: Path) -> None:
         assert abs(float(attitude.values[k] @ expected)) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_two_boots_in_one_log_are_kept_apart(tmp_path: Path) -> None:
+def test_two_boots_in_one_log_are_kept_apart(tmp_path: Path, happened: Happened) -> None:
     log = flight()
     add_flight(log, 4.0, 1.0)
     recording = open_log(opened(tmp_path, bytes(log.data)))
@@ -118,17 +120,19 @@ def test_two_boots_in_one_log_are_kept_apart(tmp_path: Path) -> None:
     for channel in recording.channels.values():
         assert np.all(np.diff(channel.t) > 0.0)
     assert recording.channels["gyro"].t[-1] - recording.channels["gyro"].t[0] > 8.0
+    happened(7, "two boots in one DataFlash log: kept apart")
 
 
-def test_a_damaged_stretch_costs_only_itself(tmp_path: Path) -> None:
+def test_a_damaged_stretch_costs_only_itself(tmp_path: Path, happened: Happened) -> None:
     data = bytearray(flight().data)
     data[9000:9300] = bytes(300)
     recording = open_log(opened(tmp_path, bytes(data)))
     assert len(recording.channels["gyro"].t) > 380
     assert any("damaged" in w for w in recording.warnings)
+    happened(3, "DataFlash with garbage inside: resynchronised, the bytes skipped are counted")
 
 
-def test_a_damaged_description_loses_only_that_message(tmp_path: Path) -> None:
+def test_a_damaged_description_loses_only_that_message(tmp_path: Path, happened: Happened) -> None:
     log = flight()
     at = log.data.find(b"IMU\x00")
     log.data[at + 4 : at + 7] = b"Q\x01~"  # a format that does not exist
@@ -136,6 +140,7 @@ def test_a_damaged_description_loses_only_that_message(tmp_path: Path) -> None:
     assert "gyro" not in recording.channels
     assert len(recording.channels["motor_command"].t) == 400
     assert any("descriptions" in w for w in recording.warnings)
+    happened(3, "DataFlash with a corrupted FMT: only that message is lost, and named")
 
 
 def test_padding_at_the_end_is_no_damage_but_a_cut_record_is_told(tmp_path: Path) -> None:

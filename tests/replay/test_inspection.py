@@ -17,6 +17,7 @@ from quadid.inspection import Check, Inspection, Verdict, inspect
 from quadid.inspection.conventions import fit_axes
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
+from tests.faults.evidence import Happened
 from tests.replay.synthetic import PELICAN, Flight, with_command
 
 FloatArray = NDArray[np.float64]
@@ -47,7 +48,7 @@ def check(inspection: Inspection, name: str) -> Check:
 def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
     found = inspect(clean, PELICAN)
     assert {c.name: c.verdict for c in found.checks} == dict.fromkeys(
-        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order"), Verdict.OK
+        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order", "geometry"), Verdict.OK
     )
     assert found.usable
     np.testing.assert_allclose(found.flying, [(0.0, 19.98)])
@@ -62,14 +63,15 @@ def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
     ("factor", "unit"),
     [(1 / 9.80665, "in g"), (1000 / 9.80665, "milli-g"), (100.0, "cm/s"), (30.0, "no specific force")],
 )
-def test_wrong_units_of_the_accelerometer(clean: Recording, factor: float, unit: str) -> None:
+def test_wrong_units_of_the_accelerometer(clean: Recording, factor: float, unit: str, happened: Happened) -> None:
     gravity = check(inspect(changed(clean, "accel", lambda v: v * factor)), "gravity")
     assert gravity.verdict is Verdict.ERROR
     assert unit in gravity.message
     assert gravity.fix
+    happened(10, f"accelerometer times {factor:.4g}: '{gravity.message[-40:]}'; fix: {gravity.fix}")
 
 
-def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording) -> None:
+def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording, happened: Happened) -> None:
     gravity = check(inspect(changed(clean, "accel", flip_body)), "gravity")
     assert gravity.verdict is Verdict.ERROR
     assert "FLU" in gravity.message
@@ -86,13 +88,15 @@ def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording) -> None:
         ros = changed(ros, name, flip)
     verdicts = {c.name: c.verdict for c in inspect(ros).checks}
     assert verdicts["gravity"] is Verdict.ERROR
+    happened(10, "FLU for FRD in one channel or in all: refused, with the axis map 'x = x, y = -y, z = -z'")
 
 
-def test_degrees_for_radians(clean: Recording) -> None:
+def test_degrees_for_radians(clean: Recording, happened: Happened) -> None:
     gyro = check(inspect(changed(clean, "gyro", np.degrees)), "gyro_attitude")
     assert gyro.verdict is Verdict.ERROR
     assert "deg/s" in gyro.message
     assert gyro.fix == "convert to radians"
+    happened(10, "gyro in deg/s: refused, 'convert to radians'")
 
 
 @pytest.mark.parametrize(
@@ -120,13 +124,64 @@ def test_velocity_in_enu_beside_an_attitude_in_ned(clean: Recording) -> None:
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1), (1, 2, 3, 0)])
-def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...]) -> None:
+def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...], happened: Happened) -> None:
     swapped = changed(clean, "rotor_speed", lambda v: v[:, order])
     found = check(inspect(swapped, PELICAN), "motor_order")
     assert found.verdict is Verdict.ERROR
     back = ", ".join(str(int(i) + 1) for i in np.argsort(order))
     assert back in found.message
     assert back in found.fix
+    happened(10, f"motors logged in the order {order}: refused, with the order {back} that fits")
+
+
+def known(vehicle: Vehicle, mass: float = 1.0, arm: float = 1.0, turn: float = 0.0) -> Vehicle:
+    """The vehicle with b and inertias known to 3 %, its mass and arm wrong by factors, its rotors turned [rad]."""
+    data = vehicle.model_dump()
+    data["mass"] *= mass
+    for rotor in data["rotors"]:
+        x, y, z = rotor["position"]
+        c, s = arm * np.cos(turn), arm * np.sin(turn)
+        rotor["position"] = (c * x - s * y, s * x + c * y, z)
+    for name in ("b", "J_xx", "J_yy"):
+        data["parameters"][name]["sigma"] = 0.03 * data["parameters"][name]["initial"]
+    return Vehicle.model_validate(data)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_a_wrong_mass_is_named_with_the_factor_where_thrust_is_known(
+    clean: Recording, factor: float, happened: Happened
+) -> None:
+    assert check(inspect(clean, known(PELICAN)), "mass").verdict is Verdict.OK
+    found = check(inspect(clean, known(PELICAN, mass=factor)), "mass")
+    assert found.verdict is Verdict.WARNING
+    assert found.numbers["mass_factor"] == pytest.approx(1.0 / factor, rel=0.03)
+    assert "kg would fit" in found.fix
+    assert not [c for c in inspect(clean, PELICAN).checks if c.name == "mass"], "m / b alone shows when b is a guess"
+    happened(
+        10, f"mass stated {factor - 1.0:+.0%} with b known to 3 %: '{found.message}'; with b only guessed nothing tells"
+    )
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_a_wrong_arm_is_named_with_the_factor_where_inertia_is_known(
+    clean: Recording, factor: float, happened: Happened
+) -> None:
+    assert check(inspect(clean, known(PELICAN)), "geometry").verdict is Verdict.OK
+    found = check(inspect(clean, known(PELICAN, arm=factor)), "geometry")
+    assert found.verdict is Verdict.WARNING
+    assert found.numbers["arm_factor"] == pytest.approx(1.0 / factor, rel=0.1)
+    assert "measure the arm" in found.fix
+    happened(
+        10, f"arm stated times {factor:g}: '{found.message}'; factor that would fit {found.numbers['arm_factor']:.2f}"
+    )
+
+
+@pytest.mark.parametrize("degrees", [45.0, -45.0, 30.0])
+def test_a_frame_turned_about_z_is_named_with_the_angle(clean: Recording, degrees: float, happened: Happened) -> None:
+    found = check(inspect(clean, known(PELICAN, turn=np.radians(degrees))), "geometry")
+    assert found.verdict is Verdict.ERROR
+    assert np.degrees(found.numbers["turned_rad"]) == pytest.approx(-degrees, abs=5.0)
+    happened(10, f"rotor positions turned by {degrees:+.0f} deg (X for +): '{found.message}'")
 
 
 def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
@@ -138,10 +193,11 @@ def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(60 / (2 * np.pi), "rpm"), (1 / (2 * np.pi), "rev/s")])
-def test_rotor_speeds_in_other_units(clean: Recording, factor: float, unit: str) -> None:
+def test_rotor_speeds_in_other_units(clean: Recording, factor: float, unit: str, happened: Happened) -> None:
     found = check(inspect(changed(clean, "rotor_speed", lambda v: v * factor), PELICAN), "hover")
     assert found.verdict is Verdict.ERROR
     assert unit in found.message
+    happened(10, f"rotor speeds in {unit}: refused, fix: {found.fix}")
 
 
 def test_the_wrong_vehicle_is_an_error_of_hover(clean: Recording) -> None:
@@ -184,14 +240,15 @@ def test_flying_spans_leave_out_the_ground(clean: Recording) -> None:
     assert inspect(replace(pulses, channels={"motor_command": armed})).flying == ()
 
 
-def test_lying_on_the_back_with_turning_motors_is_no_flight(clean: Recording) -> None:
+def test_lying_on_the_back_with_turning_motors_is_no_flight(clean: Recording, happened: Happened) -> None:
     late = clean.channels["accel"].t > 12.0
     crashed = changed(clean, "accel", lambda v: np.where(late[:, None], [0.0, 3.0, 9.0], v))
     (span,) = inspect(crashed, PELICAN).flying
     assert span[1] == pytest.approx(12.0, abs=0.6)
+    happened(18, "on its back with turning motors from 12 s on: flight ends at 12 s")
 
 
-def test_stuck_clipped_and_jumping_sensors(clean: Recording) -> None:
+def test_stuck_clipped_and_jumping_sensors(clean: Recording, happened: Happened) -> None:
     def stuck(v: FloatArray) -> FloatArray:
         out = v.copy()
         out[300:400] = out[300]
@@ -203,6 +260,7 @@ def test_stuck_clipped_and_jumping_sensors(clean: Recording) -> None:
     assert "at the limit" in check(clipped, "saturated").message
     broken = inspect(replace(clean, breaks=(5.0,)))
     assert "1 breaks" in check(broken, "clock").message
+    happened(6, "inspection names a stuck gyro ('does not change for 2 s') and a clipped one")
 
 
 def test_faults_of_the_reader_are_counted(clean: Recording) -> None:
@@ -250,12 +308,13 @@ def test_real_flights_are_believed_and_their_motors_in_order(data_dir: Path, log
     assert found.usable
 
 
-def test_a_crash_ends_the_flight_of_a_real_log(data_dir: Path) -> None:
+def test_a_crash_ends_the_flight_of_a_real_log(data_dir: Path, happened: Happened) -> None:
     recording = open_log(data_dir / "ardupilot" / "log171.bin")
     spans = inspect(recording, with_command(PELICAN, kind="pwm", max_speed=800.0)).flying
     zero = float(recording.channels["gyro"].t[0])
     assert spans[-1][0] - zero < 83.0
     assert 216.0 < spans[-1][1] - zero < 230.0
+    happened(18, "recorded crash (log171.bin): the flying span ends there")
 
 
 @pytest.mark.parametrize(("profile", "verdict"), [("hover", "unknown"), ("gentle", "ok"), ("excited", "ok")])

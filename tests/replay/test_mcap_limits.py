@@ -18,6 +18,7 @@ from quadid_replay.mcap_records import McapFile
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
+from tests.faults.evidence import Happened
 from tests.replay.synthetic import full_recording
 
 
@@ -34,18 +35,22 @@ def chunked(path: Path, body: bytes, declared: int, compression: str = "zstd") -
     path.write_bytes(buffer.getvalue()[:start] + struct.pack("<BQ", 6, len(chunk)) + chunk)
 
 
-def test_declared_bombs_are_refused_before_anything_is_inflated(tmp_path: Path) -> None:
+def test_declared_bombs_are_refused_before_anything_is_inflated(tmp_path: Path, happened: Happened) -> None:
     chunked(tmp_path / "bomb", zstandard.compress(bytes(10_000_000)), 3_000_000_000)
     with pytest.raises(LogError, match="decompression bomb"):
         open_log(tmp_path / "bomb")
+    happened(5, "10 MB of zeros in an MCAP chunk that declares 3 GB: refused as a bomb before inflating")
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_chunks_that_lie_about_their_size_inflate_no_further(tmp_path: Path, compression: str) -> None:
+def test_chunks_that_lie_about_their_size_inflate_no_further(
+    tmp_path: Path, compression: str, happened: Happened
+) -> None:
     body = zstandard.compress(bytes(50_000_000)) if compression == "zstd" else lz4.frame.compress(bytes(50_000_000))
     chunked(tmp_path / "liar", body, 1000, compression)
     with pytest.raises(LogError, match="no topic|no usable"):
         open_log(tmp_path / "liar")
+    happened(5, f"{compression} chunk of 50 MB that declares 1000 bytes: inflated to 1000 bytes, then refused")
 
 
 @pytest.fixture
@@ -56,7 +61,7 @@ def small_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_one_damaged_chunk_costs_only_itself(small_chunks: Path) -> None:
+def test_one_damaged_chunk_costs_only_itself(small_chunks: Path, happened: Happened) -> None:
     with small_chunks.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -68,6 +73,10 @@ def test_one_damaged_chunk_costs_only_itself(small_chunks: Path) -> None:
     assert any("1 damaged chunks or definitions refused" in w for w in recording.warnings)
     share = len(recording.channels["gyro"].t) / 400
     assert 1 - 2 / len(summary.chunk_indexes) < share < 1
+    happened(
+        1,
+        f"one of {len(summary.chunk_indexes)} chunks with a wrong CRC: refused and told, {share:.0%} of the gyro used",
+    )
 
 
 def test_without_summary_everything_before_the_cut_is_read(small_chunks: Path) -> None:

@@ -13,6 +13,7 @@ from quadid_replay.motors import RPM
 from quadid_replay.ulog_check import collect_records
 
 from quadid.errors import LogError
+from tests.faults.evidence import Happened
 
 
 class Ulog:
@@ -105,7 +106,7 @@ def test_values_are_those_of_pyulog(data_dir: Path) -> None:
     assert recording.channels["motor_command"].values.shape == (330, 4)
 
 
-def test_a_wild_stamp_moves_nothing(tmp_path: Path) -> None:
+def test_a_wild_stamp_moves_nothing(tmp_path: Path, happened: Happened) -> None:
     log = flight()
     log.add("sensor_combined", "Q3fIi3fI", 10**15, 0.1, 0.2, 0.3, 4000, 500, 0.0, 0.0, -9.8, 4000)
     for k in range(10):
@@ -114,15 +115,17 @@ def test_a_wild_stamp_moves_nothing(tmp_path: Path) -> None:
     assert len(recording.channels["gyro"].t) == 410
     assert recording.channels["gyro"].t[-1] < 8.0
     assert any("confirm" in w for w in recording.warnings)
+    happened(7, "ULog with one wild stamp: refused, no other sample moved")
 
 
-def test_a_cut_file_is_told_although_pyulog_says_nothing(tmp_path: Path) -> None:
+def test_a_cut_file_is_told_although_pyulog_says_nothing(tmp_path: Path, happened: Happened) -> None:
     data = bytes(flight().data)
     path = opened(tmp_path, data[: len(data) // 2 + 1])
     assert not ULog(str(path)).file_corruption
     recording = open_log(path)
     assert any("cut" in w for w in recording.warnings)
     assert len(recording.channels["gyro"].t) == pytest.approx(200, abs=15)
+    happened(4, "ULog cut where pyulog reports no corruption: told by our own walk through the records")
 
 
 def test_damage_in_the_middle_is_counted(tmp_path: Path) -> None:

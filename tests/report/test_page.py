@@ -18,6 +18,7 @@ from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.diagnose_page import diagnosis_part
 from quadid.report.identify_page import identify_page
 from quadid.report.page import code, number, packed, render
+from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"
 
@@ -123,11 +124,12 @@ def read(html: str) -> Reader:
     return reader
 
 
-def test_nothing_from_a_log_becomes_markup(read: Reader) -> None:
+def test_nothing_from_a_log_becomes_markup(read: Reader, happened: Happened) -> None:
     assert [kind for kind, _ in read.scripts] == ["application/json", None, None]
     assert read.text.count("<script>alert(1)</script>") > 5  # shown as text
     assert "{{7*7}}" in read.text
     assert [tag for tag, _ in read.tags].count("title") == 1
+    happened(20, "script tags and template marks as log name: shown as text in the report, no element made of them")
 
 
 def test_policy_allows_exactly_the_two_scripts(read: Reader) -> None:
