@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.backward import eliminate
-from quadid.diagnose.candidates import candidates
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
+from quadid.diagnose.foresight import POOR, refit_to_predict
 from quadid.diagnose.form import inconstant
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
@@ -91,14 +92,61 @@ def diagnose(
     check_windows(windows)
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
+    begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
+    search = _select(windows, begun, report)
+    decisive = search.shooting
+    left = remainder(decisive, search.model, seed)
+    report("validation", 0.0)
+    outcome, per_finding = validate(decisive, search, validation, begun.listed)
+    beyond, doubts = _beyond_belief(begun.short, search.model), dict(inconstant(search.model, left))
+    verdict = judge(search.nominal, search.model, left)
+    saturated = any(f.kind == "saturated" for f in faults)
+    if search.model.causes and (outcome.contradicted or beyond or saturated or len(doubts) == len(search.model.causes)):
+        verdict = Verdict.UNKNOWN
+    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
+    findings = describe(decisive, search, per_finding, believed)
+    foresight = None
+    if verdict is Verdict.UNKNOWN and search.model.misfit > POOR:
+        report("prediction", 0.0)
+        foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
+    text = extended_vehicle(vehicle, decisive, search.model)
+    if foresight is not None:
+        text = extended_vehicle(vehicle, foresight.shooting, foresight.model)
+    name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
+    report("done", 1.0)
+    warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *([foresight.sentence] if foresight else []))
+    result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, foresight)
+    return result, Workings(search, begun.short, decisive, left)
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """What the selection starts from.
+
+    Attributes:
+        short: short segments; ladder: the lengths that may decide, short ones last.
+        nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
+        elsewhere: other nominal parameters to start from, each of shape (6,).
+        listed: the catalogue.
+    """
+
+    short: Shooting
+    ladder: list[Shooting]
+    nominal: FloatArray
+    flexible: FloatArray
+    elsewhere: list[FloatArray]
+    listed: list[Candidate]
+
+
+def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
+    """Fits the nominal model, estimates the noise, cuts the data into the segments of the ladder."""
     short = Shooting(windows, vehicle, SWARM_SECONDS)
     free = short.free(NOMINAL_NAMES)
-    theta = short.layout.initial(vehicle)
-    if swarm:
-        theta, _ = swarm_search(short, theta, free, FitOptions(seed=seed), report)
+    start = short.layout.initial(vehicle)
+    if swarm is not None:
+        start, _ = swarm_search(short, start, free, swarm, report)
     report("fit", 0.0)
-    start = theta
-    first = polish(short, theta, free, iterations=8)
+    first = polish(short, start, free, iterations=8)
     far = first.cost > FAR * float(first.lin.rows.sum())
     typical, short.noise = short.noise, residual_noise(short, first)
     first = polish(short, first.theta, free, iterations=8)
@@ -109,16 +157,22 @@ def diagnose(
     else:
         flexible = flexible_fit(windows, short, [first.theta], free, short.noise)
     short.noise = flexible.noise
-    elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
     ladder = [Shooting(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     ladder = [*(s for s in ladder if s.count >= FEWEST_SEGMENTS), short]
+    elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15)
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    search = select(ladder, first.theta, listed, report, elsewhere)
+    return _Begun(short, ladder, first.theta, flexible.theta, elsewhere, listed)
+
+
+def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Search:
+    """Selects causes forwards, where that leads nowhere backwards, and again when they show the noise to be less."""
+    ladder, short = begun.ladder, begun.short
+    search = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere)
     if search.model.misfit > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
-        general = eliminate(short, flexible.theta, listed)
-        other = select(ladder, first.theta, listed, report, elsewhere, general)
+        general = eliminate(short, begun.flexible, begun.listed)
+        other = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, general)
         search = min(search, other, key=lambda s: (-s.shooting.length, s.model.misfit))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
@@ -131,28 +185,9 @@ def diagnose(
         search = _with_noise(noise, ladder, search)
         if np.all(noise.variance > NOISE_FELL * before):
             break
-        again = select(ladder, first.theta, listed, report, elsewhere, search.model)
+        again = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    decisive = search.shooting
-    left = remainder(decisive, search.model, seed)
-    verdict = judge(search.nominal, search.model, left)
-    report("validation", 0.0)
-    outcome, per_finding = validate(decisive, search, validation, listed)
-    beyond = _beyond_belief(short, search.model)
-    if search.model.causes and (outcome.contradicted or beyond or any(f.kind == "saturated" for f in faults)):
-        verdict = Verdict.UNKNOWN
-    doubts = dict(inconstant(search.model, left))
-    if search.model.causes and len(doubts) == len(search.model.causes):
-        verdict = Verdict.UNKNOWN
-    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
-    findings = describe(decisive, search, per_finding, believed)
-    text = extended_vehicle(vehicle, decisive, search.model)
-    name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
-    report("done", 1.0)
-    result = Diagnosis(
-        verdict, findings, outcome, left, text, name, (*(f.text for f in faults), *beyond, *doubts.values())
-    )
-    return result, Workings(search, short, decisive, left)
+    return search
 
 
 def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:

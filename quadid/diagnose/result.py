@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from quadid.diagnose.foresight import Foresight
 from quadid.diagnose.remainder import Remainder
 
 
@@ -121,7 +122,10 @@ class Validation:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name."""
+    """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name.
+
+    With `foresight` the vehicle file holds parameters refitted to predict.
+    """
 
     verdict: Verdict
     findings: tuple[Finding, ...]
@@ -130,6 +134,7 @@ class Diagnosis:
     vehicle_yaml: str
     vehicle_name: str
     warnings: tuple[str, ...] = field(default_factory=tuple)
+    foresight: Foresight | None = None
 
     @property
     def unexplained(self) -> dict[str, float]:
@@ -161,6 +166,7 @@ class Diagnosis:
             "unexplained": self.unexplained,
             "unexplained_follows": self.unexplained_follows,
             "vehicle_file": vehicle_file,
+            "prediction": None if self.foresight is None else self.foresight.to_dict(),
             "warnings": list(self.warnings),
         }
 

@@ -1,7 +1,8 @@
 """Signals that a residual may follow: inputs, motions, time.
 
 None may share noise with the residual: motions are the predicted ones, and inputs are those of the step before a
-sample, because a controller's command answers to the noise of the sample that it was worked out from.
+sample, because a controller's command answers to the noise of the sample that it was worked out from; so are specific
+forces, which follow the command at once.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def _motions(part: Columns) -> dict[str, FloatArray]:
     """Predicted rates, tilt and specific force, and products of them."""
     window = part.window
     p, q, r = (_predicted(part, window.gyro, i, i) for i in range(3))
-    f_x, f_y, f_z = (_predicted(part, window.accel, i, 6 + i) for i in range(3))
+    f_x, f_y, f_z = (_before(_predicted(part, window.accel, i, 6 + i)) for i in range(3))
     out = {"p": p, "q": q, "r": r, "p|p|": p * np.abs(p), "q|q|": q * np.abs(q), "r|r|": r * np.abs(r)}
     out |= {"p q": p * q, "q r": q * r, "r p": r * p, "|p|": np.abs(p), "|q|": np.abs(q)}
     lift = f_z - np.mean(f_z)
@@ -75,6 +76,11 @@ def _motions(part: Columns) -> dict[str, FloatArray]:
         out |= {"pitched": 2.0 * (x * z - w * y), "rolled": 2.0 * (y * z + w * x)}
         out |= {"heading north": w * w + x * x - y * y - z * z, "heading east": 2.0 * (x * y + w * z)}
     return out
+
+
+def _before(signal: FloatArray) -> FloatArray:
+    """The signal one step before; at the first sample of a segment, there."""
+    return np.concatenate([signal[:, :1], signal[:, :-1]], axis=1)
 
 
 def _predicted(part: Columns, measured: FloatArray | None, axis: int, channel: int) -> FloatArray:

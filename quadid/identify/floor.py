@@ -11,18 +11,24 @@ from quadid.effects import EFFECTS
 from quadid.identify.noise import NoiseModel, estimate_noise
 from quadid.identify.polish import FloatArray, Polished, polish
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.spectrum import shaped_noise
+from quadid.identify.spectrum import LEAST_SEGMENTS, shaped_noise
 from quadid.model.layout import LOSS, Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
 
 SPECTRUM_SECONDS = 0.5
+LINE_SECONDS = 1.0
+"""Segments of this length tell a line of vibration, as in calm flight, from a hump; used where the model follows."""
 FLEXIBLE_DRAG = 0.1
 """Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
 GROWS = 3.0
-"""Growth of a channel's residual variance, from short segments to longer ones, that no sensor noise shows."""
+"""Growth of a channel's residual variance, from short segments to longer ones, that no sensor noise shows …"""
+STAYS = 1.2
+"""… and up to which the longer ones are followed as well."""
 SHORT_SEGMENTS = 400
 """Most short segments the flexible model is fitted to at first."""
+FROM_START = 8
+"""Linearisations spent on the longer segments when they begin anew."""
 LONG_SEGMENTS = 300
 """Most longer segments it is fitted to afterwards: its parameters need no more."""
 MOST_SEGMENTS = 4000
@@ -111,27 +117,49 @@ def flexible_fit(
     brief = residual_noise(few, first)
     longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
     longer.local = ()
-    every = -(-longer.count // LONG_SEGMENTS)
-    second = polish(longer.thinned(every) if every > 1 else longer, first.theta, wide, iterations=3)
-    simulated = (sum(t.iterations for t, _ in tried) + second.iterations) * (len(names) + 10)
-    if every > 1:
-        # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial
-        # states, so that segments are started and filters warmed up as for all.
-        settled = longer.free([n for n in _SETTLING if n in names])
-        second = polish(longer, second.theta, settled, iterations=3)
-        simulated += second.iterations * (len(settled.entries) + 10)
-    longer.noise = residual_noise(longer, second, len(names))
-    # Noise does not grow with the length of a segment; what does is the model losing its way.
-    if np.any(longer.noise.variance > GROWS * brief.variance):
-        return Flexible(brief, first.theta, simulated)
-    return Flexible(shaped_noise(longer, second.theta, wide), second.theta, simulated)
+    simulated = sum(t.iterations for t, _ in tried) * (len(names) + 10)
+    # In calm flight short segments may lead flexible parameters far astray; then longer ones begin where they did.
+    for theta, iterations in [(first.theta, 3), *((start, FROM_START) for start in starts)]:
+        longer.noise = brief
+        second, more = _on_longer(longer, theta, names, iterations)
+        longer.noise = residual_noise(longer, second, len(names))
+        simulated += more
+        # Noise does not grow with the length of a segment; what does is the model losing its way.
+        if not np.any(longer.noise.variance > GROWS * brief.variance):
+            longest, more = _longest(windows, longer, second.theta, names)
+            return Flexible(shaped_noise(longest, second.theta, wide), second.theta, simulated + more)
+    return Flexible(brief, first.theta, simulated)
+
+
+def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterations: int) -> tuple[Polished, int]:
+    """Fits the flexible model to some of the longer segments, evenly spread, and settles all; and vectors simulated."""
+    every = max(-(-longer.count // LONG_SEGMENTS), 1)
+    longer.restore({})
+    second = polish(longer.thinned(every), theta, longer.free(names), iterations=iterations)
+    simulated = second.iterations * (len(names) + 10)
+    # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial states,
+    # so that segments are started and filters warmed up as for all.
+    settled = longer.free([n for n in _SETTLING if n in names])
+    second = polish(longer, second.theta, settled, iterations=3)
+    return second, simulated + second.iterations * (len(settled.entries) + 10)
+
+
+def _longest(
+    windows: Sequence[Window], longer: Shooting, theta: FloatArray, names: Sequence[str]
+) -> tuple[Shooting, int]:
+    """The longest segments that the flexible model at `theta` follows as well as `longer`; and vectors simulated."""
+    out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
+    if out.count < LEAST_SEGMENTS:
+        return longer, 0
+    settled = out.free([n for n in _SETTLING if n in names])
+    fitted = polish(out, theta, settled, iterations=3)
+    out.noise = residual_noise(out, fitted, len(names))
+    grew = bool(np.any(out.noise.variance > STAYS * longer.noise.variance))
+    return longer if grew else out, fitted.iterations * (len(settled.entries) + 10)
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
     """Segments of `seconds`, at most about `most` of them spread evenly; vehicle and local parameters as in `like`."""
     out = Shooting(windows, like.vehicle, seconds, noise, like.layout)
     out.local = like.local
-    every = -(-out.count // most)
-    if every > 1:
-        out.segments = [s.every(every) for s in out.segments]
-    return out
+    return out.thinned(max(-(-out.count // most), 1))
