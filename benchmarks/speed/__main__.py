@@ -61,7 +61,7 @@ def main() -> None:
         all_parts = parts(options.rounds, options.longest, Path(folder))
         for name in options.parts.split(",") if options.parts else all_parts:
             begin = time.perf_counter()
-            results[name] = {"machine": machine(), **all_parts[name]()}
+            results[name] = {"machine": machine(), "rounds": options.rounds, **all_parts[name]()}
             target.write_text(whole.written(results), encoding="utf-8")
             print(f"{name}: measured in {time.perf_counter() - begin:.0f} s", flush=True)
     draw(results, options.out)

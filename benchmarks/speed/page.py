@@ -23,7 +23,7 @@ def page(results: Result) -> str:
         if found is None:
             out += ["Not measured.", ""]
             continue
-        out += [*write(found), "", f"_{_machine(found['machine'])}_", ""]
+        out += [*write(found), "", f"_{found['rounds']} rounds; {_machine(found['machine'])}_", ""]
     return "\n".join(out)
 
 
@@ -81,10 +81,10 @@ def _instructions(r: Result) -> list[str]:
         rows.append(f"| {name} | {' | '.join(str(c[key]) for key in cells)} |")
     return [
         *rows, "",
-        "Nearly all of it is arithmetic on full-width registers, and about half of that is fused: the arithmetic units "
-        "are the limit of the steps. Between them and the peak stand sums that are not fused, loads and stores of "
-        "states for which no register is left, and for the full equations divisions and roots, which take many cycles "
-        "each; the rollout adds rotors, sensors and the writing of residuals.",
+        "There is hardly any scalar work, and about half of the arithmetic is fused. That the rollout still stays at the "
+        "share of the peak given above comes from what stands beside arithmetic: moves and memory operands (the states "
+        "of a vector of lanes do not fit into registers), chains of dependent operations, divisions and roots in the "
+        "full equations, rotors, sensors and the writing of residuals. How much of it each takes was not measured.",
     ]  # fmt: skip
 
 
