@@ -81,10 +81,10 @@ def _instructions(r: Result) -> list[str]:
         rows.append(f"| {name} | {' | '.join(str(c[key]) for key in cells)} |")
     return [
         *rows, "",
-        "There is hardly any scalar work, and about half of the arithmetic is fused. That the rollout still stays at "
-        "the share of the peak given above comes from what stands beside arithmetic: moves and memory operands (the "
-        "states of a vector of lanes do not fit into registers), chains of dependent operations, divisions and roots in the "
-        "full equations, rotors, sensors and the writing of residuals. How much of it each takes was not measured.",
+        "There is hardly any scalar work, and about half of the arithmetic is fused. Beside it stand moves and memory "
+        "operands (the states of a vector of lanes do not fit into registers), chains of dependent operations, "
+        "divisions and roots in the full equations, and outside the steps rotors, sensors and the writing of "
+        "residuals. Which of them keeps the rollout from the peak was not measured.",
     ]  # fmt: skip
 
 
