@@ -7,7 +7,6 @@ BIN := $(VENV)/bin
 try_python = for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= $(1))' 2>/dev/null && echo $$p && break; done
 PYTHON ?= $(or $(shell $(call try_python,(3, 13))),$(shell $(call try_python,(3, 99))))
-PYTHON_OF_CONTAINER ?= python3.12
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 # What is installed, one stamp a step; a step runs again only when what it reads has changed.
@@ -132,31 +131,6 @@ fuzz: $(DEV) ## mutated logs through the four binary readers for an hour; goes o
 .PHONY: soak
 soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, into docs/results/soak.md (hours)
 	$(STUDY) studies.soak --out docs/results
-
-.PHONY: chaos mutation coverage audit pins
-chaos: $(MESSAGES) ## random faults at the running service for 20 min, into docs/results/chaos.md
-	$(STUDY) studies.chaos --minutes 20 --out docs/results
-
-mutation: $(MESSAGES) ## spoil gate, ledger and a sample of session line by line: which tests notice? (half an hour)
-	$(STUDY) studies.mutation gate ledger --out docs/results
-	$(STUDY) studies.mutation session --most 40 --out docs/results
-
-# Kernels run as Python here (NUMBA_DISABLE_JIT), where that is bearable: see docs/results/coverage.md.
-coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run (an hour)
-	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest -q -m "not browser and not slow" tests
-	$(BIN)/coverage combine
-	$(BIN)/coverage report --include='quadid/*' --sort=cover
-
-audit: ## known holes in the pinned dependencies; says so where the database cannot be reached
-	@test -x $(VENV)-audit/bin/pip-audit || { $(BIN)/python -m venv $(VENV)-audit && $(VENV)-audit/bin/python -m pip install --quiet pip-audit; }
-	@$(VENV)-audit/bin/pip-audit --requirement docker/requirements.txt --disable-pip --require-hashes --timeout 20 || \
-		echo "Either holes are listed above, or the vulnerability database could not be reached: then nothing was checked." >&2
-
-pins: ## exact versions with hashes of what the container installs: docker/requirements.txt (needs Python 3.12, as the container)
-	@test -x $(VENV)-pins/bin/pip-compile || { $(PYTHON_OF_CONTAINER) -m venv $(VENV)-pins && $(VENV)-pins/bin/python -m pip install --quiet pip-tools; }
-	$(VENV)-pins/bin/pip-compile --quiet --generate-hashes --strip-extras --no-emit-index-url --no-emit-find-links \
-		--custom-compile-command "make pins" --output-file docker/requirements.txt pyproject.toml
 
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow

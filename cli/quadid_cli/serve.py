@@ -79,9 +79,10 @@ def serve(
     known = name or described.name
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     with ExitStack() as opened:
+        store = Store(file or default_path(), known)  # first: who is refused here must not have taken the port
+        opened.callback(store.close)
         link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
         opened.callback(link.close)
-        store = Store(file or default_path(), known)
         service = Service(described, settings, ProcessWorker(described), store)
         opened.callback(service.close)
         outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]

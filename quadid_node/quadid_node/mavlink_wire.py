@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import hmac
+import socket
 import time
 from collections.abc import Container, Iterator
 from pathlib import Path
@@ -24,6 +26,8 @@ MOST_BEHIND = 60 * 100_000
 KEY_BYTES = 32
 _HEAD = {0xFE: 8, 0xFD: 12}
 _SIGNED, _SIGNATURE = 1, 13
+READS_AT_ONCE = 500
+"""Datagrams or pieces of a stream after which whoever receives gets to do other things, as heeding a signal."""
 _LONGEST = 12 + 255 + _SIGNATURE
 
 
@@ -108,6 +112,22 @@ def read_key(path: Path) -> bytes:
     return data
 
 
+def _refuse_shared_port(device: str) -> None:
+    """pymavlink lets two programs listen on one UDP port, and the second one takes the first one's frames away."""
+    kind, _, place = device.partition(":")
+    host, _, port = place.rpartition(":")
+    if kind not in ("udpin", "udp") or not port.isdigit():
+        return
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, int(port)))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise LinkError(
+                    f"another program listens on UDP port {port}", "one service a port", "stop it, or give another port"
+                ) from error
+
+
 class Wire:
     """A link.
 
@@ -129,6 +149,7 @@ class Wire:
             LinkError: the link cannot be opened.
         """
         device, _, baud = url.partition(",")
+        _refuse_shared_port(device)
         try:
             options = {"baud": int(baud)} if baud else {}
             self._conn: Any = mavutil.mavlink_connection(device, autoreconnect=True, **options)
@@ -148,14 +169,17 @@ class Wire:
         self.refused = self.dropped = 0
 
     def receive(self, wanted: Container[int], most: int) -> Iterator[Any]:
-        """Yields the wanted messages that have arrived; never waits.
+        """Yields the wanted messages that have arrived; never waits, and ends however fast more of them come.
 
         Args:
             wanted: message numbers; others are not even decoded.
             most: frames to decode at most; what comes beyond is read and dropped.
         """
         decoded = 0
-        while data := self._read():
+        for _ in range(READS_AT_ONCE):
+            data = self._read()
+            if not data:
+                return
             if decoded >= most:
                 self.dropped += len(data)
                 continue

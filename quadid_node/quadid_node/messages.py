@@ -32,6 +32,8 @@ PHASES = {
     Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
 }  # fmt: skip
 VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
+BEHIND = 10.0
+"""A session that is this far behind its data [s] is worth a warning: it keeps what waits in memory."""
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
 
@@ -158,7 +160,10 @@ def diagnostics(health: Health, name: str, hardware: str, stamp: Message, notes:
     """
     status = health.status
     blocked = status.phase in (Phase.BLOCKED, Phase.FAILED)
-    session = _entry(name, "session", hardware, WARN if blocked else OK, f"{status.phase.value}: {status.reason}", {
+    said = f"{status.phase.value}: {status.reason}"
+    if status.backlog > BEHIND:
+        said = f"{status.backlog:.0f} s behind the data, fits get too little of the processor: refit less often; {said}"
+    session = _entry(name, "session", hardware, WARN if blocked or status.backlog > BEHIND else OK, said, {
         "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
         "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
         "backlog [s]": f"{status.backlog:.2f}",

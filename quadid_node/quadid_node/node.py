@@ -15,19 +15,21 @@ from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
-from quadid.online import Diagnosed, Event, Publish
+from quadid.online import Event, Publish
 from quadid.online.ledger import Answer
 from quadid_node import messages
 from quadid_node.chooser import Chooser
-from quadid_node.convert import Decoder, best_ranks, deserializer, message_class, to_message
+from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
+from quadid_node.neighbours import Neighbours
 from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, read_vehicle, vehicle_id
 from quadid_node.presets import Input, Source, source
 from quadid_node.recorder import Beginning, Recorder
 from quadid_node.service import Output, Service
+from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker
 
@@ -36,9 +38,6 @@ BLOCKS_A_STEP = 2
 WARM_UP_SECONDS = 8.0
 """How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
 SENSOR_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED_QOS = QoSProfile(
-    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
-)  # fmt: skip
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -59,10 +58,8 @@ class IdentifyNode(LifecycleNode):
         self._service: Service | None = None
         self._recorder: Recorder | None = None
         self._decoders: dict[str, Decoder] = {}
-        self._notes: dict[str, str] = {}
-        self._paused = False
+        self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
-        self._publishers_by_topic: dict[str, Any] = {}
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self._active = False
 
@@ -91,6 +88,8 @@ class IdentifyNode(LifecycleNode):
             return FAILURE
         result = super().on_activate(state)
         self._active = True
+        if self._speaker is not None:
+            self._speaker.step()
         self.get_logger().info(f"ready: identifies '{self._id}'")
         return result
 
@@ -116,6 +115,8 @@ class IdentifyNode(LifecycleNode):
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])
         self._stamps = messages.Clock()
+        inputs = [self.resolve_topic_name(entry.topic) for entry in preset.inputs]
+        self._neighbours = Neighbours(inputs, self.count_publishers, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
@@ -137,8 +138,9 @@ class IdentifyNode(LifecycleNode):
             decoder = Decoder(entry, self._stamps, chooser, rotors, deserializer(entry.type))
             topic = self.resolve_topic_name(entry.topic)
             events = SubscriptionEventCallbacks(
-                incompatible_qos=lambda event, t=topic: self._note(t, "its publisher's QoS does not match"),
-                incompatible_type=lambda event, t=topic: self._note(t, "its publisher uses another message type"),
+                incompatible_qos=lambda event, t=topic: self._neighbours.note(t, "its publisher's QoS does not match"),
+                incompatible_type=lambda event, t=topic: self._neighbours.note(t, "its publisher has another type"),
+                matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
             )
             subscription = self.create_subscription(
                 message_class(entry.type), entry.topic, lambda data, d=decoder, e=entry: self._on_message(d, e, data),
@@ -149,14 +151,7 @@ class IdentifyNode(LifecycleNode):
             self._open.append((self.destroy_subscription, subscription))
 
     def _offer(self) -> None:
-        for topic in ("parameters", "candidate", "diagnosis"):
-            kind = message_class(messages.DIAGNOSIS if topic == "diagnosis" else messages.PARAMETER_SET)
-            qos = LATCHED_QOS if topic == "parameters" else 10
-            self._publishers_by_topic[topic] = self.create_lifecycle_publisher(kind, messages.TOPICS[topic], qos)
-        status = self.create_lifecycle_publisher(message_class(messages.FIT_STATUS), "quadid/status", 10)
-        health = self.create_lifecycle_publisher(message_class(messages.DIAGNOSTICS), "/diagnostics", 10)
-        self._publishers_by_topic |= {"status": status, "diagnostics": health}
-        self._open += [(self.destroy_publisher, p) for p in self._publishers_by_topic.values()]
+        self._speaker = Speaker(self, self._observer, self._neighbours.deaf)
         for name, answer in (("fit_now", self._fit_now), ("approve", self._approve), ("rollback", self._roll_back)):
             service = self.create_service(Trigger, f"quadid/{name}", answer)
             self._open.append((self.destroy_service, service))
@@ -169,7 +164,9 @@ class IdentifyNode(LifecycleNode):
         for destroy, item in reversed(self._open):
             destroy(item)
         self._open.clear()
-        self._publishers_by_topic.clear()
+        if self._speaker is not None:
+            self._speaker.close()
+            self._speaker = None
         self._decoders.clear()
         if self._service is not None:
             self._service.close()
@@ -181,7 +178,7 @@ class IdentifyNode(LifecycleNode):
     # --- callbacks
 
     def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
-        if self._active and not self._paused and self._service is not None:
+        if self._active and not self._neighbours.paused and self._service is not None:
             if self._recorder is not None:
                 self._recorder.take(entry.topic, entry.type.replace("/", "/msg/"), data)
             for sample in decoder.samples(data):
@@ -196,12 +193,12 @@ class IdentifyNode(LifecycleNode):
     def _put(self, output: Output) -> None:
         if isinstance(output, Event):
             self._log(output.level, output.text)
-        elif isinstance(output, Publish) and not self._observer:
-            self._publish(
-                output.topic, messages.PARAMETER_SET, messages.parameter_set(output.item, self._id, self._stamps)
-            )
-        elif isinstance(output, Diagnosed) and not self._observer:
-            self._publish("diagnosis", messages.DIAGNOSIS, messages.diagnosis(output, self._id, self._stamps))
+        elif self._speaker is None or self._speaker.silent:
+            return
+        elif isinstance(output, Publish):
+            self._speaker.publish(output.topic, messages.parameter_set(output.item, self._id, self._stamps))
+        else:
+            self._speaker.publish("diagnosis", messages.diagnosis(output, self._id, self._stamps))
 
     def _log(self, level: str, text: str) -> None:
         """One call a level: rclpy remembers the level of each line of code and refuses another."""
@@ -213,46 +210,32 @@ class IdentifyNode(LifecycleNode):
         else:
             log.error(text)
 
-    def _publish(self, topic: str, kind: str, fields: messages.Message) -> None:
-        self._publishers_by_topic[topic].publish(to_message(kind, fields))
-
     def _report(self) -> None:
         """Once a second: status, health, and who else publishes."""
-        if self._service is None:
+        if self._service is None or self._speaker is None:
             return
-        self._look_for_rivals()
+        self._look_around(self._service, self._speaker)
         health = self._service.health()
         fields = messages.fit_status(health.status, self._id, self._stamps, health.fit_seconds)
         if "no rotor speeds" in fields["reason"]:
             fields["reason"] += f"; here: {self._hint}"
-        self._publish("status", messages.FIT_STATUS, fields)
-        notes = dict(self._notes)
+        self._speaker.publish("status", fields)
+        notes = dict(self._neighbours.notes)
         notes |= {t: f"{d.failed} messages could not be read" for t, d in self._decoders.items() if d.failed}
         stamp = self.get_clock().now().to_msg()
         now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
         report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)
-        self._publish("diagnostics", messages.DIAGNOSTICS, report)
+        self._speaker.publish("diagnostics", report)
 
-    def _look_for_rivals(self) -> None:
-        """A second publisher on an input would mix two vehicles: pause until it is gone."""
-        rivals = {t: self.count_publishers(t) for t in self._decoders}
-        crowded = [t for t, n in rivals.items() if n > 1]
-        for topic in self._decoders:
-            if topic in crowded:
-                self._note(topic, f"{rivals[topic]} publishers on one topic: paused until there is one")
-            elif "publishers on one topic" in self._notes.get(topic, ""):
-                del self._notes[topic]
-        self._paused = bool(crowded)
-        ours = self.resolve_topic_name(messages.TOPICS["parameters"])
-        if self.count_publishers(ours) > 1 and not self._observer:
-            self._note(ours, "someone else publishes parameter sets on our topic: check sequence and log_hash")
-        else:
-            self._notes.pop(ours, None)
-
-    def _note(self, topic: str, text: str) -> None:
-        if self._notes.get(topic) != text:
-            self.get_logger().error(f"{topic}: {text}")
-        self._notes[topic] = text
+    def _look_around(self, service: Service, speaker: Speaker) -> None:
+        """Who else publishes inputs, or the parameter sets of our vehicle."""
+        self._neighbours.look()
+        if not self._active:
+            return
+        force = service.session.ledger.in_force
+        if speaker.step() and force is not None:
+            self._put(Publish("parameters", force))
+        self._neighbours.note(speaker.ours, speaker.problem)
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:
         if self._service is not None:

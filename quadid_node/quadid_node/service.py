@@ -85,7 +85,7 @@ class Service:
         self._arrived: dict[str, float] = {}
         self._counted: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, float] = {}
-        self._notes = [Event(0.0, "error", "history", note) for note in (store.notes if store is not None else [])]
+        self._noted = 0
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
 
@@ -125,8 +125,7 @@ class Service:
         return self._journalled(self._tidy())
 
     def _tidy(self) -> list[Output]:
-        outputs: list[Output] = list(self._notes)
-        self._notes.clear()
+        outputs: list[Output] = self._history_notes()
         studied = self._studying.poll() if self._studying is not None else []
         for item in (*self._worker.poll(), *studied):
             if isinstance(item, StudyReply):
@@ -177,6 +176,12 @@ class Service:
 
     def _trouble(self, item: Trouble) -> Event:
         return Event(self.session.status().t, item.level, "worker", item.text)
+
+    def _history_notes(self) -> list[Output]:
+        """What the history has told since the last call: a damaged one set aside."""
+        notes = self._store.notes[self._noted :] if self._store is not None else []
+        self._noted += len(notes)
+        return [Event(self.session.status().t, "error", "history", note) for note in notes]
 
     def _history_trouble(self) -> list[Event]:
         problem = self._store.problem if self._store is not None else ""

@@ -41,6 +41,8 @@ KEPT = {"candidates": 20_000, "events": 20_000}
 PRUNE_EVERY = 1000
 MOST_WAITING = 5000
 BUSY_SECONDS = 5.0
+AGAIN = 1.0
+"""Time after which entries that could not be written are tried again [s]."""
 
 
 class StoreError(QuadidError):
@@ -89,6 +91,7 @@ class Store:
         self._lock: IO[str] | None = None
         self._queue: queue.Queue[tuple[str, tuple[Any, ...]] | None] = queue.Queue(MOST_WAITING)
         self._written = 0
+        self._last: tuple[str, tuple[Any, ...]] | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = _take_lock(path, vehicle)
@@ -109,6 +112,7 @@ class Store:
                 last = self._set(db, "state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
                 approved = self._set(db, "approved_by NOT IN ('auto', '') ORDER BY rowid DESC")
                 first = self._set(db, "state = 'accepted' ORDER BY rowid")
+            self._last = self._row(last) if last is not None else None
             return Restored(last, int(highest or 0) + 1, approved or first)
         except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
             self.problem = f"the last set cannot be read back ({error})"
@@ -120,8 +124,12 @@ class Store:
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, or waits for approval."""
+        self._last = self._row(item)
+        self._put(*self._last)
+
+    def _row(self, item: OnlineSet) -> tuple[str, tuple[Any, ...]]:
         row = (self.vehicle, item.sequence, item.state.value, item.reason, item.approved_by, item.stop, time.time())
-        self._put("INSERT INTO sets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*row, json.dumps(set_to_dict(item))))
+        return "INSERT INTO sets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*row, json.dumps(set_to_dict(item)))
 
     def candidate(self, item: OnlineSet) -> None:
         """Journals an estimate and what the gate said of it."""
@@ -168,16 +176,22 @@ class Store:
         try:
             self._make_tables()
         except sqlite3.DatabaseError as error:
-            if isinstance(error, sqlite3.OperationalError) and "malformed" not in str(error):
+            if isinstance(error, sqlite3.OperationalError) and not _is_damage(error):
                 self.problem = f"{self.path} cannot be written ({error})"
                 return
-            aside = self.path.with_name(f"{self.path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}")
-            for suffix in ("", "-wal", "-shm"):
-                with contextlib.suppress(FileNotFoundError):
-                    Path(f"{self.path}{suffix}").rename(f"{aside}{suffix}")
-            self.notes.append(f"the history was damaged ({error}); it was set aside as {aside.name}, a new one begins")
+            self._set_aside(error)
             with contextlib.suppress(sqlite3.Error):
                 self._make_tables()
+
+    def _set_aside(self, error: sqlite3.Error) -> None:
+        """Gives a damaged file another name."""
+        name = f"{self.path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}"
+        taken = sum(p.name.startswith(name) for p in self.path.parent.iterdir())
+        aside = self.path.with_name(f"{name}-{taken}" if taken else name)
+        for suffix in ("", "-wal", "-shm"):
+            with contextlib.suppress(FileNotFoundError):
+                Path(f"{self.path}{suffix}").rename(f"{aside}{suffix}")
+        self.notes.append(f"the history was damaged ({error}); it was set aside as {aside.name}, a new one begins")
 
     def _make_tables(self) -> None:
         with contextlib.closing(_connect(self.path)) as db:
@@ -191,19 +205,23 @@ class Store:
         """The thread: one transaction for all that waits; tries again after a failure, keeping the order."""
         batch: list[tuple[str, tuple[Any, ...]]] = []
         while True:
-            entry = self._queue.get()
-            while entry is not None:
-                batch.append(entry)
-                try:
-                    entry = self._queue.get_nowait()
-                except queue.Empty:
-                    break
+            last = self._collect(batch)
             done = self._write(batch)
             batch = [] if done else batch[-MOST_WAITING:]
-            if entry is None:
+            if last:
                 return
             if not done:
                 time.sleep(0.2)
+
+    def _collect(self, batch: list[tuple[str, tuple[Any, ...]]]) -> bool:
+        """Adds what waits to be written; what failed before is tried again soon, whether more comes or not."""
+        with contextlib.suppress(queue.Empty):
+            entry = self._queue.get(timeout=AGAIN if batch else None)
+            while entry is not None:
+                batch.append(entry)
+                entry = self._queue.get_nowait()
+            return True
+        return False
 
     def _write(self, batch: list[tuple[str, tuple[Any, ...]]]) -> bool:
         if self._lock is None:
@@ -219,9 +237,33 @@ class Store:
                         db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
         except sqlite3.Error as error:
             self.problem = f"{self.path} cannot be written ({error}): kept in memory until it can"
+            if _is_damage(error):
+                self._begin_anew(error, batch)
             return False
         self.problem = ""
         return True
+
+    def _begin_anew(self, error: sqlite3.Error, batch: list[tuple[str, tuple[Any, ...]]]) -> None:
+        """After damage while running: a new file that begins with the set in force."""
+        try:
+            try:
+                self._make_tables()  # the file was removed, or another service has dealt with it
+            except sqlite3.DatabaseError as found:
+                if not _is_damage(found):
+                    raise
+                self._set_aside(error)
+                self._make_tables()
+        except (sqlite3.Error, OSError) as failure:
+            self.problem = f"{self.path} cannot be written ({failure}): kept in memory until it can"
+            return
+        if self._last is not None and self._last not in batch:
+            batch.insert(0, self._last)
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether an error says that the file is no sound database, not that it cannot be reached now."""
+    told = str(error)
+    return "malformed" in told or "not a database" in told or "no such table" in told
 
 
 def read_history(path: Path, vehicle: str, candidates: int = 0, events: int = 0) -> dict[str, list[dict[str, Any]]]:

@@ -77,16 +77,17 @@ def day(
         service = Service(PELICAN, SessionSettings(refit=refit, diagnose=diagnose), worker, store)
         tally = _Tally(service, worker, flight)
         last = round(hours * 3600.0 / (FLIGHT + GROUND))
-        every = max(round(3600.0 / (FLIGHT + GROUND)), 1)
+        every = max(round(min(hours / 12.0, 1.0) * 3600.0 / (FLIGHT + GROUND)), 1)
         for loop in range(last):
             tally.fly(loop * (FLIGHT + GROUND))
-            if (loop + 1) % every and loop + 1 != last:
+            over = time.monotonic() - begin > limit
+            if (loop + 1) % every and loop + 1 != last and not over:
                 continue
             points.append(
                 {**tally.point(), "hours": (loop + 1) * (FLIGHT + GROUND) / 3600.0, "files_mib": _size(folder)}
             )
             tell(f"{points[-1]['hours']:.1f} h of flight, {points[-1]['memory_mib']:.0f} MiB")
-            if time.monotonic() - begin > limit:
+            if over:
                 break
         service.close()
     return {

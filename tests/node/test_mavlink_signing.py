@@ -8,6 +8,7 @@ import pytest
 from quadid_node.mavlink_link import MavlinkLink
 from quadid_node.mavlink_wire import LinkError, dialect, read_key
 
+from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, free_port, samples
 
 
@@ -20,7 +21,7 @@ def signed_link(port: int) -> MavlinkLink:
     return MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY)
 
 
-def test_with_a_key_unsigned_forged_and_replayed_frames_change_nothing(port: int) -> None:
+def test_with_a_key_unsigned_forged_and_replayed_frames_change_nothing(port: int, happened: Happened) -> None:
     link = signed_link(port)
     vehicle, mallory, thief = Sender(port, key=KEY), Sender(port), Sender(port, key=bytes(32))
     try:
@@ -42,11 +43,12 @@ def test_with_a_key_unsigned_forged_and_replayed_frames_change_nothing(port: int
         vehicle.imu(1.01)
         assert len([s for s in samples(link, 0.1) if s.channel == "gyro"]) == 1
         assert all(m.get_msgbuf()[2] & 1 for m in vehicle.heard()), "what we send is signed"
+        happened(14, "103 unsigned, wrongly signed and replayed frames: none taken, all counted; vehicle heard")
     finally:
         link.close()
 
 
-def test_a_forged_timestamp_from_the_far_future_does_not_lock_the_vehicle_out(port: int) -> None:
+def test_a_forged_timestamp_from_the_far_future_does_not_lock_the_vehicle_out(port: int, happened: Happened) -> None:
     """pymavlink itself notes the timestamp before it checks the signature."""
     link, vehicle, mallory = signed_link(port), Sender(port, key=KEY), Sender(port, key=bytes(32))
     try:
@@ -66,6 +68,7 @@ def test_a_forged_timestamp_from_the_far_future_does_not_lock_the_vehicle_out(po
     with pytest.raises(dialect.MAVError):
         theirs.decode(frame)
     assert max(theirs.signing.stream_timestamps.values()) > 2**47, "the weakness is still there: keep our check"
+    happened(14, "forged stamp from the far future: the vehicle is still heard (pymavlink alone locks it out)")
 
 
 def test_old_signatures_of_a_new_stream_are_refused(port: int) -> None:

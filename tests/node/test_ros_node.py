@@ -15,6 +15,7 @@ from quadid_node.store import read_history
 from quadid_replay import write_mcap
 
 from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
 from tests.node.peers import ROOT, Ear, Process, node, player
 from tests.online.driving import flight
 
@@ -38,7 +39,7 @@ def ear() -> Iterator[Ear]:
 
 
 def latched() -> Any:
-    from quadid_node.node import LATCHED_QOS
+    from quadid_node.speaker import LATCHED_QOS
 
     return LATCHED_QOS
 
@@ -191,7 +192,9 @@ def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, 
     assert "Traceback" not in identify.text
 
 
-def test_a_killed_fit_process_is_replaced_and_the_set_comes(log: Path, tmp_path: Path, ear: Ear) -> None:
+def test_a_killed_fit_process_is_replaced_and_the_set_comes(
+    log: Path, tmp_path: Path, ear: Ear, happened: Happened
+) -> None:
     from diagnostic_msgs.msg import DiagnosticArray
     from quadid_msgs.msg import ParameterSet
 
@@ -209,6 +212,7 @@ def test_a_killed_fit_process_is_replaced_and_the_set_comes(log: Path, tmp_path:
         assert ear.until(lambda: restarts(health) == 1, 10.0)
         assert ear.until(lambda: level(health, "inputs") == b"\x02", 15.0), "silent inputs become an error"
         assert "silent" in next(s.message for s in health[-1].status if s.name.endswith("inputs"))
+    happened(11, "fit process of the node killed in flight: replaced, said in /diagnostics, the set came")
 
 
 def worker_of(pid: int) -> int:
@@ -263,7 +267,7 @@ def test_what_cannot_be_configured_is_told_with_the_fix(tmp_path: Path, paramete
         assert "Traceback" not in identify.text
 
 
-def test_a_second_node_on_one_history_is_refused_and_may_observe(tmp_path: Path) -> None:
+def test_a_second_node_on_one_history_is_refused_and_may_observe(tmp_path: Path, happened: Happened) -> None:
     with node(tmp_path / "h.sqlite") as first:
         first.wait_for("ready", 120.0)
         with node(tmp_path / "h.sqlite") as second:
@@ -272,6 +276,7 @@ def test_a_second_node_on_one_history_is_refused_and_may_observe(tmp_path: Path)
         with node(tmp_path / "h.sqlite", observer=True) as observer:
             observer.wait_for("ready", 120.0)
             assert observer.end()[0] == 0
+    happened(21, "second node on one history: refused with exit code 2 and the fix; as observer it runs")
 
 
 def test_a_log_that_cannot_be_played_is_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 
 PELICAN = Vehicle.shipped("pelican")
@@ -93,7 +94,7 @@ def test_a_child_is_polite(worker: ProcessWorker) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_killed_child_is_replaced_and_the_fit_done(
-    worker: ProcessWorker, requests: list[FitRequest], number: signal.Signals
+    worker: ProcessWorker, requests: list[FitRequest], number: signal.Signals, happened: Happened
 ) -> None:
     worker.submit(requests[0])
     os.kill(worker.pid, number)
@@ -101,10 +102,11 @@ def test_a_killed_child_is_replaced_and_the_fit_done(
     assert reply.estimate is not None
     assert worker.restarts == 1
     assert any(f"signal {number.value}" in t.text for t in told)
+    happened(11, f"fit process ended by {number.name}: replaced, the same window fitted, said")
 
 
 def test_a_stopped_child_is_replaced(
-    worker: ProcessWorker, requests: list[FitRequest], monkeypatch: pytest.MonkeyPatch
+    worker: ProcessWorker, requests: list[FitRequest], monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
     monkeypatch.setattr(working, "FIT_LIMIT", 1.5)
     old = worker.pid
@@ -116,9 +118,12 @@ def test_a_stopped_child_is_replaced(
     assert reply.estimate is not None
     assert worker.pid not in (0, old)
     assert any("hung" in t.text for t in told)
+    happened(11, "fit process stopped (SIGSTOP): the parent was not held up; replaced, the window fitted, said")
 
 
-def test_after_three_deaths_the_session_is_told(worker: ProcessWorker, requests: list[FitRequest]) -> None:
+def test_after_three_deaths_the_session_is_told(
+    worker: ProcessWorker, requests: list[FitRequest], happened: Happened
+) -> None:
     worker.submit(requests[0])
     told: list[Trouble] = []
     killed: set[int] = set()
@@ -140,9 +145,10 @@ def test_after_three_deaths_the_session_is_told(worker: ProcessWorker, requests:
     assert pauses[-1] > pauses[0], "the pause grows"
     (reply,) = answers(worker, requests[1])
     assert reply.estimate is not None, "the next window is fitted again"
+    happened(11, f"killed on every try: given up after 3, said; pauses {pauses} s; the next window was fitted")
 
 
-def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest]) -> None:
+def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest], happened: Happened) -> None:
     worker = ProcessWorker(PELICAN, memory_mb=40)
     deadline = time.monotonic() + 60.0
     told: list[Trouble] = []
@@ -151,6 +157,7 @@ def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest
         time.sleep(0.01)
     worker.close()
     assert "fit process ended" in told[0].text
+    happened(11, "40 MiB of memory for the fit process: it ended, the service lived and said so")
 
 
 def test_a_child_ends_with_its_parent() -> None:

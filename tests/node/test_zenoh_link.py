@@ -14,6 +14,7 @@ from quadid_cli.watch import snapshot, table
 from quadid_node.zenoh_link import Fleet, ZenohError, ZenohLink, key_of
 
 from quadid.online.records import Diagnosed, OnlineFinding
+from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.test_gate import TRUE, online_set
 
@@ -78,7 +79,7 @@ def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
         link.close()
 
 
-def test_forged_values_and_spying_are_refused_by_the_router(net: Net) -> None:
+def test_forged_values_and_spying_are_refused_by_the_router(net: Net, happened: Happened) -> None:
     watcher = Fleet(net.client("watch"))
     mallory = zenoh.open(zenoh.Config.from_file(net.client("quad2")))
     victim = ZenohLink(net.client("quad1"), "quad1", service())
@@ -98,6 +99,10 @@ def test_forged_values_and_spying_are_refused_by_the_router(net: Net) -> None:
         assert stolen == []
         told = [r for r in mallory.get("quadid/quad1/command/rollback", timeout=1.0) if r.ok is not None]
         assert told == []
+        happened(
+            16,
+            "put, get, subscription, command under another vehicle's name: refused by certificate name",
+        )
         spy.undeclare()  # type: ignore[no-untyped-call]
     finally:
         for session in (watcher, victim):
@@ -106,7 +111,7 @@ def test_forged_values_and_spying_are_refused_by_the_router(net: Net) -> None:
 
 
 @pytest.mark.parametrize("how", ["foreign authority", "no certificate", "no TLS"])
-def test_who_has_no_certificate_of_ours_does_not_get_in(net: Net, how: str) -> None:
+def test_who_has_no_certificate_of_ours_does_not_get_in(net: Net, how: str, happened: Happened) -> None:
     if how == "foreign authority":
         config = zenoh.Config.from_file(net.client("quad1", "foreign"))
         config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(net.folder / "certs" / "ca.pem")))
@@ -124,15 +129,17 @@ def test_who_has_no_certificate_of_ours_does_not_get_in(net: Net, how: str) -> N
         try:
             session = zenoh.open(config)
         except zenoh.ZError:
+            happened(16, f"{how}: refused at the door")
             return
         heard = [r for r in session.get("quadid/**", timeout=1.0) if r.ok is not None]
         session.close()  # type: ignore[no-untyped-call]
         assert heard == []
+        happened(16, f"{how}: let in nowhere, heard nothing")
     finally:
         link.close()
 
 
-def test_garbage_and_floods_are_counted_not_shown(net: Net) -> None:
+def test_garbage_and_floods_are_counted_not_shown(net: Net, happened: Happened) -> None:
     fleet = Fleet(net.client("watch"))
     rogue = zenoh.open(zenoh.Config.from_file(net.client("quad3")))
     try:
@@ -162,6 +169,7 @@ def test_garbage_and_floods_are_counted_not_shown(net: Net) -> None:
         console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
         console.print(table(snapshot(fleet)))
         assert "\x1b[31m" not in console.export_text()
+        happened(16, f"flood of 2000 values, {len(garbage)} kinds of garbage: not shown; the last value arrived")
     finally:
         fleet.close()
         rogue.close()  # type: ignore[no-untyped-call]

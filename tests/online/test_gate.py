@@ -16,6 +16,7 @@ from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia
 from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
 
 PELICAN = Vehicle.shipped("pelican")
 TRUE = dict(zip(NOMINAL_NAMES, (2.33e-5, 4.96e-7, 0.010, 0.0136, 0.0226, 5e-5), strict=True))
@@ -94,7 +95,7 @@ def test_a_moderate_step_waits_for_a_person_even_in_auto() -> None:
 
 
 @pytest.mark.parametrize("name", ["b", "J_xx", "J_yy"])
-def test_small_steps_do_not_creep_past_the_baseline(name: str) -> None:
+def test_small_steps_do_not_creep_past_the_baseline(name: str, happened: Happened) -> None:
     settings, baseline = GateSettings(), online_set(TRUE)
     force = baseline
     factor = 1.0
@@ -105,6 +106,7 @@ def test_small_steps_do_not_creep_past_the_baseline(name: str) -> None:
             break
         force = online_set(scaled(**{name: factor}))
     assert 1.3 < factor < 1.0 + settings.creep + 0.05
+    happened(17, f"{name} in steps of 2 %: stopped at {factor - 1.0:+.0%} of the approved baseline")
 
 
 def test_a_sharper_set_is_news() -> None:

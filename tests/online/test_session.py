@@ -132,7 +132,7 @@ def test_a_restored_set_is_published_stale_and_confirmed_by_flight() -> None:
     assert not session.status().stale
 
 
-def test_a_rollback_while_a_fit_runs_ignores_that_fit() -> None:
+def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> None:
     stream = samples(flight(24.0, 9).recording)
     session = Session(PELICAN, QUICK)
     drive(session, [s for s in stream if s.t < 20.0])
@@ -152,6 +152,7 @@ def test_a_rollback_while_a_fit_runs_ignores_that_fit() -> None:
         assert published(actions)[0].state is SetState.ROLLED_BACK
         assert session.status().approval == "manual"
         assert not published(actions, "candidate")
+        happened(19, "rollback while a fit runs: the earlier set is in force again, the fit's answer is ignored")
 
 
 def test_a_set_that_turns_out_worse_is_taken_back() -> None:

@@ -1,0 +1,90 @@
+"""The node's publishers: candidates, findings, status, health; and parameter sets while the topic is ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from quadid_node import messages
+from quadid_node.claim import Claim
+from quadid_node.convert import message_class, to_message
+
+LATCHED_QOS = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+)  # fmt: skip
+KINDS = {
+    "parameters": messages.PARAMETER_SET, "candidate": messages.PARAMETER_SET, "diagnosis": messages.DIAGNOSIS,
+    "status": messages.FIT_STATUS, "diagnostics": messages.DIAGNOSTICS,
+}  # fmt: skip
+_NAMES = {**messages.TOPICS, "status": "quadid/status", "diagnostics": "/diagnostics"}
+
+
+class Speaker:
+    """Publishes for one vehicle.
+
+    Attributes:
+        ours: full name of the topic of parameter sets.
+    """
+
+    def __init__(self, node: LifecycleNode, observer: bool, deaf: Callable[[str], None]) -> None:
+        """Makes the publishers.
+
+        Args:
+            node: whose they are.
+            observer: publish status and health only.
+            deaf: takes the topic of a subscriber that asks for a QoS that is not offered.
+        """
+        self._node, self._deaf = node, deaf
+        self.ours = node.resolve_topic_name(_NAMES["parameters"])
+        self._publishers = {topic: self._create(topic, 10) for topic in KINDS if topic != "parameters"}
+        self._claim: Claim | None = None
+        if not observer:
+            self._claim = Claim(
+                lambda: node.count_publishers(self.ours), self._claimed, node.destroy_lifecycle_publisher
+            )
+
+    @property
+    def silent(self) -> bool:
+        """Whether results stay unsaid: an observer, or another service speaks for this vehicle."""
+        return self._claim is None or self._claim.publisher is None
+
+    @property
+    def problem(self) -> str:
+        """Who else publishes parameter sets, or empty."""
+        return self._claim.problem if self._claim is not None else ""
+
+    def step(self) -> bool:
+        """Looks who else publishes parameter sets; True when the topic has just become ours."""
+        return self._claim is not None and self._claim.step()
+
+    def publish(self, topic: str, fields: messages.Message) -> None:
+        """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
+        publisher = self._publishers.get(topic)
+        if topic == "parameters" and self._claim is not None:
+            publisher = self._claim.publisher
+        if publisher is not None:
+            publisher.publish(to_message(KINDS[topic], fields))
+
+    def close(self) -> None:
+        """Takes all publishers away."""
+        if self._claim is not None:
+            self._claim.let_go()
+        for publisher in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        self._publishers.clear()
+
+    def _create(self, topic: str, qos: Any) -> Any:
+        full = self._node.resolve_topic_name(_NAMES[topic])
+        events = PublisherEventCallbacks(incompatible_qos=lambda event: self._deaf(full))
+        return self._node.create_lifecycle_publisher(
+            message_class(KINDS[topic]), _NAMES[topic], qos, event_callbacks=events
+        )
+
+    def _claimed(self) -> Any:
+        publisher = self._create("parameters", LATCHED_QOS)
+        publisher.on_activate(None)  # made after the node's own activation
+        return publisher
