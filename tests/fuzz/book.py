@@ -70,11 +70,13 @@ def page(book: Mapping[str, Sequence[Run]]) -> str:
         "",
         "## Runs",
         "",
-        "| format | inputs from | to | findings | date | revision |",
+        "| format | inputs from | to | findings | date | revision | note |",
         "|---|---|---|---|---|---|",
     ]
     for kind in FORMATS:
         for run in book.get(kind, []):
             span = f"{run['start']:,} | {run['stop'] - 1:,}"
-            lines.append(f"| {kind} | {span} | {run['findings']} | {run['date']} | {run['revision']} |")
+            lines.append(
+                f"| {kind} | {span} | {run['findings']} | {run['date']} | {run['revision']} | {run.get('note', '')} |"
+            )
     return "\n".join(lines) + "\n"
