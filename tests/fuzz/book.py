@@ -71,7 +71,7 @@ def page(book: Mapping[str, Sequence[Run]]) -> str:
         "## Runs",
         "",
         "| format | inputs from | to | findings | date | revision | note |",
-        "|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|",
     ]
     for kind in FORMATS:
         for run in book.get(kind, []):
