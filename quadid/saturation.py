@@ -30,13 +30,13 @@ class AtLimit(NamedTuple):
     Attributes:
         axis: column.
         level: the value that is not left, in the unit of the values.
-        count: samples there.
+        samples: how many are there.
         share: of the column's finite samples.
     """
 
     axis: int
     level: float
-    count: int
+    samples: int
     share: float
 
 

@@ -171,6 +171,8 @@ class Vehicle(_Strict):
     @field_validator("effects", mode="before")
     @classmethod
     def _known_effects(cls, value: Any) -> Any:
+        if not isinstance(value or {}, dict):
+            raise ValueError("effects must map names of effects to their parameters, as {motor_lag: {tau: 0.03}}")
         for name, numbers in (value or {}).items():
             if name not in EFFECTS:
                 raise ValueError(f"unknown effect '{name}'; {nearest(str(name), EFFECTS)}")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtr, stdtrit
 
 from quadid.identify.shooting import Linearised
 
@@ -73,7 +73,7 @@ class Gain:
         n = len(self.blocks)
         if n < 3 or self.error <= 0.0:
             return 1.0 if self.total <= 0.0 else 0.0
-        return float(stats.t.sf(self.total / self.error, n - 1))
+        return float(stdtr(n - 1, -self.total / self.error))
 
     @property
     def spread(self) -> bool:
@@ -86,7 +86,7 @@ class Gain:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the total."""
-        half = float(stats.t.ppf(0.975, max(len(self.blocks) - 1, 1))) * self.error
+        half = float(stdtrit(max(len(self.blocks) - 1, 1), 0.975)) * self.error
         return self.total - half, self.total + half
 
 

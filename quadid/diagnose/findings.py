@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scipy.stats import chi2
-
+from quadid.chi_square import survival
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
@@ -58,7 +57,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
 
 def _p_value(search: Search, cause: Candidate) -> float:
     """Chance of numbers so far from neutral without the effect, by the robust Wald statistic, for all causes tried."""
-    return min(1.0, float(chi2.sf(search.model.wald(cause), len(cause.names))) * search.tests)
+    return min(1.0, survival(search.model.wald(cause), len(cause.names)) * search.tests)
 
 
 def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]) -> tuple[FoundParameter, ...]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from quadid.chi_square import exceeded, survival
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
@@ -171,7 +171,7 @@ def _drafts(
 ) -> list[_Draft]:
     """Candidates to refit: the best by prediction, and look-alikes that come near them."""
     far = model.misfit > LINEAR_MISFIT
-    least = 0.5 * max(float(stats.chi2.isf(FALSE_ALARM / tests, 1)), LEAST_GAIN, LEAST_SHARE * model.rows)
+    least = 0.5 * max(exceeded(FALSE_ALARM / tests, 1), LEAST_GAIN, LEAST_SHARE * model.rows)
     linear = [s for s in scores if not s.candidate.starts and s.drop > least][:MOST_SKETCHES]
     thin, base, every = thinned(shooting, model, FAR_SEGMENTS) if far else (shooting, model, 1)
     drafts = []
@@ -244,7 +244,7 @@ def _significant(gain: Gain, evidence: float, cause: Candidate, tests: int, cont
     return (
         (gain.total > ERRORS * gain.error or gain.spread)
         and gain.total > least
-        and float(stats.chi2.sf(evidence, len(cause.names))) * tests < FALSE_ALARM
+        and survival(evidence, len(cause.names)) * tests < FALSE_ALARM
     )
 
 

@@ -35,6 +35,8 @@ LEAD_SECONDS = 0.2
 _TANGENT_STEP = np.array([1e-6] * 3 + [1e-6] * 3 + [1e-5] * 3 + [1e-5] * 3)
 _RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 """Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
+RAN_AWAY = 1e30
+"""Products of whitened columns above which, or without a value, a simulation has left every scale of a flight."""
 LOCAL_SIGMA = 10.0
 """Standard deviation, in typical sizes, of parameters that are free in every segment (`Shooting.local`)."""
 VELOCITY_PRIOR = 4.0
@@ -230,7 +232,7 @@ class Shooting:
     ) -> Linearised:  # fmt: skip
         count, width = len(grams), grams.shape[1] - 1
         # A simulation that ran away has an infinite cost, which every search steps back from.
-        away = 0.0 if np.isfinite(grams).all() else np.inf
+        away = 0.0 if np.max(np.abs(grams), initial=0.0) < RAN_AWAY else np.inf
         h = grams if away == 0.0 else np.zeros_like(grams)
         own = k + len(self.local)
         haa, hab, hbb = h[:, :own, :own].copy(), h[:, :own, own:width], h[:, own:width, own:width]

@@ -112,7 +112,7 @@ def geometry_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
 
 def _map(torque: FloatArray, answer: FloatArray) -> tuple[float, FloatArray]:
     """Least-squares map (2, 2) from torque (n, 2) to answer (n, 2), and the share of variance it explains."""
-    a = np.linalg.lstsq(torque, answer, rcond=None)[0]
+    a = np.asarray(np.linalg.lstsq(torque, answer, rcond=None)[0], dtype=np.float64)
     total = float(np.sum(answer**2))
     return (1.0 - float(np.sum((answer - torque @ a) ** 2)) / total if total > 0.0 else 0.0), a
 

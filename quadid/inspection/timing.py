@@ -44,7 +44,7 @@ def _facts(channel: Channel, gap: float) -> ChannelFacts:
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
         stuck=_longest_rest(channel.t, same),
-        saturated=sum(end.count for end in at_limit(channel.values))
+        saturated=sum(end.samples for end in at_limit(channel.values))
         if channel.name in ("gyro", "accel", "motor_command")
         else 0,
         dropped=dict(channel.faults),

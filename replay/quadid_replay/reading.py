@@ -7,9 +7,11 @@ an MCAP that may inflate, could still take more memory than there is; the child 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import pickle
 import resource
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,18 +25,21 @@ MEMORY, SECONDS = "QUADID_READ_MEMORY_MB", "QUADID_READ_SECONDS"
 """Environment variables that override the limits."""
 LARGEST_MEMORY_MB = 8192
 LEAST_SECONDS, SECONDS_A_MIB = 60.0, 3.0
+STANDING = 20.0
+"""Times the limit of processor time that a reader may take by the clock: a busy machine is no fault of the log."""
 _MIB = 1 << 20
 
 
 class Limits(NamedTuple):
-    """What reading one log may take: memory [MiB], time [s]."""
+    """What reading one log may take: memory [MiB], processor time [s]."""
 
     memory: int
     seconds: float
 
 
 def limits(size: int) -> Limits:
-    """Limits for a file of `size` bytes: half of this machine's memory, at most 8 GiB, and 60 s plus 3 s a MiB.
+    """Limits for a file of `size` bytes: half of this machine's memory, at most 8 GiB, and 60 s plus 3 s a MiB
+    of processor time.
 
     Raises:
         LogError: an environment variable that is no positive number.
@@ -64,17 +69,16 @@ def read_in_child(path: Path, preset: str) -> Recording:
         LogError: what the reader says; or the log needs more memory or time than the limits, which the error names.
     """
     allowed = limits(path.stat().st_size)
-    command = [sys.executable, "-m", __name__, str(path.absolute()), preset, str(allowed.memory)]
+    command = [sys.executable, "-m", __name__, str(path.absolute()), preset, str(allowed.memory), str(allowed.seconds)]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as child:
         try:
-            answer, _ = child.communicate(timeout=allowed.seconds)
+            answer, _ = child.communicate(timeout=STANDING * allowed.seconds)
         except subprocess.TimeoutExpired as error:
-            raise LogError(
-                f"{path.name}: reading it takes longer than {allowed.seconds:.0f} s", "logs that are read faster",
-                f"cut it into parts, or allow more time with {SECONDS}",
-            ) from error  # fmt: skip
+            raise _too_slow(path, STANDING * allowed.seconds) from error
         finally:
             child.kill()
+    if child.returncode == -signal.SIGXCPU:
+        raise _too_slow(path, allowed.seconds)
     try:
         result = pickle.loads(answer)  # written by our own child
     except (EOFError, pickle.UnpicklingError) as error:
@@ -88,6 +92,13 @@ def read_in_child(path: Path, preset: str) -> Recording:
     return replace(recording, channels={name: replace(channel) for name, channel in recording.channels.items()})
 
 
+def _too_slow(path: Path, seconds: float) -> LogError:
+    return LogError(
+        f"{path.name}: reading it takes longer than {seconds:.0f} s", "logs that are read faster",
+        f"cut it into parts, or allow more time with {SECONDS}",
+    )  # fmt: skip
+
+
 def _too_large(path: Path, allowed: Limits, how: str = "") -> LogError:
     return LogError(
         f"{path.name}: reading it takes more than {allowed.memory} MiB of memory{how}", "logs that fit",
@@ -95,11 +106,12 @@ def _too_large(path: Path, allowed: Limits, how: str = "") -> LogError:
     )  # fmt: skip
 
 
-def _child(path: Path, preset: str, memory: int) -> None:
+def _child(path: Path, preset: str, memory: int, seconds: float) -> None:
     """What the child does: the answer goes to stdout, and whatever a library prints to stderr."""
     from quadid_replay.opening import read_here
 
     resource.setrlimit(resource.RLIMIT_DATA, (memory * _MIB, memory * _MIB))
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 5))
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)
         try:
@@ -115,4 +127,4 @@ def _child(path: Path, preset: str, memory: int) -> None:
 
 
 if __name__ == "__main__":
-    _child(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
+    _child(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))

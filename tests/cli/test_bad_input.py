@@ -219,6 +219,7 @@ def test_nan_in_a_log_is_left_out(inside: Cli, flights: Flights, tmp_path: Path)
             "triangle",
         ),
         (_pelican(effects={"motor_lga": {"tau": 0.1}}), "did you mean 'motor_lag'?"),
+        (_pelican(effects=[1]), "effects must map names"),
         (_pelican(rotors=[]), "rotors"),
         ("[1, 2", "not YAML"),
         ("just text", "mapping"),
