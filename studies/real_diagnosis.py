@@ -56,6 +56,7 @@ class Flights:
     scored: tuple[str, ...] = ()
 
 
+SCORED = tuple(f"nanodrone/{n}_run4.csv" for n in ("random", "chirp", "square"))
 FLIGHTS = (
     Flights(
         "crazyflie", "Crazyflie, measured rotor speeds, figure eights",
@@ -83,20 +84,39 @@ from other flights and another signal.""",
     ),
     Flights(
         "nanodrone", "Nano-drone (Crazyflie 2.1 Brushless)",
+        ("nanodrone/random_run1.csv", "nanodrone/square_run1.csv"), ("nanodrone/random_run3.csv",),
+        "nanodrone/vehicle.yaml",
+        """\
+Rotor drag and its moment again carry nearly all. The verdict stays `unknown`, as it should: the states of these files
+were low-passed without delay, shifted by a constant each, and rows are missing; no entry of the catalogue says that.
+J_xx and J_yy come out well above the published 2.5e-5 and 2.8e-5, because what was filtered away looks like inertia.
+Three weak rotors at once are a thrust scale that the fourth does not share, which an offset of the centre of gravity
+explains nearly as well. The file is refitted to predict: its inertias are no inertias any more.""",
+        scored=SCORED,
+    ),
+    Flights(
+        "nanodrone-chirp", "Nano-drone, with a chirp flight among those to learn from",
         tuple(f"nanodrone/{n}_run1.csv" for n in ("random", "chirp", "square")),
         tuple(f"nanodrone/{n}_run3.csv" for n in ("random", "chirp", "square")),
         "nanodrone/vehicle.yaml",
         """\
-REMARK""",
-        scored=tuple(f"nanodrone/{n}_run4.csv" for n in ("random", "chirp", "square")),
+With the chirp the search does not get out of the nominal basin, and finds drag alone; the refit for prediction, which
+begins at the vehicle file on short segments, does. It beats "no change" in all four quantities on random and square
+flights, not in rotation and rate on the chirp, which hardly turns. Beside the published models, as shares of "no
+change": position is better than all of them on the random flight, velocity within a tenth of the best, rate better than
+three of four; rotation is worse than all. On the square flight, ten times livelier, position and velocity are behind
+and rotation and rate far ahead. One rigid body with constants serves both kinds of flight only so far: fitted to random
+and chirp flights alone it predicts those better, and squares worse.""",
+        scored=SCORED,
     ),
     Flights(
         "ardupilot", "ArduCopter DataFlash", ("ardupilot/log171.bin@76:146",), ("ardupilot/log171.bin@146:216",),
         str(HERE / "log171.yaml"),
         """\
 Mass, arm and top speed are assumptions here, and the thrust curve of the autopilot is not a square. Causes are listed,
-none is confident: the inertias run to their bounds and structure is left in all channels. An honest answer, and not yet
-a useful one.""",
+none is confident: a vertical accelerometer bias of -5 m/s² stands for that curve, the inertias run to their bounds and
+structure is left in all channels. As a physical description this is not yet useful. As a prediction it is: refitted,
+the rate half a second ahead is missed by little more than half of what the findings' own parameters miss it by.""",
     ),
     Flights(
         "mcap-rpm", "Crazyflie figure eight as ROS 2 MCAP", ("mcap/crazyflie_figure8_35.mcap",), (),
@@ -108,9 +128,9 @@ Five seconds with an inertial unit alone: structure is seen in all rates, and no
         "mcap-pwm", "Crazyflie, PWM commands, ROS 2 MCAP", ("mcap/crazyflie_rollpitch.mcap",), (),
         f"{CF}/vehicle_pwm.yaml",
         """\
-A delay of 36 ms stands for the lag of about 40 ms between command and speed. The vertical accelerometer bias of -5 m/s²
-is none: it makes up for a thrust coefficient that the curve of the pulse width drove away. It is beyond what any
-accelerometer has, so nothing is called confident; `thrust_curve` is among the look-alikes that lost to it.""",
+A delay of 36 ms stands for the lag of about 40 ms between command and speed, and gains nearly all that is gained.
+Thrust is no square of the pulse width, which shows in what is left of a_z; a damping that drives the motion is none.
+Nothing is called confident.""",
     ),
 )  # fmt: skip
 

@@ -1,0 +1,115 @@
+"""Faults of topics and processes around the real node, over DDS: silence, rivals, signals, power cuts."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from quadid_replay import write_mcap
+
+from tests.faults.evidence import Happened
+from tests.node.peers import Ear, node, player
+from tests.node.test_ros_node import latched, level, message
+from tests.online.driving import flight
+
+pytestmark = pytest.mark.usefixtures("ros")
+OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("faults") / "flight.mcap"
+    write_mcap(path, flight(60.0, 6).recording)
+    return path
+
+
+@pytest.fixture
+def ear() -> Iterator[Ear]:
+    with Ear() as made:
+        yield made
+
+
+def rate(health: list[Any], channel: str) -> float:
+    entry = next(s for s in health[-1].status if s.name.endswith("inputs"))
+    return next((float(v.value) for v in entry.values if v.key == f"{channel} [Hz]"), 0.0)
+
+
+@pytest.mark.slow
+def test_silence_and_rivals_on_the_topics(log: Path, tmp_path: Path, ear: Ear, happened: Happened) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from quadid_msgs.msg import FitStatus, ParameterSet
+    from sensor_msgs.msg import Imu
+
+    with node(tmp_path / "h.sqlite") as identify:
+        health = ear.listen("/diagnostics", DiagnosticArray)
+        status = ear.listen("quadid/status", FitStatus)
+        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        identify.wait_for("ready", 120.0)
+        with player(log, 1.0) as vehicle:
+            assert ear.until(lambda: sets, 60.0), identify.text
+            rogue = ear.node.create_publisher(Imu, "imu", 10)
+            assert ear.until(lambda: "2 publishers" in message(health, "inputs"), 20.0), message(health, "inputs")
+            assert level(health, "inputs") == ERROR
+            assert ear.until(lambda: rate(health, "gyro") == 0.0, 10.0), "paused: nothing is taken in"
+            ear.node.destroy_publisher(rogue)
+            assert ear.until(lambda: level(health, "inputs") == OK, 20.0), identify.text
+            happened(15, "second IMU publisher: ERROR naming topic and count, nothing taken in until it was gone again")
+            vehicle.end()
+        held, fits = sets[-1], status[-1].fits
+        first = len(health)
+        assert ear.until(lambda: level(health, "inputs") == ERROR and "silent" in message(health, "inputs"), 20.0)
+        levels = [next(s.level for s in h.status if s.name.endswith("inputs")) for h in health[first:]]
+        assert WARN in levels[: levels.index(ERROR)], "first a warning, then an error"
+        with Ear() as late:
+            again = late.listen("quadid/parameters", ParameterSet, latched())
+            assert late.until(lambda: again, 20.0)
+            assert list(again[0].values) == list(held.values)
+        with player(log, 2.0) as vehicle:
+            assert ear.until(lambda: level(health, "inputs") == OK, 30.0), message(health, "inputs")
+            assert ear.until(lambda: status[-1].fits > fits, 40.0), identify.text
+            vehicle.end()
+        happened(
+            9,
+            "vehicle gone: WARN, then ERROR naming the silent channel; a late subscriber still got the last set; "
+            "publisher restarted: OK again, fits go on",
+        )
+        assert identify.end()[0] == 0
+
+
+@pytest.mark.slow
+def test_a_power_cut_in_flight_and_signals_while_it_starts(
+    log: Path, tmp_path: Path, ear: Ear, happened: Happened
+) -> None:
+    from quadid_msgs.msg import ParameterSet
+
+    history = tmp_path / "h.sqlite"
+    sets = ear.listen("quadid/parameters", ParameterSet, latched())
+    with node(history) as identify:
+        identify.wait_for("ready", 120.0)
+        with player(log, 2.0) as vehicle:
+            assert ear.until(lambda: sets, 60.0), identify.text
+            ear.until(lambda: False, 1.0)
+            identify.end(signal.SIGKILL)
+            vehicle.end()
+    last = sets[-1]
+    spent = []
+    for number, after in ((signal.SIGTERM, 0.7), (signal.SIGINT, 1.5), (signal.SIGINT, 3.0)):
+        with node(history) as starting:
+            time.sleep(after)
+            code, took = starting.end(number)
+            spent.append(took)
+            assert code in (0, -number), starting.text
+            assert code == 0 or not starting.lines, "only before its first line may a signal end it the hard way"
+    with node(history) as restarted:
+        assert ear.until(lambda: sets[-1].state == ParameterSet.STATE_STALE, 90.0), restarted.text
+        assert restarted.end(signal.SIGTERM)[0] == 0
+    assert (sets[-1].sequence, list(sets[-1].values)) == (last.sequence, list(last.values))
+    times = ", ".join(f"{s:.1f}" for s in spent)
+    happened(
+        13, f"SIGTERM or SIGINT 0.7, 1.5, 3 s after the start: gone after {times} s (measured beside other programs)"
+    )
+    happened(13, f"kill -9 in flight: set {last.sequence} came back as stale with the same bits")

@@ -1,0 +1,177 @@
+"""The history under real faults: a full disk, a read-only one, a lock held elsewhere, bytes overwritten in flight."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from quadid_node.service import Output, Service
+from quadid_node.store import Store, read_history
+from quadid_node.worker import InlineWorker
+
+from quadid.online import SessionSettings, SetState
+from quadid.online.records import Event, OnlineSet
+from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
+from tests.online.driving import flight, samples
+from tests.online.test_gate import TRUE, online_set
+
+PELICAN = Vehicle.shipped("pelican")
+
+
+def until(done: Callable[[], object], seconds: float = 60.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not done() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return bool(done())
+
+
+def mount(where: Path, options: str) -> None:
+    where.mkdir(exist_ok=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(where)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"this machine does not let us mount: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 400 KiB."""
+    where = tmp_path / "disk"
+    mount(where, "size=400k")
+    yield where
+    subprocess.run(["umount", "-l", str(where)], check=False)
+
+
+def in_force(sequence: int) -> OnlineSet:
+    return replace(online_set(TRUE), sequence=sequence, approved_by="auto")
+
+
+def test_a_disk_that_is_full_is_said_and_what_came_meanwhile_is_written_later(
+    small_disk: Path, happened: Happened
+) -> None:
+    path = small_disk / "h.sqlite"
+    store = Store(path, "pelican")
+    store.numbered(in_force(1))
+    assert until(lambda: len(read_history(path, "pelican")["sets"]) == 1)
+    filler = small_disk / "filler"
+    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(b"x" * 4096)
+    service = Service(PELICAN, SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
+    for sample in samples(flight(8.0, 6).recording):
+        service.push(sample)
+    said: list[Output] = []
+    while service.session.running is not None or not service.session.status().fits:
+        said += service.step()
+    for k in range(20):
+        store.event(Event(float(k), "info", "test", "x" * 2000))
+    assert until(lambda: store.problem)
+    assert "full" in store.problem or "I/O" in store.problem
+    said += service.step()
+    assert any(isinstance(o, Event) and o.kind == "history" and o.level == "error" for o in said)
+    assert service.session.status().fits > 0, "the session went on"
+    assert read_history(path, "pelican")["sets"][0]["sequence"] == 1, "what is there can be read"
+    problem = store.problem.split("(", 1)[-1].split(")")[0]
+    filler.unlink()
+    assert until(lambda: not store.problem)
+    store.close(60.0)
+    assert len(read_history(path, "pelican", events=100)["events"]) >= 20
+    happened(
+        12,
+        f"disk of 400 KiB really full: fits went on, said '{problem}', old sets readable; with room again everything "
+        "kept in memory was written",
+    )
+
+
+def test_a_read_only_home_is_said_and_the_service_goes_on(tmp_path: Path, happened: Happened) -> None:
+    home = tmp_path / "home"
+    mount(home, "size=400k,ro")
+    try:
+        store = Store(home / "deep" / "h.sqlite", "pelican")
+        assert "cannot be written (Read-only file system)" in store.problem
+        service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
+        assert any(isinstance(o, Event) and "Read-only" in o.text for o in service.step())
+        store.numbered(in_force(1))
+        store.close()
+    finally:
+        subprocess.run(["umount", "-l", str(home)], check=False)
+    happened(12, "read-only file system: the service starts and says that this run's history is lost")
+
+
+def test_a_lock_held_by_another_program_delays_and_loses_nothing(tmp_path: Path, happened: Happened) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    code = (
+        "import sqlite3, sys; db = sqlite3.connect(sys.argv[1]); db.execute('BEGIN EXCLUSIVE')\n"
+        "print('locked', flush=True); sys.stdin.read(); db.rollback()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdin is not None
+        assert other.stdout.readline() == "locked\n"
+        for k in range(300):
+            store.event(Event(float(k), "info", "test", "while locked"))
+        store.numbered(in_force(1))
+        assert until(lambda: "locked" in store.problem)
+        other.stdin.close()
+    assert until(lambda: not store.problem)
+    store.close(60.0)
+    found = read_history(path, "pelican", events=500)
+    assert (len(found["events"]), len(found["sets"])) == (300, 1)
+    happened(12, "locked by another process for over 5 s: said; all 300 events and the set were written afterwards")
+
+
+@pytest.mark.parametrize("damage", ["pages", "head", "removed"])
+def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in_force(
+    tmp_path: Path, damage: str, happened: Happened
+) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    for k in range(40):
+        store.numbered(in_force(k + 1))
+    assert until(lambda: len(read_history(path, "pelican")["sets"]) == 40)
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    before = path.read_bytes()
+    if damage == "removed":
+        path.unlink()
+    else:
+        keep = 0 if damage == "head" else 4096
+        path.write_bytes(before[:keep] + os.urandom(len(before) - keep))
+    service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
+    for k in range(10):
+        store.event(Event(float(k), "info", "test", "after"))
+    assert until(lambda: len(_events(path)) >= 10), store.problem
+    assert until(lambda: not store.problem)
+    aside = [p for p in tmp_path.iterdir() if ".damaged-" in p.name and not p.name.endswith(("-wal", "-shm"))]
+    if damage != "removed":
+        assert [p.stat().st_size for p in aside] == [len(before)], "set aside as it was"
+        assert any(isinstance(o, Event) and "set aside" in o.text for o in service.step())
+    store.close(60.0)
+    again = Store(path, "pelican")
+    restored = again.restore()
+    again.close()
+    assert restored.item is not None
+    assert (restored.item.sequence, restored.item.state) == (40, SetState.ACCEPTED)
+    what = "new file" if damage == "removed" else "set aside whole, said"
+    happened(12, f"history damaged in service ({damage}): {what}; the new one begins with the set in force")
+
+
+def _events(path: Path) -> list[object]:
+    try:
+        with sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True) as db:
+            return db.execute("SELECT id FROM events").fetchall()
+    except sqlite3.Error:
+        return []
