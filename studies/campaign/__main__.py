@@ -27,15 +27,16 @@ def run_many(todo: Sequence[Case], processes: int, records: Path | None) -> list
 
 
 def kept(records: Path) -> list[Graded]:
-    """Answers of an earlier run of the same code."""
-    out = []
+    """Answers of an earlier run of the same code, the latest to each case."""
+    out = {}
     for text in records.read_text(encoding="utf-8").splitlines():
         data = json.loads(text)
         case = Case(**{**data.pop("case")})
         data["intervals"] = {e: {n: tuple(v) for n, v in p.items()} for e, p in data["intervals"].items()}
         case = Case(**{**asdict(case), "expected": tuple(case.expected)})
-        out.append(Graded(case, **{**data, "named": tuple(data["named"]), "listed": tuple(data["listed"])}))
-    return out
+        graded = Graded(case, **{**data, "named": tuple(data["named"]), "listed": tuple(data["listed"])})
+        out[case.group, case.number] = graded
+    return list(out.values())
 
 
 def main() -> None:
@@ -54,7 +55,7 @@ def main() -> None:
     for group in options.groups.split(","):
         name, _, count = group.partition(":")
         wanted = cases(name, int(count or options.count or GROUPS[name]), options.start)
-        have = {(g.case.group, g.case.number) for g in done}
+        have = {(g.case.group, g.case.number) for g in everything}
         graded = run_many([c for c in wanted if (c.group, c.number) not in have], options.processes, records)
         everything += graded
         mine = [g for g in everything if g.case.group == name]
