@@ -11,7 +11,7 @@ from quadid.effects import EFFECTS
 from quadid.identify.noise import NoiseModel, estimate_noise
 from quadid.identify.polish import FloatArray, Polished, polish
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.spectrum import LEAST_SEGMENTS, shaped_noise
+from quadid.identify.spectrum import shaped_noise
 from quadid.model.layout import LOSS, Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
@@ -19,6 +19,8 @@ from quadid.window import Window
 SPECTRUM_SECONDS = 0.5
 LINE_SECONDS = 1.0
 """Segments of this length tell a line of vibration, as in calm flight, from a hump; used where the model follows."""
+LINE_SEGMENTS = 100
+"""Fewest of them: from fewer, so fine a spectrum would be known too poorly to weigh by."""
 FLEXIBLE_DRAG = 0.1
 """Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
 GROWS = 3.0
@@ -149,7 +151,7 @@ def _longest(
 ) -> tuple[Shooting, int]:
     """The longest segments that the flexible model at `theta` follows as well as `longer`; and vectors simulated."""
     out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
-    if out.count < LEAST_SEGMENTS:
+    if out.count < LINE_SEGMENTS:
         return longer, 0
     settled = out.free([n for n in _SETTLING if n in names])
     fitted = polish(out, theta, settled, iterations=3)
