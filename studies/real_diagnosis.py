@@ -104,9 +104,8 @@ With the chirp the search does not get out of the nominal basin, and finds drag 
 begins at the vehicle file on short segments, does. It beats "no change" in all four quantities on random and square
 flights, not in rotation and rate on the chirp, which hardly turns. Beside the published models, as shares of "no
 change": position is better than all of them on the random flight, velocity within a tenth of the best, rate better than
-three of four; rotation is worse than all. On the square flight, ten times livelier, position and velocity are behind
-and rotation and rate far ahead. One rigid body with constants serves both kinds of flight only so far: fitted to random
-and chirp flights alone it predicts those better, and squares worse.""",
+three of four; rotation is worse than all. On the square flight, six times livelier, position and velocity are behind
+and rotation and rate far ahead. One rigid body with constants serves both kinds of flight only so far.""",
         scored=SCORED,
     ),
     Flights(
