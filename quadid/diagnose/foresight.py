@@ -48,7 +48,7 @@ BETTER = 0.9
 """The refitted parameters are kept when their error is below this share of that of the findings' own."""
 _EXPECTED = np.array([0.3] * 3 + [0.05] * 3 + [1.0] * 3 + [0.1] * 3 + [0.03] * 3)
 """What such a prediction typically misses by: rad/s, rad, m/s^2, m/s, m."""
-SENSOR_EFFECTS = (
+MOTIONLESS = (
     "gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment", "imu_lever_arm", "imu_lag", "attitude_delay",
     "ahrs_acceleration_error",
 )  # fmt: skip
@@ -147,7 +147,7 @@ def _start(vehicle: Vehicle, decisive: Shooting, found: Model) -> FloatArray:
 
 def _moves(cause: Candidate) -> bool:
     """Whether a cause is refitted: it acts on the motion, all the time, and is the same in every flight."""
-    return cause.effect not in SENSOR_EFFECTS and cause.timed is None and not EFFECTS[cause.effect].per_log
+    return cause.effect not in MOTIONLESS and cause.timed is None and not EFFECTS[cause.effect].per_log
 
 
 def _stages(

@@ -43,7 +43,8 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 NOISE_ROSE = 1.5
 """When it rises by more than this the flexible fit has lost its way, and the first estimate stands."""
-SENSOR_EFFECTS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
+SENSOR_ERRORS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
+"""Effects whose size a data sheet bounds."""
 BELIEVABLE = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
 SHARE_TO_NAME = 0.8
@@ -109,9 +110,8 @@ def diagnose(
     if verdict is Verdict.UNKNOWN and search.model.misfit > POOR:
         report("prediction", 0.0)
         foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
-    text = extended_vehicle(vehicle, decisive, search.model)
-    if foresight is not None:
-        text = extended_vehicle(vehicle, foresight.shooting, foresight.model)
+    fitted = (decisive, search.model) if foresight is None else (foresight.shooting, foresight.model)
+    text = extended_vehicle(vehicle, *fitted)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
     warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *([foresight.sentence] if foresight else []))
@@ -210,7 +210,7 @@ def _with_noise(noise: NoiseModel, ladder: Sequence[Shooting], search: Search) -
 def _beyond_belief(shooting: Shooting, model: Model) -> list[str]:
     """Sentences about sensor errors so large that they must stand for something else."""
     out = []
-    for e in shooting.free([n for c in model.causes if c.effect in SENSOR_EFFECTS for n in c.names]).entries:
+    for e in shooting.free([n for c in model.causes if c.effect in SENSOR_ERRORS for n in c.names]).entries:
         value = float(model.theta[e.index])
         if abs(value - e.neutral) > BELIEVABLE * e.typical:
             out.append(
