@@ -44,7 +44,7 @@ class Speaker:
         self._claim: Claim | None = None
         if not observer:
             self._claim = Claim(
-                lambda: node.count_publishers(self.ours), self._claimed, node.destroy_lifecycle_publisher
+                lambda: node.count_publishers(self.ours), self._kin, self._claimed, node.destroy_lifecycle_publisher
             )
 
     @property
@@ -57,9 +57,9 @@ class Speaker:
         """Who else publishes parameter sets, or empty."""
         return self._claim.problem if self._claim is not None else ""
 
-    def step(self) -> bool:
-        """Looks who else publishes parameter sets; True when the topic has just become ours."""
-        return self._claim is not None and self._claim.step()
+    def step(self, wanted: bool = True) -> bool:
+        """Looks who else publishes parameter sets; True when the topic has just become ours, if it is `wanted`."""
+        return self._claim is not None and self._claim.step(wanted)
 
     def publish(self, topic: str, fields: messages.Message) -> None:
         """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
@@ -83,6 +83,11 @@ class Speaker:
         return self._node.create_lifecycle_publisher(
             message_class(KINDS[topic]), _NAMES[topic], qos, event_callbacks=events
         )
+
+    def _kin(self) -> int:
+        """Publishers of parameter sets that belong to a node of our name: services of this vehicle, this one too."""
+        found = self._node.get_publishers_info_by_topic(self.ours)
+        return sum(info.node_name == self._node.get_name() for info in found)
 
     def _claimed(self) -> Any:
         publisher = self._create("parameters", LATCHED_QOS)

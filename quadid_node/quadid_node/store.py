@@ -14,9 +14,10 @@ import queue
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any
 
 from quadid.errors import QuadidError
@@ -36,7 +37,7 @@ CREATE TABLE IF NOT EXISTS events (
     t REAL, wall REAL NOT NULL, data TEXT);
 """
 VERSION = 1
-KEPT = {"candidates": 20_000, "events": 20_000}
+KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets never."""
 PRUNE_EVERY = 1000
 MOST_WAITING = 5000
@@ -75,17 +76,18 @@ class Store:
         notes: what happened on opening (a damaged history set aside).
     """
 
-    def __init__(self, path: Path, vehicle: str) -> None:
+    def __init__(self, path: Path, vehicle: str, kept: Mapping[str, int] = KEPT) -> None:
         """Opens the history, or makes it.
 
         Args:
             path: database file.
             vehicle: name of the vehicle.
+            kept: rows that stay, by table; older ones are forgotten.
 
         Raises:
             StoreError: another service writes the history of this vehicle.
         """
-        self.path, self.vehicle = path, vehicle
+        self.path, self.vehicle, self._kept = path, vehicle, kept
         self.problem = ""
         self.notes: list[str] = []
         self._lock: IO[str] | None = None
@@ -233,7 +235,7 @@ class Store:
                 self._written += len(batch)
                 if self._written >= PRUNE_EVERY:
                     self._written = 0
-                    for table, kept in KEPT.items():
+                    for table, kept in self._kept.items():
                         db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
         except sqlite3.Error as error:
             self.problem = f"{self.path} cannot be written ({error}): kept in memory until it can"

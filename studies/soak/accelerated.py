@@ -19,7 +19,7 @@ from benchmarks.online.memory import resident
 from quadid.online import Publish, SessionSettings
 from quadid.online.answering import Reply
 from quadid.window import Sample
-from quadid_node import store as storing
+from studies.soak import memory
 
 FLIGHT, GROUND = 120.0, 5.0
 """A flight of so long [s] over and over, with a pause of so long between two."""
@@ -69,11 +69,10 @@ def day(
         One entry an hour of flight: memory, files, time a sample and a fit, samples sent, taken and dropped.
     """
     flight = list(samples(flown(FLIGHT, 3).recording))
-    storing.KEPT.update(candidates=kept, events=kept)
     begin, points = time.monotonic(), []
     with tempfile.TemporaryDirectory() as folder:
         worker = TimedWorker()
-        store = Store(Path(folder) / "history.sqlite", "pelican")
+        store = Store(Path(folder) / "history.sqlite", "pelican", {"candidates": kept, "events": kept})
         service = Service(PELICAN, SessionSettings(refit=refit, diagnose=diagnose), worker, store)
         tally = _Tally(service, worker, flight)
         last = round(hours * 3600.0 / (FLIGHT + GROUND))
@@ -106,8 +105,8 @@ class _Tally:
     def __init__(self, service: Service, worker: TimedWorker, flight: list[Sample]) -> None:
         self._service, self._worker, self._flight = service, worker, flight
         self._sent = self._published = 0
+        self._sent_before = self._fits_before = 0
         self._own = self._fits_spent = 0.0
-        self._fits = 0
 
     def fly(self, shift: float) -> None:
         """One flight, `shift` [s] later than the recording."""
@@ -131,11 +130,12 @@ class _Tally:
         taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
         out = {
             "memory_mib": resident(), "sent": self._sent, "taken": taken, "dropped": dropped,
-            "us_a_sample": 1e6 * self._own / max(self._sent - getattr(self, "_before", 0), 1),
-            "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits, 1),
-            "fits": worker.fits, "published": self._published,
+            "us_a_sample": 1e6 * self._own / max(self._sent - self._sent_before, 1),
+            "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits_before, 1),
+            "fits": worker.fits, "published": self._published, "parts": memory.parts(),
         }  # fmt: skip
-        self._before, self._own, self._fits_spent, self._fits = self._sent, 0.0, worker.spent, worker.fits
+        self._sent_before, self._fits_before = self._sent, worker.fits
+        self._own, self._fits_spent = 0.0, worker.spent
         return out
 
 

@@ -18,6 +18,8 @@ from quadid_node.convert import Decoder
 from quadid_node.identify import main
 from quadid_node.presets import Input
 
+from studies.soak import memory
+
 OUT, EVERY = "QUADID_SOAK_OUT", 60.0
 _LAST_DOUBLE = struct.Struct("<d")
 
@@ -46,12 +48,14 @@ class CountingNode(quadid_node.node.IdentifyNode):
         self.noted = time.monotonic()
         ms = 1e3 * np.array(self.late)
         session = self._service.session if self._service is not None else None
+        status = session.status() if session else None
         line = {
             "t": time.time(), "messages": dict(self.counted), "p50": float(np.median(ms)) if len(ms) else None,
             "p99": float(np.quantile(ms, 0.99)) if len(ms) else None, "max": float(ms.max()) if len(ms) else None,
             "taken": dict(session.buffer.counts) if session else {},
             "dropped": dict(session.buffer.faults) if session else {},
-            "fits": session.status().fits if session else 0, "in_force": session.status().in_force if session else 0,
+            "fits": status.fits if status else 0, "in_force": status.in_force if status else 0,
+            "backlog": status.backlog if status else 0.0, "memory": memory.parts(),
         }  # fmt: skip
         self.late = array("d")
         with Path(os.environ[OUT]).open("a") as file:

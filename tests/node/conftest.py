@@ -13,6 +13,7 @@ import pytest
 from quadid.online.fitting import warm_up
 from quadid.vehicle import Vehicle
 from tests.conftest import absent
+from tests.node.peers import Ear
 
 HERE = Path(__file__).resolve().parent
 
@@ -45,3 +46,10 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
         patch.delenv("RMW_IMPLEMENTATION", raising=False)
         yield
+
+
+@pytest.fixture
+def ear(ros: None) -> Iterator[Ear]:
+    """A ROS node of this process that listens and calls."""
+    with Ear() as made:
+        yield made

@@ -1,14 +1,14 @@
-"""Faults of topics and processes around the real node, over DDS: silence, rivals, signals, power cuts."""
+"""Faults of topics and processes around the real node, over DDS: silence, rivals, wrong types, signals, power cuts."""
 
 from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from quadid_node.store import read_history
 from quadid_replay import write_mcap
 
 from tests.faults.evidence import Happened
@@ -27,22 +27,16 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def ear() -> Iterator[Ear]:
-    with Ear() as made:
-        yield made
-
-
 def rate(health: list[Any], channel: str) -> float:
     entry = next(s for s in health[-1].status if s.name.endswith("inputs"))
     return next((float(v.value) for v in entry.values if v.key == f"{channel} [Hz]"), 0.0)
 
 
 @pytest.mark.slow
-def test_silence_and_rivals_on_the_topics(log: Path, tmp_path: Path, ear: Ear, happened: Happened) -> None:
+def test_silence_rivals_and_strangers_on_the_topics(log: Path, tmp_path: Path, ear: Ear, happened: Happened) -> None:
     from diagnostic_msgs.msg import DiagnosticArray
     from quadid_msgs.msg import FitStatus, ParameterSet
-    from sensor_msgs.msg import Imu
+    from sensor_msgs.msg import Imu, JointState
 
     with node(tmp_path / "h.sqlite") as identify:
         health = ear.listen("/diagnostics", DiagnosticArray)
@@ -77,7 +71,21 @@ def test_silence_and_rivals_on_the_topics(log: Path, tmp_path: Path, ear: Ear, h
             "vehicle gone: WARN, then ERROR naming the silent channel; a late subscriber still got the last set; "
             "publisher restarted: OK again, fits go on",
         )
+        strange = ear.node.create_publisher(JointState, "attitude", 10)
+        assert ear.until(lambda: "another type" in message(health, "inputs"), 20.0), message(health, "inputs")
+        ear.node.destroy_publisher(strange)
+        ear.listen("quadid/candidate", ParameterSet, latched())
+        assert ear.until(lambda: "its subscriber: asks for a QoS" in message(health, "inputs"), 20.0)
+        happened(9, "publisher of another type, subscriber with a QoS that is not offered: ERROR naming the topic")
+        forger = ear.node.create_publisher(ParameterSet, "quadid/parameters", latched())
+        forger.publish(ParameterSet(sequence=999, values=[4.0e-5], names=["b"], log_hash="00" * 32))
+        assert ear.until(lambda: "someone else publishes" in message(health, "inputs"), 20.0)
+        assert level(health, "inputs") == ERROR
         assert identify.end()[0] == 0
+    hashes = {s["input_hash"] for s in read_history(tmp_path / "h.sqlite", "pelican")["sets"]}
+    assert held.log_hash in hashes
+    assert "00" * 32 not in hashes
+    happened(15, "forged set on our topic: ERROR naming it; its log_hash is in no history, those of ours are")
 
 
 @pytest.mark.slow

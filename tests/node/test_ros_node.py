@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +29,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("ros") / "flight.mcap"
     write_mcap(path, flight(16.0, 6).recording)
     return path
-
-
-@pytest.fixture
-def ear() -> Iterator[Ear]:
-    with Ear() as made:
-        yield made
 
 
 def latched() -> Any:

@@ -205,11 +205,10 @@ def test_a_power_cut_leaves_the_last_committed_set(tmp_path: Path) -> None:
 def test_old_candidates_are_forgotten_sets_never(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import quadid_node.store as storing
 
-    monkeypatch.setattr(storing, "KEPT", {"candidates": 10, "events": 10})
     monkeypatch.setattr(storing, "PRUNE_EVERY", 5)
     store = filled(tmp_path / "h.sqlite", sets=40)
     store.close()
-    again = Store(tmp_path / "h.sqlite", "pelican")
+    again = Store(tmp_path / "h.sqlite", "pelican", {"candidates": 10, "events": 10})
     for k in range(30):
         again.event(Event(float(k), "info", "test", "x"))
         time.sleep(0.005)

@@ -1,0 +1,89 @@
+"""Two services for one vehicle over DDS, each a process with a history of its own: one speaks, the other observes."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from quadid_node.claim import OBSERVES, YOUNG
+from quadid_node.store import Store
+
+from tests.faults.evidence import Happened
+from tests.node.peers import Ear, node
+from tests.node.test_ros_node import latched
+from tests.online.test_gate import TRUE, online_set
+
+pytestmark = pytest.mark.usefixtures("ros")
+
+
+def history_with(path: Path, b: float, sequence: int) -> Path:
+    """A history whose last set in force has this b."""
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set({**TRUE, "b": b}), sequence=sequence, approved_by="auto"))
+    store.close(30.0)
+    return path
+
+
+def speakers(ear: Ear) -> int:
+    """Publishers of parameter sets."""
+    count: int = ear.node.count_publishers("quadid/parameters")
+    return count
+
+
+@pytest.mark.slow
+def test_a_second_service_with_a_history_of_its_own_observes_and_takes_over(
+    tmp_path: Path, ear: Ear, happened: Happened
+) -> None:
+    from quadid_msgs.msg import ParameterSet
+
+    paths = [history_with(tmp_path / f"{k}.sqlite", b, 10 * k) for k, b in ((1, 2.3e-5), (2, 2.4e-5))]
+    sets = ear.listen("quadid/parameters", ParameterSet, latched())
+    with node(paths[0]) as first:
+        first.wait_for("ready", 240.0)
+        assert ear.until(lambda: sets, 20.0), first.text
+        with node(paths[1]) as second:
+            second.wait_for(OBSERVES, 60.0)
+            second.wait_for("ready", 240.0)  # kernels compile for minutes on a busy machine
+            ear.until(lambda: False, 3.0)
+            assert {s.sequence for s in sets} == {10}, "the second one says nothing"
+            assert first.end()[0] == 0
+            begin = time.monotonic()
+            assert ear.until(lambda: sets[-1].sequence == 20, 40.0), second.text
+            took = time.monotonic() - begin
+            assert second.end()[0] == 0
+    happened(
+        21, f"second node with a history of its own: observes with ERROR; first one ended: speaks {took:.1f} s later"
+    )
+
+
+@pytest.mark.slow
+def test_two_that_lost_sight_of_each_other_end_with_one_speaker(tmp_path: Path, ear: Ear, happened: Happened) -> None:
+    """The first one is stopped for so long that DDS takes it for gone; the second takes over; then both are there."""
+    with node(tmp_path / "1.sqlite") as first, node(tmp_path / "2.sqlite") as second:
+        for service in (first, second):
+            service.wait_for("ready", 240.0)
+        assert ear.until(lambda: speakers(ear) == 1, 30.0)
+        speaking, other = (second, first) if OBSERVES in first.text else (first, second)
+        begin = time.monotonic()
+        speaking.child.send_signal(signal.SIGSTOP)
+        assert ear.until(lambda: speakers(ear) == 0, 60.0), "DDS takes it for gone"
+        assert ear.until(lambda: speakers(ear) == 1, 30.0), other.text
+        took_over = time.monotonic() - begin
+        ear.until(lambda: False, YOUNG + 2.0)
+        begin = time.monotonic()
+        speaking.child.send_signal(signal.SIGCONT)
+        both = ear.until(lambda: speakers(ear) == 2, 20.0)
+        assert ear.until(lambda: speakers(ear) == 1, 60.0), f"{first.text}\n{second.text}"
+        settled = time.monotonic() - begin
+        ear.until(lambda: False, 8.0)
+        assert speakers(ear) == 1
+        assert first.child.poll() is None
+        assert second.child.poll() is None
+    seen = "both spoke for a moment" if both else "it gave way before anyone saw both"
+    happened(
+        21, f"speaker stopped until DDS forgets it: the observer speaks after {took_over:.0f} s; the first one back "
+        f"({seen}): one speaker again after {settled:.1f} s"
+    )  # fmt: skip
