@@ -12,6 +12,10 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
 Blocks = list[Sequence[float]]
 _LITTLE_ENDIAN = b"\x00\x01"
 _STAMP = struct.Struct("<iI")
@@ -24,6 +28,15 @@ class Read(NamedTuple):
     seconds: int
     nanoseconds: int
     blocks: Blocks
+    extra: Any
+
+
+class ReadMany(NamedTuple):
+    """Messages: stamps (n,) as seconds and nanoseconds, runs of numbers (n, size), and what else was noted of all."""
+
+    seconds: NDArray[np.int64]
+    nanoseconds: NDArray[np.int64]
+    blocks: list[FloatArray]
     extra: Any
 
 
@@ -46,6 +59,7 @@ class BlockReader:
         self._places: list[tuple[struct.Struct, int, int]] | None = None
         self._frame: list[tuple[int, int | None, bytes]] = []
         self._noted: Any = None
+        self._size = 0
 
     def read(self, data: bytes) -> Read:
         """Reads one message; raises what the library raises on damaged data."""
@@ -58,6 +72,21 @@ class BlockReader:
         self._learn(data, blocks, extra)
         stamp = message.header.stamp
         return Read(stamp.sec, stamp.nanosec, blocks, extra)
+
+    def read_many(self, messages: Sequence[bytes]) -> ReadMany | None:
+        """Reads messages as `read` does one after the other; None when not all of them have the layout last learnt."""
+        size = self._size
+        if self._places is None or any(len(data) != size for data in messages):
+            return None
+        rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), size)
+        for begin, end, same in self._frame:
+            if not (rows[:, begin:end] == np.frombuffer(same, dtype=np.uint8)).all():
+                return None
+        stamps = np.ascontiguousarray(rows[:, _STAMP_AT:_AFTER_STAMP])
+        blocks = [np.ascontiguousarray(rows[:, a:b]).view("<f8").astype(np.float64) for _, a, b in self._places]
+        return ReadMany(
+            stamps.view("<i4")[:, 0].astype(np.int64), stamps.view("<u4")[:, 1].astype(np.int64), blocks, self._noted
+        )  # fmt: skip
 
     def _learn(self, data: bytes, blocks: Blocks, extra: Any) -> None:
         self._places, self._frame = None, []
@@ -74,7 +103,7 @@ class BlockReader:
             frame.append((begin, at, data[begin:at]))
             begin = at + len(packed)
         self._frame = [*frame, (begin, None, data[begin:])]
-        self._places, self._noted = places, extra
+        self._places, self._noted, self._size = places, extra, len(data)
 
 
 class BlockWriter:

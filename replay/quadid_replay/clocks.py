@@ -93,6 +93,17 @@ class LogClock:
         out = np.array([np.nan if t is None else t for t in mapped], dtype=np.float64)
         return out, np.isfinite(out)
 
+    def plain_times(self, raw: FloatArray) -> FloatArray | None:
+        """Maps stamps as `time` does one by one; None, and nothing has changed, unless all follow without a step."""
+        if self._newest is None or self._suspects or not len(raw) or not np.isfinite(raw).all():
+            return None
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], raw]))
+        before = newest[:-1]
+        if not np.all((before - STEP_BACK < raw) & (raw < before + STEP_AHEAD)):
+            return None
+        self._newest = float(newest[-1])
+        return raw + self._offset
+
     def _suspect(self, raw: float) -> float | None:
         """Collects stamps of a possible new time base and moves to it when enough agree."""
         if self._suspects and abs(raw - self._suspects[-1]) > STEP_BACK:

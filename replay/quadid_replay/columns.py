@@ -73,6 +73,15 @@ class Columns:
         self._t.append(t)
         self._values.extend(values)
 
+    def add_many(self, t: FloatArray, values: FloatArray) -> None:
+        """Appends samples: times (n,), NaN where refused, and values (n, width)."""
+        if values.shape != (len(t), self.width):
+            raise ValueError(f"values of shape {values.shape} for {len(t)} times and {self.width} columns")
+        known = ~np.isnan(t)
+        self.refused += len(t) - int(np.count_nonzero(known))
+        self._t.frombytes(t[known].tobytes())
+        self._values.frombytes(values[known].tobytes())
+
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Returns times (n,) and values (n, width), as added."""
         t = np.frombuffer(self._t, dtype=np.float64) if self._t else np.empty(0)

@@ -26,12 +26,14 @@ class MessageType:
         signals: names and values in those runs; the second argument is what `extra` noted.
         extra: what else to note of a message.
         stamp: seconds and nanoseconds, for types without a header.
+        deciding: run and place of the numbers that decide, by being -1 or NaN, which signals a message has.
     """
 
     blocks: Callable[[Any], Blocks]
     signals: Callable[[Blocks, Any], Signals]
     extra: Callable[[Any], Any] = lambda message: None
     stamp: Callable[[Any], tuple[int, int]] | None = None
+    deciding: tuple[tuple[int, int], ...] = ()
 
 
 def _vector(v: Any) -> list[float]:
@@ -137,13 +139,14 @@ def _set_if(valid: bool, values: list[float]) -> list[float]:
 
 
 TYPES: dict[str, MessageType] = {
-    "sensor_msgs/Imu": MessageType(_imu_block, _imu_signals),
+    "sensor_msgs/Imu": MessageType(_imu_block, _imu_signals, deciding=((0, 4), (0, 16), (0, 28))),
     "geometry_msgs/QuaternionStamped": MessageType(
         lambda m: [_quaternion(m.quaternion)], lambda b, extra: [("attitude", _wxyz(b[0]))]
     ),
     "sensor_msgs/JointState": MessageType(lambda m: [list(m.velocity), list(m.effort)], _joint_signals),
     "nav_msgs/Odometry": MessageType(
-        _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id
+        _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id,
+        deciding=((0, 0), (0, 43)),
     ),
     "geometry_msgs/PoseStamped": MessageType(
         lambda m: [_pose(m.pose)], lambda b, extra: [("position", b[0][:3]), ("pose_attitude", _wxyz(b[0][3:]))]

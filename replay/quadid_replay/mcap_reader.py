@@ -4,65 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import io
-import struct
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap_ros2._dynamic import generate_dynamic
 
 from quadid.errors import LogError
 from quadid.resample import fresh_rows
 from quadid.window import Recording
-from quadid_replay.cdr_blocks import BlockReader, Read
-from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.definition_check import DefinitionError, check_definition
-from quadid_replay.mcap_messages import SIGNALS, TYPES, MessageType, type_name
+from quadid_replay.mcap_decode import Source, decode_messages, source_of
+from quadid_replay.mcap_messages import SIGNALS, TYPES, type_name
 from quadid_replay.mcap_records import McapFile, Topic
 from quadid_replay.motors import active_outputs
 from quadid_replay.plain import plain
 from quadid_replay.presets import AUTO, preset_rank
-
-_EPOCH_NS = 10**17
-"""Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
-_OTHER_CLOCK = 3600.0
-"""Stamps this far [s] from the log time belong to another clock (boot or simulation time)."""
-
-
-class _Source(NamedTuple):
-    """A topic that is read: its description and reader."""
-
-    topic: Topic
-    kind: MessageType
-    read: Callable[[bytes], Read]
-
-
-class _Stamps:
-    """Turns stamps of headers and of PX4 into recording time."""
-
-    def __init__(self) -> None:
-        self.clock = LogClock()
-        self.base_ns: int | None = None
-        self._offsets: dict[str, float] = {}
-
-    def time(self, group: str, seconds: int, nanoseconds: int, log_time: int) -> float | None:
-        """Returns recording time of a stamp; log time stands in for a stamp of zero."""
-        if self.base_ns is None:
-            self.base_ns = log_time // 10**9 * 10**9 if log_time > _EPOCH_NS else 0
-        logged = (log_time - self.base_ns) * 1e-9
-        if seconds == 0 and nanoseconds == 0:
-            return self.clock.time(logged)
-        stamped = (seconds * 10**9 + nanoseconds - self.base_ns) * 1e-9
-        offset = self._offsets.get(group)
-        if offset is None:
-            # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
-            offset = logged - stamped if abs(logged - stamped) > _OTHER_CLOCK else 0.0
-            self._offsets[group] = offset
-        return self.clock.time(stamped + offset)
 
 
 def read_mcap(path: Path, preset: str = AUTO) -> Recording:
@@ -80,7 +40,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     sources = _sources(file, preset, notes)
     if not sources:
         raise _no_topic(path, file, preset, notes)
-    columns, stamps, failed = _decode(file, sources)
+    columns, stamps, failed = decode_messages(file.messages(sources.keys()), sources)
     notes = [*file.damage(), *notes]
     if failed:
         notes.append(f"{failed} messages could not be decoded and were dropped")
@@ -89,7 +49,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
 
 
-def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source]:
+def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, Source]:
     """Picks the topics whose type is known and whose name the preset lists for one of its channels."""
     sources = {}
     for number, topic in file.topics.items():
@@ -107,7 +67,7 @@ def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, _Source
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
-        sources[number] = _Source(topic, kind, _reader(kind, decode))
+        sources[number] = source_of(topic, kind, decode)
     return sources
 
 
@@ -120,47 +80,7 @@ def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
     return decode
 
 
-def _reader(kind: MessageType, decode: Callable[[bytes], Any]) -> Callable[[bytes], Read]:
-    stamp = kind.stamp
-    if stamp is None:
-        return BlockReader(decode, kind.blocks, kind.extra).read
-
-    def read(data: bytes) -> Read:
-        message = decode(data)
-        return Read(*stamp(message), kind.blocks(message), kind.extra(message))
-
-    return read
-
-
-def _decode(file: McapFile, sources: dict[int, _Source]) -> tuple[dict[tuple[int, str], Columns], _Stamps, int]:
-    """Streams through the messages and keeps the numbers; returns columns by topic and signal, clock, failures."""
-    columns: dict[tuple[int, str], Columns] = {}
-    stamps, failed = _Stamps(), 0
-    for number, log_time, data in file.messages(sources.keys()):
-        source = sources[number]
-        try:
-            message = source.read(data)
-            signals = source.kind.signals(message.blocks, message.extra)
-        except (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            failed += 1
-            continue
-        group = "header" if source.kind.stamp is None else "px4"
-        t = stamps.time(group, message.seconds, message.nanoseconds, log_time)
-        for name, values in signals:
-            kept = columns.get((number, name))
-            if len(values) == 0:
-                failed += 1
-                continue
-            if kept is None:
-                kept = columns[number, name] = Columns(len(values))
-            if len(values) == kept.width:
-                kept.add(t, values)
-            else:
-                failed += 1
-    return columns, stamps, failed
-
-
-def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, _Source], preset: str) -> list[RawChannel]:
+def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, Source], preset: str) -> list[RawChannel]:
     """Makes channels of the columns; of several topics for one channel the best comes first."""
     ranked: dict[str, list[tuple[int, RawChannel]]] = {}
     for (number, signal), kept in columns.items():

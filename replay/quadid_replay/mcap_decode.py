@@ -1,0 +1,250 @@
+"""From the messages of an MCAP to columns of numbers: a batch at a time where nothing but numbers changes.
+
+Messages are taken in batches.  Where a topic keeps its layout throughout a batch (`cdr_blocks.BlockReader`), its
+numbers are read column by column, otherwise message by message, which is slower and gives the same numbers bit for bit;
+so it is with stamps and the clock they follow.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.exceptions import McapError
+from numpy.typing import NDArray
+
+from quadid_replay.cdr_blocks import BlockReader, Blocks, Read
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import Columns
+from quadid_replay.mcap_messages import MessageType
+from quadid_replay.mcap_records import Topic
+
+FloatArray = NDArray[np.float64]
+Message = tuple[int, int, bytes]
+"""Channel id, log time [ns], payload."""
+ColumnsOf = dict[tuple[int, str], Columns]
+
+FIRST_BATCH, LARGEST_BATCH = 64, 8192
+"""Messages in the first batch, from which layouts are learnt; each further one holds twice as many, up to the most."""
+BATCH_BYTES = 8 << 20
+"""A batch ends when its payloads have this many bytes."""
+UNDECODABLE = (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+"""What the library and the types' functions raise on damaged data."""
+_EPOCH_NS = 10**17
+"""Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
+_OTHER_CLOCK = 3600.0
+"""Stamps this far [s] from the log time belong to another clock (boot or simulation time)."""
+_LARGEST_BASE = 1 << 62
+
+
+class Source(NamedTuple):
+    """A topic that is read: its description, its type, the library's decoder, and the reader of its layout if any."""
+
+    topic: Topic
+    kind: MessageType
+    decode: Callable[[bytes], Any]
+    layout: BlockReader | None
+
+    def read(self, data: bytes) -> Read:
+        """Reads one message; raises what the library raises on damaged data."""
+        if self.layout is not None:
+            return self.layout.read(data)
+        message = self.decode(data)
+        assert self.kind.stamp is not None
+        return Read(*self.kind.stamp(message), self.kind.blocks(message), self.kind.extra(message))
+
+
+def source_of(topic: Topic, kind: MessageType, decode: Callable[[bytes], Any]) -> Source:
+    """The reader of a topic; messages without a header have no layout that could be learnt."""
+    layout = BlockReader(decode, kind.blocks, kind.extra) if kind.stamp is None else None
+    return Source(topic, kind, decode, layout)
+
+
+class Stamps:
+    """Turns stamps of headers and of PX4 into recording time."""
+
+    def __init__(self) -> None:
+        self.clock = LogClock()
+        self.base_ns: int | None = None
+        self._offsets: dict[str, float] = {}
+
+    def time(self, group: str, seconds: int, nanoseconds: int, log_time: int) -> float | None:
+        """Returns recording time of a stamp; log time stands in for a stamp of zero."""
+        if self.base_ns is None:
+            self.base_ns = log_time // 10**9 * 10**9 if log_time > _EPOCH_NS else 0
+        logged = (log_time - self.base_ns) * 1e-9
+        if seconds == 0 and nanoseconds == 0:
+            return self.clock.time(logged)
+        stamped = (seconds * 10**9 + nanoseconds - self.base_ns) * 1e-9
+        offset = self._offsets.get(group)
+        if offset is None:
+            # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
+            offset = logged - stamped if abs(logged - stamped) > _OTHER_CLOCK else 0.0
+            self._offsets[group] = offset
+        return self.clock.time(stamped + offset)
+
+    def times(self, groups: Sequence[str], stamps: NDArray[np.int64], logged: Sequence[int]) -> FloatArray:
+        """As `time` for many stamps (n, 2), seconds and nanoseconds, in file order; NaN for those refused."""
+        plain = self._plain_times(groups, stamps)
+        if plain is not None:
+            return plain
+        pairs = stamps.tolist()
+        each = [self.time(g, s, ns, log) for g, (s, ns), log in zip(groups, pairs, logged, strict=True)]
+        return np.array([np.nan if t is None else t for t in each], dtype=np.float64)
+
+    def _plain_times(self, groups: Sequence[str], stamps: NDArray[np.int64]) -> FloatArray | None:
+        """None, and nothing has changed, unless every stamp follows plainly on a clock that is known."""
+        if self.base_ns is None or self.base_ns > _LARGEST_BASE or not np.all(np.any(stamps != 0, axis=1)):
+            return None
+        known = set(groups)
+        if not known <= self._offsets.keys() or np.any(np.abs(stamps[:, 0]) > _LARGEST_BASE // 10**9):
+            return None
+        offset = np.array([self._offsets[g] for g in groups]) if len(known) > 1 else self._offsets[groups[0]]
+        stamped = (stamps[:, 0] * 10**9 + stamps[:, 1] - self.base_ns) * 1e-9
+        return self.clock.plain_times(np.asarray(stamped + offset, dtype=np.float64))
+
+
+class Decoded(NamedTuple):
+    """Columns by topic and signal, the clock, and how many messages could not be decoded."""
+
+    columns: ColumnsOf
+    stamps: Stamps
+    failed: int
+
+
+def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) -> Decoded:
+    """Streams through messages and keeps their numbers.
+
+    Args:
+        messages: of the topics in `sources`, in file order.
+        sources: readers by channel id.
+    """
+    columns: ColumnsOf = {}
+    stamps, failed = Stamps(), 0
+    for batch in _batches(messages):
+        failed += _add_batch(batch, sources, columns, stamps)
+    return Decoded(columns, stamps, failed)
+
+
+def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
+    batch: list[Message] = []
+    most, size = FIRST_BATCH, 0
+    for message in messages:
+        batch.append(message)
+        size += len(message[2])
+        if len(batch) >= most or size >= BATCH_BYTES:
+            yield batch
+            batch, size, most = [], 0, min(2 * most, LARGEST_BATCH)
+    if batch:
+        yield batch
+
+
+class _Number(float):
+    """A number of a message that knows where it stands: run of numbers and place in it."""
+
+    at: tuple[int, int]
+
+    @classmethod
+    def placed(cls, value: float, at: tuple[int, int]) -> _Number:
+        """A number and where it stands."""
+        number = cls(value)
+        number.at = at
+        return number
+
+
+class _Part(NamedTuple):
+    """Samples of one signal in a batch: which messages, and values (n, size)."""
+
+    key: tuple[int, str]
+    order: int
+    rows: NDArray[np.intp]
+    values: FloatArray
+
+
+def _add_batch(batch: list[Message], sources: Mapping[int, Source], columns: ColumnsOf, stamps: Stamps) -> int:
+    """Adds the numbers of a batch to the columns; returns how many messages could not be decoded."""
+    numbers = np.array([number for number, _, _ in batch])
+    stamped, decoded = np.zeros((len(batch), 2), np.int64), np.ones(len(batch), np.bool_)
+    parts: list[_Part] = []
+    for number in dict.fromkeys(numbers.tolist()):
+        source, rows = sources[number], np.flatnonzero(numbers == number)
+        data = [batch[row][2] for row in rows]
+        parts += _read_at_once(number, source, rows, data, stamped) or _read_each(
+            number, source, rows, data, stamped, decoded
+        )
+    groups = ["header" if sources[number].layout is not None else "px4" for number in numbers[decoded].tolist()]
+    times = np.full(len(batch), np.nan)
+    if groups:
+        logged = [batch[row][1] for row in np.flatnonzero(decoded)]
+        times[decoded] = stamps.times(groups, stamped[decoded], logged)
+    failed = len(batch) - int(np.count_nonzero(decoded))
+    for part in sorted(parts, key=lambda p: (p.rows[0], p.order)):
+        kept = columns.get(part.key)
+        if part.values.shape[1] == 0 or (kept is not None and kept.width != part.values.shape[1]):
+            failed += len(part.rows)
+            continue
+        if kept is None:
+            kept = columns[part.key] = Columns(part.values.shape[1])
+        kept.add_many(times[part.rows], part.values)
+    return failed
+
+
+def _read_at_once(
+    number: int, source: Source, rows: NDArray[np.intp], data: list[bytes], stamped: NDArray[np.int64]
+) -> list[_Part]:
+    """Reads all messages of a topic by columns; nothing where that would not be the same as one by one."""
+    read = source.layout.read_many(data) if source.layout is not None else None
+    signals = None if read is None else _signals(source.kind, read.blocks, read.extra)
+    if read is None or signals is None:
+        return []
+    stamped[rows, 0], stamped[rows, 1] = read.seconds, read.nanoseconds
+    return [_Part((number, name), order, rows, values) for order, (name, values) in enumerate(signals)]
+
+
+def _read_each(
+    number: int, source: Source, rows: NDArray[np.intp], data: list[bytes], stamped: NDArray[np.int64],
+    decoded: NDArray[np.bool_],
+) -> list[_Part]:  # fmt: skip
+    """Reads the messages of a topic one by one; `decoded` becomes False where that was not possible."""
+    parts = []
+    for row, one in zip(rows, data, strict=True):
+        try:
+            message = source.read(one)
+            signals = source.kind.signals(message.blocks, message.extra)
+            samples = [(name, np.array(values, dtype=np.float64)[None]) for name, values in signals]
+            stamped[row] = message.seconds, message.nanoseconds
+        except UNDECODABLE:
+            decoded[row] = False
+            continue
+        here = np.array([row])
+        parts += [_Part((number, name), order, here, sample) for order, (name, sample) in enumerate(samples)]
+    return parts
+
+
+def _signals(kind: MessageType, blocks: list[FloatArray], extra: Any) -> list[tuple[str, FloatArray]] | None:
+    """Signals of messages whose runs of numbers have shapes (n, size); None where they differ in which they tell.
+
+    The type's own function picks them from the first message; where each number stood tells the columns.
+    """
+    for run, column in kind.deciding:
+        values = blocks[run][:, column]
+        if np.any((values == -1.0) != (values[0] == -1.0)) or np.any(np.isnan(values) != np.isnan(values[0])):
+            return None
+    first: Blocks = [
+        [_Number.placed(value, (run, column)) for column, value in enumerate(block[0])]
+        for run, block in enumerate(blocks)
+    ]
+    try:
+        told = kind.signals(first, extra)
+    except UNDECODABLE:
+        return None
+    out = []
+    for name, picked in told:
+        places = [one.at for one in picked if isinstance(one, _Number)]
+        if len(places) != len(picked):
+            return None
+        columns = [blocks[run][:, column] for run, column in places]
+        out.append((name, np.stack(columns, axis=1) if columns else np.empty((len(blocks[0]), 0))))
+    return out
