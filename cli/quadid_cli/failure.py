@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from quadid.errors import QuadidError
+from quadid.plain import one_line
 
 
 class Failure(NamedTuple):
@@ -17,11 +18,11 @@ class Failure(NamedTuple):
 def explain(error: Exception) -> Failure | None:
     """Returns the line for an error that the user can act on, or None for a defect of the program."""
     if isinstance(error, QuadidError):
-        return Failure(_one_line(str(error)), error.exit_code)
+        return Failure(one_line(str(error)), error.exit_code)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return Failure(
-            _one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
+            one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
         )
     if type(error).__name__ == "LinAlgError":
         cause = "the equations have no unique solution: these data cannot support an answer"
@@ -31,11 +32,5 @@ def explain(error: Exception) -> Failure | None:
     if callable(told):
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "quadid"
-        return Failure(_one_line(f"{str(told()).rstrip('.')}; see `{path} --help`"), 2)
+        return Failure(one_line(f"{str(told()).rstrip('.')}; see `{path} --help`"), 2)
     return None
-
-
-def _one_line(text: str) -> str:
-    """Joins lines and drops control characters, which a log's content must not send to a terminal."""
-    joined = " ".join(text.split())
-    return "".join(c if c.isprintable() else "?" for c in joined)

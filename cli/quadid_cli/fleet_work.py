@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
+from quadid.plain import one_line
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -137,5 +138,4 @@ def _diagnosed(job: Job, log: Log, vehicle: Vehicle) -> Row:
 
 
 def _line(error: Exception) -> str:
-    joined = " ".join(str(error).split())
-    return "".join(c if c.isprintable() else "?" for c in joined)[:500]
+    return one_line(str(error), 500)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import NotIdentifiableError
+from quadid.plain import LONGEST_LINE, plain
 from quadid_cli.options import (
     JsonTarget,
     Logs,
@@ -173,7 +174,7 @@ def vehicle_header(logs: Sequence[Log]) -> str:
 
     lines = [f"Fitted by quadid {__version__}; `initial` is the fitted value, `sigma` its standard deviation. From:"]
     lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
-    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)
+    return "".join(f"# {plain(line, LONGEST_LINE)}\n" for line in lines)
 
 
 def show(result: Mapping[str, Any], quiet: bool) -> None:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from quadid.plain import LONGEST_LINE
+from quadid.plain import plain as clean
 from quadid_cli.options import JsonTarget, Preset, Start, Stop
 
 if TYPE_CHECKING:
@@ -128,7 +130,7 @@ def _plain(text: str) -> str:
     """Text of a log for the terminal: no control characters, no markup."""
     from rich.markup import escape
 
-    return escape("".join(c if c.isprintable() else "?" for c in text))
+    return escape(clean(text, LONGEST_LINE))
 
 
 def _print(console: Console, inspection: Inspection) -> None:

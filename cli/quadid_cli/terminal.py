@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from quadid.plain import one_line
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -36,8 +38,7 @@ def console(quiet: bool = False, stderr: bool = False, markup: bool = False) -> 
 def warn(messages: tuple[str, ...] | list[str]) -> None:
     """Prints warnings on stderr, one line each, without control characters that a name in a log may hold."""
     for message in messages:
-        line = " ".join(str(message).split())
-        print(f"warning: {''.join(c if c.isprintable() else '?' for c in line)}", file=sys.stderr)
+        print(f"warning: {one_line(message)}", file=sys.stderr)
 
 
 @contextmanager

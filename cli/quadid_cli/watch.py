@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import QuadidError
+from quadid.plain import plain
 from quadid_cli.options import JsonTarget
 
 if TYPE_CHECKING:
@@ -146,4 +147,4 @@ def _listing(value: Any) -> list[Mapping[str, Any]]:
 
 def _plain(value: Any) -> str:
     """Text from elsewhere, without anything a terminal would act on."""
-    return "".join(c if c.isprintable() else "?" for c in str(value))[:_LONGEST]
+    return plain(str(value), _LONGEST)

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError, nearest
+from quadid.plain import plain
 from quadid.resample import COINCIDENT, sample_period
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble
 from quadid_replay.frames import from_euler
-from quadid_replay.plain import plain
 from quadid_replay.recognise import HEAD_BYTES, header_line
 
 FloatArray = NDArray[np.float64]

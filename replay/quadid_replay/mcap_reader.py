@@ -13,6 +13,7 @@ import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
 
 from quadid.errors import LogError
+from quadid.plain import plain
 from quadid.resample import fresh_rows
 from quadid.window import Recording
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
@@ -21,7 +22,6 @@ from quadid_replay.mcap_decode import Source, decode_messages, source_of
 from quadid_replay.mcap_messages import SIGNALS, TYPES, type_name
 from quadid_replay.mcap_records import McapFile, Topic
 from quadid_replay.motors import active_outputs
-from quadid_replay.plain import plain
 from quadid_replay.presets import AUTO, preset_rank
 
 

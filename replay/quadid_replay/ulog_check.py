@@ -13,7 +13,7 @@ from io import BytesIO
 from pathlib import Path
 
 from quadid.errors import LogError
-from quadid_replay.plain import plain
+from quadid.plain import plain
 
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
 _DEFINITIONS = frozenset(b"FP")

@@ -17,12 +17,12 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from quadid.errors import LogError
+from quadid.plain import plain
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
-from quadid_replay.plain import plain
 from quadid_replay.ulog_check import UlogRecords, collect_records
 
 FloatArray = NDArray[np.float64]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.parameters import NOMINAL_UNITS
+from quadid.plain import LONGEST_LINE, plain
 from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]
@@ -110,4 +111,4 @@ class Facts:
         lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
         if left:
             lines.append(f"Effects that have no place here: {', '.join(left)}")
-        return ["".join(c if c.isprintable() else "?" for c in line) for line in lines]
+        return [plain(line, LONGEST_LINE) for line in lines]
