@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from quadid.effects import EFFECTS
 from quadid.errors import VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
+from quadid.plain import LONGEST_NAME
 
 FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
@@ -130,7 +131,7 @@ class Vehicle(_Strict):
     """Everything known about a vehicle before its log is read.
 
     Attributes:
-        name: identifier.
+        name: identifier, of at most 200 characters.
         mass: kg, known; fixes the force scale.
         rotors: at least three.
         command: meaning of the rotor columns.
@@ -143,7 +144,7 @@ class Vehicle(_Strict):
         thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
     """
 
-    name: str
+    name: str = Field(max_length=LONGEST_NAME)
     mass: PositiveFloat
     mass_sigma: Spread = 0.0
     arm_sigma: Spread = 0.0

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
+
+from quadid.plain import plain
 
 REMEMBERED = 30.0
 """A subscriber that cannot hear us is told of for so long [s] after it came."""
 _CROWDED = "publishers on one topic: paused until there is one"
+_STRANGE = "a publisher of another type"
 
 
 class Neighbours:
@@ -19,18 +22,18 @@ class Neighbours:
     """
 
     def __init__(
-        self, inputs: Iterable[str], count: Callable[[str], int], tell: Callable[[str], None],
+        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[str]], tell: Callable[[str], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """Watches the topics `inputs`.
 
         Args:
-            inputs: full names.
-            count: publishers on a topic.
+            inputs: type of messages by full name.
+            offered: types of a topic's publishers, one entry each.
             tell: takes a line for people.
             clock: seconds, monotonic.
         """
-        self._inputs, self._count, self._tell, self._clock = tuple(inputs), count, tell, clock
+        self._inputs, self._offered, self._tell, self._clock = dict(inputs), offered, tell, clock
         self._until: dict[str, float] = {}
         self.notes: dict[str, str] = {}
         self.paused = False
@@ -56,14 +59,22 @@ class Neighbours:
             self.note(topic, f"{publishers} {_CROWDED}")
 
     def look(self) -> None:
-        """Counts publishers, and forgets what is over; once a second."""
-        counts = {topic: self._count(topic) for topic in self._inputs}
-        for topic, publishers in counts.items():
-            if publishers > 1:
-                self.matched(topic, publishers)
-            elif publishers == 0 or _CROWDED in self.notes.get(topic, ""):
+        """Counts publishers, and forgets what is over; once a second.
+
+        DDS tells some of it by events, but no type that differs: what nobody can receive has to be looked for.
+        """
+        most = 0
+        for topic, kind in self._inputs.items():
+            types = self._offered(topic)
+            strange = sorted({*types} - {kind})
+            most = max(most, types.count(kind))
+            if types.count(kind) > 1:
+                self.matched(topic, types.count(kind))
+            elif strange:
+                self.note(topic, f"{_STRANGE} ({plain(strange[0], 80)} for {kind}), which is not listened to")
+            elif not types or any(told in self.notes.get(topic, "") for told in (_CROWDED, _STRANGE)):
                 self.note(topic, "")
-        self.paused = any(n > 1 for n in counts.values())
+        self.paused = most > 1
         for topic, until in list(self._until.items()):
             if self._clock() > until:
                 del self._until[topic]

@@ -115,8 +115,8 @@ class IdentifyNode(LifecycleNode):
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])
         self._stamps = messages.Clock()
-        inputs = [self.resolve_topic_name(entry.topic) for entry in preset.inputs]
-        self._neighbours = Neighbours(inputs, self.count_publishers, lambda text: self._log("error", text))
+        inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
+        self._neighbours = Neighbours(inputs, self._types_on, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
@@ -139,7 +139,6 @@ class IdentifyNode(LifecycleNode):
             topic = self.resolve_topic_name(entry.topic)
             events = SubscriptionEventCallbacks(
                 incompatible_qos=lambda event, t=topic: self._neighbours.note(t, "its publisher's QoS does not match"),
-                incompatible_type=lambda event, t=topic: self._neighbours.note(t, "its publisher has another type"),
                 matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
             )
             subscription = self.create_subscription(
@@ -149,6 +148,9 @@ class IdentifyNode(LifecycleNode):
             )  # fmt: skip
             self._decoders[topic] = decoder
             self._open.append((self.destroy_subscription, subscription))
+
+    def _types_on(self, topic: str) -> list[str]:
+        return [info.topic_type for info in self.get_publishers_info_by_topic(topic)]
 
     def _offer(self) -> None:
         self._speaker = Speaker(self, self._observer, self._neighbours.deaf)

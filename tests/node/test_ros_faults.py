@@ -72,7 +72,9 @@ def test_silence_rivals_and_strangers_on_the_topics(log: Path, tmp_path: Path, e
             "publisher restarted: OK again, fits go on",
         )
         strange = ear.node.create_publisher(JointState, "attitude", 10)
-        assert ear.until(lambda: "another type" in message(health, "inputs"), 20.0), message(health, "inputs")
+        assert ear.until(lambda: "another type (sensor_msgs/msg/JointState" in message(health, "inputs"), 20.0), (
+            message(health, "inputs")
+        )
         ear.node.destroy_publisher(strange)
         ear.listen("quadid/candidate", ParameterSet, latched())
         assert ear.until(lambda: "its subscriber: asks for a QoS" in message(health, "inputs"), 20.0)

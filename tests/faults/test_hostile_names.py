@@ -1,0 +1,146 @@
+"""Names of a megabyte with HTML, ANSI, NUL and SQL in them: harmless in reader, terminal, report and history."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from quadid_node.store import Store, read_history
+from quadid_replay import open_log
+from quadid_replay.schemas import schema_text
+
+from quadid.errors import LogError, VehicleError
+from quadid.plain import LONGEST_LINE
+from quadid.vehicle import Vehicle
+from quadid.window import Recording
+from tests.cli.conftest import Cli, inside
+from tests.faults.evidence import Happened
+from tests.fuzz.seeds import mcap_of
+from tests.online.test_gate import TRUE, online_set
+from tests.replay.test_dataflash import flight as dataflash_flight
+from tests.replay.test_mcap import imu
+from tests.replay.test_ulog import Ulog
+from tests.replay.test_ulog import flight as ulog_flight
+from tests.report.test_page import EVIL, page, scored
+
+__all__ = ["inside"]
+MEGABYTE = 1 << 20
+HOSTILE = "<script>alert(1)</script>\x1b[31m\x00'; DROP TABLE sets; --\u202e"
+NAME = HOSTILE * (MEGABYTE // len(HOSTILE) + 1)
+
+
+def csv_log() -> bytes:
+    rows = "".join(f"{0.02 * k},0,0,0,400,400,400,400,1\n" for k in range(200))
+    return f't,p,q,r,w1,w2,w3,w4,"{NAME}"\n{rows}'.encode()
+
+
+def mcap_log() -> bytes:
+    kind = "sensor_msgs/msg/Imu"
+    text = schema_text(kind)
+    return mcap_of([("imu", kind, text, imu), (NAME, kind, text, imu)], summary=True)
+
+
+def mcap_type() -> bytes:
+    """The type's name is hostile; the definition in the log too."""
+    kind, text = "sensor_msgs/msg/Imu", schema_text("sensor_msgs/msg/Imu")
+    return mcap_of([("imu", kind, text, imu), ("other", kind, text, imu)], True, shown=f"float64 x # {NAME}\n")
+
+
+def ulog_log() -> bytes:
+    """As long as a record can be: 65,535 bytes."""
+    log, long = ulog_flight(count=200), NAME[:60_000]
+    extra = Ulog()
+    extra.format(long, "uint64_t timestamp;float x;")
+    extra.subscribe(long)
+    extra.add(long, "Qf", 6_000_000, 1.0)
+    extra.parameter(HOSTILE[:50], 1.0)
+    extra.record("I", bytes([20]) + b"char[20] " + b"x" * 11 + long.encode("ascii", "replace"))
+    return bytes(log.data) + bytes(extra.data[16:])
+
+
+def dataflash_log() -> bytes:
+    """Its names have room for 16 bytes only."""
+    log = dataflash_flight()
+    log.add("PARM", 0, HOSTILE[25:41].encode()[:16], 1.0)
+    return bytes(log.data)
+
+
+LOGS: dict[str, Callable[[], bytes]] = {
+    "csv column": csv_log, "mcap topic": mcap_log, "mcap definition": mcap_type, "ulog message": ulog_log,
+    "dataflash parameter": dataflash_log,
+}  # fmt: skip
+
+
+@pytest.fixture(params=sorted(LOGS))
+def log(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    path = tmp_path / "log"
+    path.write_bytes(LOGS[request.param]())
+    yield request.param, path
+
+
+def texts(recording: Recording) -> list[str]:
+    sources = [text for channel in recording.channels.values() for text in (channel.name, channel.source)]
+    return [recording.name, recording.format, *recording.warnings, *sources]
+
+
+def test_a_reader_and_the_terminal_show_a_bounded_part_without_control_characters(
+    log: tuple[str, Path], inside: Cli, happened: Happened
+) -> None:
+    what, path = log
+    try:
+        said = texts(open_log(path))
+    except LogError as error:
+        said = [str(error)]
+    assert all(text.isprintable() and len(text) <= LONGEST_LINE for text in said)
+    run = inside("inspect", path, "--vehicle", "pelican")
+    told = run.out + run.err
+    assert run.code in (0, 2, 3)
+    assert "Traceback" not in told
+    assert not set(told) - {"\n"} & set(map(chr, range(32))) or "\x1b" not in told
+    assert "\x00" not in told
+    assert "\u202e" not in told
+    assert len(told) < 20 * LONGEST_LINE
+    happened(
+        20, f"{what} of {path.stat().st_size >> 10} KiB with HTML, ANSI, NUL, SQL: nothing longer than "
+        f"{max(map(len, said))} characters from the reader, {len(told)} on the terminal, no control character"
+    )  # fmt: skip
+
+
+def test_a_megabyte_of_hostile_text_in_a_report_stays_text_and_data(happened: Happened) -> None:
+    shown = page([scored(NAME)])
+    assert "<script>alert(1)</script>\x1b" not in shown
+    assert shown.count("<script") == page([scored(EVIL)]).count("<script")
+    happened(20, f"log name of {len(NAME) >> 10} KiB in a report: escaped everywhere, no element made of it")
+
+
+def test_a_vehicle_with_a_megabyte_name_is_refused_in_one_short_line(happened: Happened) -> None:
+    data = Vehicle.shipped("pelican").to_yaml().replace("name: pelican", f"name: {json.dumps(NAME)}", 1)
+    with pytest.raises(VehicleError) as caught:
+        Vehicle.from_yaml(data)
+    assert len(str(caught.value)) < LONGEST_LINE
+    assert "name" in str(caught.value)
+    happened(20, f"vehicle file with a name of a megabyte: refused, '{str(caught.value)[:90]}'")
+
+
+def test_a_megabyte_in_the_history_is_one_value_and_no_statement(tmp_path: Path, happened: Happened) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, NAME)
+    store.numbered(replace(online_set(TRUE), sequence=1, reason=NAME, approved_by="auto"))
+    store.close(30.0)
+    found: list[dict[str, Any]] = read_history(path, NAME)["sets"]
+    assert [s["reason"] for s in found] == [NAME]
+    locks = [p.name for p in tmp_path.iterdir() if p.suffix == ".lock"]
+    assert locks
+    assert all(len(name) < 120 for name in locks)
+    happened(20, "vehicle name and reason of a megabyte in the history: stored and found again bit for bit")
+
+
+def test_packed_lengths_are_true() -> None:
+    """A ULog record's length is two bytes: more than that cannot be written."""
+    with pytest.raises(struct.error):
+        Ulog().record("I", bytes(1 << 16))
