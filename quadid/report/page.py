@@ -1,8 +1,8 @@
 """One self-contained HTML page from plain data: no request leaves it, and nothing from a log is ever run.
 
-The page carries one copy of plotly.js.  Everything that comes from a log (names, topics, warnings) is escaped by the
-template; figure data travel as JSON in a script element that no browser runs, with ``<``, ``>`` and ``&`` escaped.  A
-content security policy allows only the page's own two scripts, by hash.
+The page carries one copy of plotly.js, as far as its figures use it.  Everything that comes from a log (names, topics,
+warnings) is escaped by the template; figure data travel as JSON in a script element that no browser runs, with ``<``,
+``>`` and ``&`` escaped.  A content security policy allows only the page's own two scripts, by hash.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ def render(page: JsonDict) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     environment.filters |= {"number": number, "code": code, "fit": fit, "unit": unit}
-    scripts = {name: _script(name) for name in ("plotly", "page")}
+    figures = all_figures(page)
+    scripts = {name: closed(text) for name, text in (("plotly", _drawing(figures)), ("page", _asset("page.js")))}
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
     template = environment.from_string(_asset("page.html"))
     return template.render(
         page={**_EMPTY, **page},
-        figures=packed(all_figures(page)),
+        figures=packed(figures),
         style=Markup(_asset("page.css")),
         scripts={name: Markup(text) for name, text in scripts.items()},
         policy=policy,
@@ -125,16 +126,16 @@ def code(text: str) -> Any:
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
-@lru_cache(maxsize=4)
-def _script(name: str) -> str:
-    if name == "plotly":
-        from plotly.offline import get_plotlyjs
+def _drawing(figures: Mapping[str, Any]) -> str:
+    from quadid.report.plotly_source import plotly_source
 
-        text = str(get_plotlyjs())
-    else:
-        text = _asset(f"{name}.js")
-    # Inside a script element this would end it; in a string or comment the escaped form means the same.
-    return text.replace("</script", "<\\/script")
+    views = [view for figure in figures.values() for view in figure["views"]]
+    return plotly_source(frozenset(trace.get("type", "scatter") for view in views for trace in view["data"]))
+
+
+def closed(script: str) -> str:
+    """A script that cannot end its element early; in a string or comment the escaped form means the same."""
+    return script.replace("</script", "<\\/script")
 
 
 def _digest(text: str) -> str:
