@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,10 +77,10 @@ LOGS: dict[str, Callable[[], bytes]] = {
 
 
 @pytest.fixture(params=sorted(LOGS))
-def log(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, Path]]:
+def log(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
     path = tmp_path / "log"
     path.write_bytes(LOGS[request.param]())
-    yield request.param, path
+    return request.param, path
 
 
 def texts(recording: Recording) -> list[str]:
