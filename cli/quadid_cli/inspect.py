@@ -48,7 +48,7 @@ def inspect(
 
     from quadid.inspection import inspect as inspect_recording
     from quadid_cli.loading import load_vehicle, parse_cut
-    from quadid_cli.output import check_file, out_folder, write_json, write_text
+    from quadid_cli.output import check_file, json_text, out_folder, write_json, write_text
     from quadid_cli.terminal import console
 
     check_file(json, "--json")
@@ -62,7 +62,7 @@ def inspect(
     if folder is not None:
         target = folder / f"{cut.path.name}.inspect.json"
         result["files"] = [str(target)]
-        write_text(target, _text(result))
+        write_text(target, json_text(result))
     write_json(result, json)
     _print(console(quiet=json == "-", markup=True), inspection)
 
@@ -116,14 +116,6 @@ def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any],
         }
         for name, bound, alone in zip(found.names, found.bound, found.alone, strict=True)
     )
-
-
-def _text(result: dict[str, Any]) -> str:
-    import json
-
-    from quadid_cli.output import plain
-
-    return json.dumps(plain(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _plain(text: str) -> str:

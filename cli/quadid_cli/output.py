@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from quadid.errors import QuadidError
+from quadid.jsonable import jsonable
 
 
 class OutputError(QuadidError):
@@ -65,23 +65,13 @@ def write_json(result: Mapping[str, Any], target: str | None) -> None:
     """Writes a result as JSON to a file, or to stdout for ``-``; numbers that JSON has no word for become null."""
     if target is None:
         return
-    text = json.dumps(plain(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(result)
     if target == "-":
         sys.stdout.write(text)
     else:
         write_text(Path(target), text)
 
 
-def plain(value: Any) -> Any:
-    """Turns numpy numbers and arrays, paths and tuples into what JSON holds; NaN and infinities into None."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
+def json_text(result: Mapping[str, Any]) -> str:
+    """A result as JSON for people and programs; numbers that JSON has no word for become null."""
+    return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

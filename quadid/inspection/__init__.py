@@ -9,7 +9,7 @@ from quadid.inspection.airborne import Spans, flying_spans
 from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
 from quadid.inspection.findings import ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
-from quadid.inspection.motor_checks import hover_check, motor_order_check
+from quadid.inspection.motor_checks import hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
 from quadid.inspection.timing import channel_facts, timing_checks
 from quadid.vehicle import Vehicle
@@ -52,9 +52,10 @@ def inspect(
 
 def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[Check]:
     """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
-    hover, order = hover_check(recording, vehicle, spans), motor_order_check(recording, vehicle, spans)
+    lagged = lagged_motion(recording, vehicle, spans)
+    hover, order = hover_check(recording, vehicle, spans), motor_order_check(lagged, vehicle)
     checks = [hover, order]
     if Verdict.ERROR not in (hover.verdict, order.verdict):
         mass = mass_check(recording, vehicle, spans, hover.numbers.get("b_from_hover"))
-        checks += [check for check in (mass, geometry_check(recording, vehicle, spans)) if check is not None]
+        checks += [check for check in (mass, geometry_check(lagged, vehicle)) if check is not None]
     return checks

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from enum import Enum, StrEnum
+from enum import StrEnum
 from typing import Any
+
+from quadid.jsonable import jsonable
 
 
 class Verdict(StrEnum):
@@ -130,16 +131,4 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Returns the inspection as JSON-ready data, schema ``quadid.inspect/1``; NaN and infinity become null."""
         data = {"schema": "quadid.inspect/1", "usable": self.usable, **asdict(self)}
-        return {key: _plain(value) for key, value in data.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
+        return dict(jsonable(data))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
-from quadid.inspection.motor_checks import lagged_motion
+from quadid.inspection.motor_checks import Lagged
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Recording
 
@@ -78,14 +78,13 @@ def _load(recording: Recording, spans: Spans) -> float:
     return load if 0.8 < load < 1.5 else 1.0
 
 
-def geometry_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
-    """Roll and pitch acceleration against the torque that the stated rotor positions give.
+def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
+    """Roll and pitch acceleration (of `lagged_motion`) against the torque that the stated rotor positions give.
 
     With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha): the frame is turned
     by alpha about z, and k is b times the factor by which arms (or inertias) are wrong.
     """
     name = "geometry"
-    lagged = lagged_motion(recording, vehicle, spans)
     if isinstance(lagged, str):
         return Check(name, Verdict.UNKNOWN, lagged)
     inertia, place = vehicle.initial[2:4], vehicle.rotor_positions

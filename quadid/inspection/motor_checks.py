@@ -58,13 +58,16 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     return Check("hover", Verdict.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
 
 
-def motor_order_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
-    """Correlates roll, pitch and yaw torque of every motor order with angular acceleration."""
-    lagged = lagged_motion(recording, vehicle, spans)
+Lagged = list[tuple[FloatArray, FloatArray]]
+"""Squared rotor speeds (n, rotors) and angular acceleration (n, 3), for each lag of the motors."""
+
+
+def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
+    """Correlates roll, pitch and yaw torque of every motor order with angular acceleration (of `lagged_motion`)."""
     return Check("motor_order", Verdict.UNKNOWN, lagged) if isinstance(lagged, str) else _judge_order(lagged, vehicle)
 
 
-def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[tuple[FloatArray, FloatArray]] | str:
+def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
     """Squared rotor speeds (n, rotors) and angular acceleration (n, 3) in flight, slow parts left out.
 
     One pair for each lag of 0, 1, 2 … rows by which the motors may answer late; or why there is none.
@@ -106,7 +109,7 @@ def _quick_motion(windows: list[Window], lag: int) -> tuple[FloatArray, FloatArr
     return np.concatenate(squares), np.concatenate(gains)
 
 
-def _judge_order(lagged: list[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Check:
+def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     rotors = len(vehicle.rotors)
     if float(np.max(np.std(lagged[0][1], axis=0))) < 0.05:
         return Check("motor_order", Verdict.UNKNOWN, "too little rotation to tell the motor order")
