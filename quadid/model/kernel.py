@@ -21,18 +21,18 @@ from quadid.model import layout as ix
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP, C_DROP_TIME,
-    C_GROUND, C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY,
-    C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY,
+    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP,
+    C_DROP_TIME, C_GROUND, C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX,
+    C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY,
     C_RZ, C_SAG, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY,
-    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY,
-    X_QZ, X_R, X_VD, X_VE, X_VN,
+    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
+    X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
 
-__all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_full"]
+__all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared", "step_full"]
 
 FloatArray = NDArray[np.float64]
 
@@ -116,6 +116,56 @@ def _put_force(ax, ay, az, bx, by, bz, lane, s):  # type: ignore[no-untyped-def]
     s[F0_X + lane], s[F0_Y + lane], s[F0_Z + lane] = bx, by, bz
 
 
+@nb.njit(**inlined)
+def _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s):  # type: ignore[no-untyped-def]
+    """`step_core` of one lane for these rotor moments, means over the first and the second half step."""
+    b, d = s[C_B + lane], s[C_D + lane]
+    ixx, iyy, izz = s[C_IXX + lane], s[C_IYY + lane], s[C_IZZ + lane]
+    jxx, jyy, jzz, jr = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane], s[C_JR + lane]
+    tx1, tx2 = -b * y2a, -b * y2b
+    ty1, ty2 = b * x2a, b * x2b
+    tz1, tz2 = d * z2a, d * z2b
+    o1, o2 = jr * o1a, jr * o1b
+    lift = -b * s[C_INVM + lane]
+    _put_force(0.0, 0.0, lift * s2a, 0.0, 0.0, lift * s2b, lane, s)
+    qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
+    p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
+    s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
+    s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
+    cx, cy, cz = (jyy - jzz) * ixx, (jzz - jxx) * iyy, (jxx - jyy) * izz
+    # stage 1
+    tx, ty, tz, o = 1.5 * tx1 - 0.5 * tx2, 1.5 * ty1 - 0.5 * ty2, 1.5 * tz1 - 0.5 * tz2, 1.5 * o1 - 0.5 * o2
+    a1x, a1y, a1z = cx * q * r + (tx + o * q) * ixx, cy * p * r + (ty - o * p) * iyy, cz * p * q + tz * izz
+    k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
+    # stage 2
+    h = 0.5 * dt
+    tx, ty, tz, o = 0.5 * (tx1 + tx2), 0.5 * (ty1 + ty2), 0.5 * (tz1 + tz2), 0.5 * (o1 + o2)
+    p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
+    a2x, a2y, a2z = cx * q2 * r2 + (tx + o * q2) * ixx, cy * p2 * r2 + (ty - o * p2) * iyy, cz * p2 * q2 + tz * izz
+    k2w, k2x, k2y, k2z = _rotation_rate(qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z, p2, q2, r2)
+    # stage 3
+    p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
+    a3x, a3y, a3z = cx * q3 * r3 + (tx + o * q3) * ixx, cy * p3 * r3 + (ty - o * p3) * iyy, cz * p3 * q3 + tz * izz
+    k3w, k3x, k3y, k3z = _rotation_rate(qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z, p3, q3, r3)
+    # stage 4
+    tx, ty, tz, o = 1.5 * tx2 - 0.5 * tx1, 1.5 * ty2 - 0.5 * ty1, 1.5 * tz2 - 0.5 * tz1, 1.5 * o2 - 0.5 * o1
+    p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
+    a4x, a4y, a4z = cx * q4 * r4 + (tx + o * q4) * ixx, cy * p4 * r4 + (ty - o * p4) * iyy, cz * p4 * q4 + tz * izz
+    k4w, k4x, k4y, k4z = _rotation_rate(qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z, p4, q4, r4)
+    sixth = dt / 6.0
+    qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
+    qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
+    qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
+    qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
+    scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)  # one Newton step to unit length
+    s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane] = qw * scale, qx * scale, qy * scale, qz * scale
+    s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
+    s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
+    s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
+    s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
+    s[S_BENDZ + lane] = h * (a4z - a1z)
+
+
 @nb.njit(**jit)
 def step_core(dt: float, s: FloatArray) -> None:
     """One step of attitude and rate without velocity: Eqs. 1 and 9 with a diagonal inertia.
@@ -127,51 +177,22 @@ def step_core(dt: float, s: FloatArray) -> None:
     """
     lane_kernel()
     for lane in range(LANES):
-        b, d = s[C_B + lane], s[C_D + lane]
-        ixx, iyy, izz = s[C_IXX + lane], s[C_IYY + lane], s[C_IZZ + lane]
-        jxx, jyy, jzz, jr = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane], s[C_JR + lane]
-        tx1, tx2 = -b * s[A_Y2 + lane], -b * s[A_Y2 + HALF + lane]
-        ty1, ty2 = b * s[A_X2 + lane], b * s[A_X2 + HALF + lane]
-        tz1, tz2 = d * s[A_Z2 + lane], d * s[A_Z2 + HALF + lane]
-        o1, o2 = jr * s[A_O1 + lane], jr * s[A_O1 + HALF + lane]
-        lift = -b * s[C_INVM + lane]
-        _put_force(0.0, 0.0, lift * s[A_S2 + lane], 0.0, 0.0, lift * s[A_S2 + HALF + lane], lane, s)
-        qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
-        p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
-        s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
-        s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
-        cx, cy, cz = (jyy - jzz) * ixx, (jzz - jxx) * iyy, (jxx - jyy) * izz
-        # stage 1
-        tx, ty, tz, o = 1.5 * tx1 - 0.5 * tx2, 1.5 * ty1 - 0.5 * ty2, 1.5 * tz1 - 0.5 * tz2, 1.5 * o1 - 0.5 * o2
-        a1x, a1y, a1z = cx * q * r + (tx + o * q) * ixx, cy * p * r + (ty - o * p) * iyy, cz * p * q + tz * izz
-        k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
-        # stage 2
-        h = 0.5 * dt
-        tx, ty, tz, o = 0.5 * (tx1 + tx2), 0.5 * (ty1 + ty2), 0.5 * (tz1 + tz2), 0.5 * (o1 + o2)
-        p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
-        a2x, a2y, a2z = cx * q2 * r2 + (tx + o * q2) * ixx, cy * p2 * r2 + (ty - o * p2) * iyy, cz * p2 * q2 + tz * izz
-        k2w, k2x, k2y, k2z = _rotation_rate(qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z, p2, q2, r2)
-        # stage 3
-        p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
-        a3x, a3y, a3z = cx * q3 * r3 + (tx + o * q3) * ixx, cy * p3 * r3 + (ty - o * p3) * iyy, cz * p3 * q3 + tz * izz
-        k3w, k3x, k3y, k3z = _rotation_rate(qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z, p3, q3, r3)
-        # stage 4
-        tx, ty, tz, o = 1.5 * tx2 - 0.5 * tx1, 1.5 * ty2 - 0.5 * ty1, 1.5 * tz2 - 0.5 * tz1, 1.5 * o2 - 0.5 * o1
-        p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
-        a4x, a4y, a4z = cx * q4 * r4 + (tx + o * q4) * ixx, cy * p4 * r4 + (ty - o * p4) * iyy, cz * p4 * q4 + tz * izz
-        k4w, k4x, k4y, k4z = _rotation_rate(qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z, p4, q4, r4)
-        sixth = dt / 6.0
-        qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
-        qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
-        qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
-        qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
-        scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)  # one Newton step to unit length
-        s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane] = qw * scale, qx * scale, qy * scale, qz * scale
-        s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
-        s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
-        s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
-        s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
-        s[S_BENDZ + lane] = h * (a4z - a1z)
+        _core(
+            s[A_S2 + lane], s[A_S2 + HALF + lane], s[A_X2 + lane], s[A_X2 + HALF + lane], s[A_Y2 + lane],
+            s[A_Y2 + HALF + lane], s[A_Z2 + lane], s[A_Z2 + HALF + lane], s[A_O1 + lane], s[A_O1 + HALF + lane],
+            dt, lane, s,
+        )  # fmt: skip
+
+
+@nb.njit(**jit)
+def step_core_shared(dt: float, table: FloatArray, k: int, s: FloatArray) -> None:
+    """`step_core` where all lanes share the rotor moments of row k of `table`, see `rotor_kernel.rotor_table`."""
+    lane_kernel()
+    s2a, x2a, y2a, z2a, o1a = table[k, 0], table[k, 1], table[k, 2], table[k, 3], table[k, 4]
+    s2b, x2b, y2b = table[k, ALL_MOMENTS], table[k, ALL_MOMENTS + 1], table[k, ALL_MOMENTS + 2]
+    z2b, o1b = table[k, ALL_MOMENTS + 3], table[k, ALL_MOMENTS + 4]
+    for lane in range(LANES):
+        _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s)
 
 
 @nb.njit(**inlined)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
-from quadid.model.kernel import body_constants, flight_factors, step_core, step_full
+from quadid.model.kernel import body_constants, flight_factors, step_core, step_core_shared, step_full
 from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step, spread_moments
 
 # isort: off
@@ -219,7 +219,8 @@ def _march(
         for i in range(steps):
             k = first + i
             if need.shared:
-                spread_moments(table, k, need.full, s)
+                if need.full:
+                    spread_moments(table, k, s)
             else:
                 if k == following:
                     _copy(rot, ahead)
@@ -235,6 +236,8 @@ def _march(
             # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
             if need.full:
                 step_full(dt, s)
+            elif need.shared:
+                step_core_shared(dt, table, k, s)
             else:
                 step_core(dt, s)
             if i == 0:

@@ -263,8 +263,8 @@ def _table(
 
 
 @nb.njit(**jit)
-def spread_moments(table: FloatArray, k: int, full: bool, s: FloatArray) -> None:
-    """Writes the shared moments of step k into all lanes; sum of speeds and spin-up only for the full equations."""
+def spread_moments(table: FloatArray, k: int, s: FloatArray) -> None:
+    """Writes the shared moments of step k into all lanes."""
     lane_kernel()
     for lane in range(LANES):
         s[A_S2 + lane], s[A_S2 + HALF + lane] = table[k, 0], table[k, ALL_MOMENTS]
@@ -272,10 +272,8 @@ def spread_moments(table: FloatArray, k: int, full: bool, s: FloatArray) -> None
         s[A_Y2 + lane], s[A_Y2 + HALF + lane] = table[k, 2], table[k, ALL_MOMENTS + 2]
         s[A_Z2 + lane], s[A_Z2 + HALF + lane] = table[k, 3], table[k, ALL_MOMENTS + 3]
         s[A_O1 + lane], s[A_O1 + HALF + lane] = table[k, 4], table[k, ALL_MOMENTS + 4]
-    if full:
-        for lane in range(LANES):
-            s[A_S1 + lane], s[A_S1 + HALF + lane] = table[k, 5], table[k, ALL_MOMENTS + 5]
-            s[A_DO + lane], s[A_DO + HALF + lane] = table[k, 6], table[k, ALL_MOMENTS + 6]
+        s[A_S1 + lane], s[A_S1 + HALF + lane] = table[k, 5], table[k, ALL_MOMENTS + 5]
+        s[A_DO + lane], s[A_DO + HALF + lane] = table[k, 6], table[k, ALL_MOMENTS + 6]
 
 
 def _on_disk(sources: int) -> Any:
