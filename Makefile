@@ -132,6 +132,10 @@ fuzz: $(DEV) ## mutated logs through the four binary readers for an hour; goes o
 soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, into docs/results/soak.md (hours)
 	$(STUDY) studies.soak --out docs/results
 
+.PHONY: chaos
+chaos: $(MESSAGES) ## random faults at the running service for 20 min, into docs/results/chaos.md
+	$(STUDY) studies.chaos --minutes 20 --out docs/results
+
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow
 

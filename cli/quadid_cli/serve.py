@@ -121,6 +121,10 @@ class _Console:
         self._said = time.monotonic()
         traffic = self._link.traffic()
         rates = ", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"
+        if traffic.refused:
+            rates += f" | {traffic.refused} frames refused"
+        if traffic.behind:
+            rates += f" | signed with our key, but {traffic.behind:.0f} s behind this clock: give the vehicle the time"
         status = health.status
         self._console.print(
             f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}",
@@ -146,6 +150,7 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
         "status": status_to_dict(health.status),
         "rates": traffic.rates,
         "refused": traffic.refused,
+        "behind": traffic.behind,
         "dropped": traffic.dropped,
         "worker_restarts": health.restarts,
         "history": health.history,

@@ -40,12 +40,17 @@ _WANTED = frozenset(_IDS[n] for n in (*READERS, *_ANSWERED) if n in _IDS)
 
 @dataclass(frozen=True)
 class Traffic:
-    """What comes over the link: measured rates [Hz] by message, requests denied, frames refused, bytes dropped."""
+    """What comes over the link: measured rates [Hz] by message, requests denied, frames refused, bytes dropped.
+
+    Attributes:
+        behind: a stream signed with our key is refused because its stamps are this far behind [s]; 0 for none.
+    """
 
     rates: dict[str, float]
     denied: tuple[str, ...]
     refused: int
     dropped: int
+    behind: float = 0.0
 
 
 class MavlinkLink:
@@ -195,7 +200,8 @@ class MavlinkLink:
 
     def traffic(self) -> Traffic:
         """What comes over the link."""
-        return Traffic(dict(self._rates), tuple(self._denied.values()), self._wire.refused, self._wire.dropped)
+        wire = self._wire
+        return Traffic(dict(self._rates), tuple(self._denied.values()), wire.refused, wire.dropped, wire.mav.behind)
 
     def close(self) -> None:
         """Closes the link."""

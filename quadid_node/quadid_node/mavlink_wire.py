@@ -74,7 +74,12 @@ class SafeMavlink(_Coder):
 
     pymavlink notes a frame's timestamp first and checks the signature afterwards, so that one forged frame from the far
     future locks the true sender out.
+
+    Attributes:
+        behind: how far the newest stream refused for its age alone is behind [s]; 0 when the last one was believed.
     """
+
+    behind = 0.0
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
         """Checks signature, then timestamp; notes the timestamp only of a frame that passed both."""
@@ -84,8 +89,12 @@ class SafeMavlink(_Coder):
         timestamp = int.from_bytes(msgbuf[-12:-6], "little")
         stream = (msgbuf[-13], srcSystem, srcComponent)
         last = self.signing.stream_timestamps.get(stream)
-        if timestamp <= last if last is not None else timestamp + MOST_BEHIND < self.signing.timestamp:
+        if last is None and timestamp + MOST_BEHIND < self.signing.timestamp:
+            self.behind = (self.signing.timestamp - timestamp) * 1e-5
             return False
+        if last is not None and timestamp <= last:
+            return False
+        self.behind = 0.0
         self.signing.stream_timestamps[stream] = timestamp
         self.signing.timestamp = max(self.signing.timestamp, timestamp)
         return True

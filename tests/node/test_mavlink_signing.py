@@ -48,6 +48,24 @@ def test_with_a_key_unsigned_forged_and_replayed_frames_change_nothing(port: int
         link.close()
 
 
+def test_a_vehicle_without_the_time_is_refused_and_the_reason_is_told(port: int) -> None:
+    """Its clock is behind ours by more than a minute: to us its frames are as good as recorded ones."""
+    link, vehicle = signed_link(port), Sender(port, key=KEY)
+    try:
+        vehicle.mav.signing.timestamp -= 200 * 100_000
+        vehicle.heartbeat()
+        samples(link, 0.1)
+        assert link.vehicle_system == 0
+        assert 190.0 < link.traffic().behind < 210.0
+        vehicle.mav.signing.timestamp += 199 * 100_000
+        vehicle.heartbeat()
+        samples(link, 0.1)
+        assert link.vehicle_system == 1
+        assert link.traffic().behind == 0.0
+    finally:
+        link.close()
+
+
 def test_a_forged_timestamp_from_the_far_future_does_not_lock_the_vehicle_out(port: int, happened: Happened) -> None:
     """pymavlink itself notes the timestamp before it checks the signature."""
     link, vehicle, mallory = signed_link(port), Sender(port, key=KEY), Sender(port, key=bytes(32))
