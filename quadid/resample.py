@@ -27,11 +27,29 @@ _CHUNK = 4096
 
 def sample_period(t: FloatArray) -> float:
     """Returns the sample period [s]: the mean of the steps up to 1.5 times the median one; NaN below two samples."""
-    steps = np.diff(t)
+    return period_of(t[1:] - t[:-1])
+
+
+def period_of(steps: FloatArray) -> float:
+    """As `sample_period`, of the steps between samples [s]."""
+    if len(steps) == 0:
+        return float("nan")
+    low, high = float(steps.min()), float(steps.max())
+    if low > 0.0 and high <= 1.5 * low:  # then the median leaves none out
+        return float(np.add.reduce(steps) / len(steps))
     steps = steps[steps > 0.0]
     if len(steps) == 0:
         return float("nan")
-    return float(np.mean(steps[steps <= 1.5 * np.median(steps)]))
+    return float(np.mean(steps[steps <= 1.5 * median(steps)]))
+
+
+def median(values: FloatArray) -> float:
+    """Median of finite numbers, shape (n,), n > 0: numpy's to the bit, without the checks that cost more than it."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    low, high = np.partition(values, [middle - 1, middle])[middle - 1 : middle + 1]
+    return float((low + high) / 2.0)
 
 
 def split_stretches(t: FloatArray, longest_step: float, breaks: Sequence[float] = ()) -> list[slice]:
@@ -41,7 +59,9 @@ def split_stretches(t: FloatArray, longest_step: float, breaks: Sequence[float] 
     """
     if len(t) == 0:
         return []
-    cuts = np.flatnonzero(np.diff(t) > longest_step) + 1
+    cuts = np.flatnonzero(t[1:] - t[:-1] > longest_step) + 1
+    if not len(cuts) and not breaks:
+        return [slice(0, len(t))]
     edges = np.searchsorted(t, np.asarray(breaks, dtype=np.float64), side="left")
     inner = np.unique(np.concatenate([cuts, edges[(edges > 0) & (edges < len(t))]]))
     bounds = [0, *(int(i) for i in inner), len(t)]
@@ -143,10 +163,14 @@ def lowpass(t: FloatArray, values: FloatArray, at: FloatArray, step: float, held
     if len(at) == 0:
         return np.empty((0, values.shape[1]))
     lag, kernel, area = _kernel_table()
-    edges = np.append(t, t[-1] + (sample_period(t) if len(t) > 1 else step))
-    share = np.gradient(t) if len(t) > 1 else np.array([step])
     first = np.maximum(np.searchsorted(t, at - HALF_WIDTH * step) - 1, 0)
     taps = int(np.max(np.searchsorted(t, at + HALF_WIDTH * step, side="right") - first)) + 1
+    # Only what the kernel reaches, and a sample on either side, is looked at.
+    low, high = max(int(first.min()) - 1, 0), min(int(first.max()) + taps + 1, len(t))
+    end = t[-1] + (sample_period(t) if held and len(t) > 1 else step) if high == len(t) else t[high]
+    first, t, values = first - low, t[low:high], values[low:high]
+    edges = np.append(t, end)
+    share = np.gradient(t) if len(t) > 1 else np.array([step])
     out = np.empty((len(at), values.shape[1]))
     for begin in range(0, len(at), _CHUNK):
         rows = slice(begin, begin + _CHUNK)
@@ -181,7 +205,7 @@ def fresh_rows(values: FloatArray) -> NDArray[np.intp]:
         return np.arange(len(values))
     start = np.concatenate([[0], np.flatnonzero(np.any(np.diff(values, axis=0) != 0.0, axis=1)) + 1])
     run = np.diff(np.append(start, len(values)))
-    usual = float(np.median(run))
+    usual = median(run.astype(np.float64))
     if usual < 2.0 or len(start) < 0.02 * len(values):
         return np.arange(len(values))
     keep = np.repeat(run > 5.0 * usual, run)

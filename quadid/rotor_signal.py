@@ -78,7 +78,7 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
 
 def _usable(recording: Recording, name: str) -> Channel | None:
     channel = recording.channels.get(name)
-    return channel if channel is not None and len(np.unique(channel.t)) >= 2 else None
+    return channel if channel is not None and len(channel.t) and channel.t[-1] > channel.t[0] else None
 
 
 def _check_columns(recording: Recording, signal: RotorSignal, vehicle: Vehicle) -> None:

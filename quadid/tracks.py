@@ -17,6 +17,7 @@ from quadid.resample import (
     lowpass,
     lowpass_span,
     matching_rows,
+    median,
     sample_period,
     split_stretches,
 )
@@ -79,27 +80,31 @@ def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling:
         if channel is not None and len(channel.t) >= 2:
             raw[name] = (channel.t, channel.values)
     raw = {name: _distinct(*pair) for name, pair in raw.items()}
-    own = sample_period(raw.get("gyro", raw["rotor_speed"])[0])
+    periods = {name: sample_period(times) for name, (times, _) in raw.items()}
+    own = periods.get("gyro", periods["rotor_speed"])
     step = round(own, 9) if rate is None else 1.0 / rate
-    filtered = min(sample_period(raw[n][0]) for n in REQUIRED if n in raw) < _FAST * step
+    filtered = min(periods[n] for n in REQUIRED if n in raw) < _FAST * step
     gap, bridged = (CSV_GAP, 0.0) if recording.format == "csv" else (GAP, _BRIDGED * step)
     tracks = {}
     for name, (times, values) in raw.items():
-        longest = max(gap * float(np.median(np.diff(times))), bridged)
+        period, longest = periods[name], max(gap * median(np.diff(times)), bridged)
         if filtered and name in ("attitude", "velocity", "position", "gyro"):
             rows = fresh_rows(values)
             if len(rows) < len(times):
                 times, values = times[rows], values[rows]
-                longest = GAP * float(np.median(np.diff(times)))
-        period = sample_period(times)
+                period = sample_period(times)
+                longest = GAP * median(np.diff(times)) if len(times) > 1 else period  # stuck: there is no period
         cuts = tuple(split_stretches(times, longest, recording.breaks))
         tracks[name] = Track(times, values, period, cuts, name == "rotor_speed" and sampling == "held")
     return Plan(step, filtered, tracks, "instant" if filtered else sampling)
 
 
 def _distinct(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    keep = np.concatenate([[True], np.diff(t) > 0.0])
-    return (t, values) if bool(keep.all()) else (t[keep], values[keep])
+    rising = t[1:] > t[:-1]
+    if bool(rising.all()):
+        return t, values
+    keep = np.concatenate([[True], rising])
+    return t[keep], values[keep]
 
 
 def _is_filtered(track: Track, plan: Plan) -> bool:

@@ -5,7 +5,7 @@ Inside the core all data are SI, world NED, body FRD, quaternions body to world,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -38,6 +38,25 @@ class Sample:
     t: float
     channel: str
     values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Messages of one kind, in order: times [s], shape (n,), and values by channel, each of shape (n, columns).
+
+    It stands for its samples message by message, within a message in the order of `columns`.
+    """
+
+    t: FloatArray
+    columns: tuple[tuple[str, FloatArray], ...]
+
+    def samples(self, start: int = 0, stop: int | None = None) -> Iterator[Sample]:
+        """The samples of messages `start` to before `stop`."""
+        times = self.t[start:stop].tolist()
+        rows = [(name, values[start:stop].tolist()) for name, values in self.columns]
+        for k, t in enumerate(times):
+            for name, values in rows:
+                yield Sample(t, name, tuple(values[k]))
 
 
 def _frozen(values: ArrayLike, name: str, columns: int | None) -> FloatArray:

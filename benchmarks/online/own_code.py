@@ -9,6 +9,7 @@ from typing import Any
 
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer
+from quadid_node.intake import Intake
 from quadid_node.messages import Clock
 from quadid_node.presets import source
 from quadid_node.service import Service
@@ -19,6 +20,7 @@ from quadid_replay.mcap_records import McapFile
 from benchmarks.online.accuracy import PELICAN
 from benchmarks.online.feeder import recording
 from quadid.online import SessionSettings
+from quadid.window import Block
 
 STEP_EVERY = 80
 """Messages between two looks at the session: 50 ms of them."""
@@ -34,13 +36,18 @@ def own_code(seconds: float) -> dict[str, Any]:
         messages = [(topics[number].name, data) for number, _, data in file.messages(topics.keys())]
     inputs = source("canonical").inputs
     chooser, clock = Chooser(best_ranks(inputs)), Clock()
-    decoders = {e.topic: Decoder(e, clock, chooser, 4, deserializer(e.type)) for e in inputs}
+    intake = Intake()
+    listeners = {e.topic: intake.open(e, e.topic, Decoder(e, clock, chooser, 4, deserializer(e.type))) for e in inputs}
     service = Service(PELICAN, SessionSettings(window=60.0, diagnose=0.0), InlineWorker())
     begin = time.process_time()
     for k, (topic, data) in enumerate(messages):
-        for sample in decoders[topic].samples(data):
-            service.push(sample)
+        listeners[topic](data)
         if k % STEP_EVERY == 0:
+            for item in intake.take():
+                if isinstance(item, Block):
+                    service.push_block(item)
+                else:
+                    service.push(item)
             service.step(2)
     spent = time.process_time() - begin
     return {"messages": len(messages), "us_per_message": spent / len(messages) * 1e6, "share": spent / seconds}

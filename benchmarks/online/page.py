@@ -101,11 +101,12 @@ def _refit(r: Result) -> list[str]:
 def _load(r: Result) -> list[str]:
     lines = [
         "The node in its own process, a feeder in another: IMU 1 kHz, attitude and rotor speeds 250 Hz, references and "
-        "odometry 50 Hz. Latency: from publishing an IMU message to the begin of its callback; in the callback: how "
-        "long that takes, both by the clock, so other programs on the machine count too (load average: runnable "
-        "programs, 2 cores). Goals: under 15 % of a core, p99 under 5 ms.", "",
+        "odometry 50 Hz. A callback only keeps the message; a step every 50 ms reads all that wait at once and does one "
+        "piece of the session's work. Latency: from publishing an IMU message to the begin of its callback; a step: how "
+        "long it holds up callbacks; both by the clock, so other programs on the machine count too (load average: "
+        "runnable programs, 2 cores). Goals: under 15 % of a core, p99 under 5 ms.", "",
         "| run | node, % of a core | fit process, % | IMU received % | latency idle p50 / p99 ms | while fitting "
-        "p50 / p99 ms | in the callback p50 / p99 ms | memory MiB begin → end | load average |",
+        "p50 / p99 ms | a step p50 / p99 ms | memory MiB begin → end | load average |",
         "|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for name, x in r.items():

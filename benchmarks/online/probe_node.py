@@ -1,4 +1,4 @@
-"""The node itself, with a watch on every IMU callback: how long after publishing it began, and whether a fit ran."""
+"""The node itself, watched: how late each IMU callback began and whether a fit ran, how long each step took."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import struct
 import sys
 import time
 from array import array
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,24 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.idle, self.fitting, self.spent = array("d"), array("d"), array("d")
 
-    def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
-        begin = time.time()
-        super()._on_message(decoder, entry, data)
-        if entry.topic == "imu" and self._service is not None:
+    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
+        take = super()._listener(entry, topic, decoder)
+        if entry.topic != "imu":
+            return take
+
+        def note(data: bytes) -> None:
+            begin = time.time()
+            take(data)
             (published,) = _LAST_DOUBLE.unpack_from(data, len(data) - 8)
-            kept = self.fitting if self._service.session.running is not None else self.idle
-            kept.append(begin - published)
-            self.spent.append(time.time() - begin)
+            busy = self._service is not None and self._service.session.running is not None
+            (self.fitting if busy else self.idle).append(begin - published)
+
+        return note
+
+    def _step(self) -> None:
+        begin = time.time()
+        super()._step()
+        self.spent.append(time.time() - begin)
 
     def destroy_node(self) -> None:
         """Writes what was noted."""

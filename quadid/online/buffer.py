@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
+from quadid.online.lines import Line
 from quadid.online.timebase import TimeBase
 from quadid.resample import split_stretches
 from quadid.rotor_signal import rotor_signal
 from quadid.tracks import GAP, OPTIONAL, REQUIRED, Track, make_plan, on_grid
 from quadid.vehicle import Vehicle
-from quadid.window import CHANNELS, Channel, Recording, Sample, Sampling
+from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +34,7 @@ HISTORY = 2.0
 """Past samples kept [s]: rates and gaps are judged from them."""
 LOST = 2.05
 """Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
+_LARGE = 1e150
 MOST_SAMPLES = 400_000
 """A channel holds no more samples than this; a flood beyond is dropped and counted."""
 
@@ -72,68 +74,6 @@ class _Due:
     arrived: tuple[int, ...]
 
 
-class _Line:
-    """Samples of one channel, sorted by time."""
-
-    def __init__(self, columns: int) -> None:
-        self.t = np.empty(0)
-        self.values = np.empty((0, columns))
-        self.waiting_t: list[float] = []
-        self.waiting: list[tuple[float, ...]] = []
-        self.arrived = 0
-
-    def add(self, t: float, values: tuple[float, ...]) -> None:
-        """Takes a sample in the order of arrival."""
-        self.waiting_t.append(t)
-        self.waiting.append(values)
-        self.arrived += 1
-
-    def restart(self, arrived: int) -> None:
-        """Drops the first `arrived` samples that ever came."""
-        count = self._count(arrived)
-        del self.waiting_t[:count], self.waiting[:count]
-        self.t, self.values = self.t[:0], self.values[:0]
-
-    def settle(self, oldest: float, arrived: int) -> tuple[int, int]:
-        """Sorts in what is among the first `arrived` samples; returns how many of them were too late and doubles."""
-        count = self._count(arrived)
-        if not count:
-            return 0, 0
-        t, values = np.array(self.waiting_t[:count]), np.array(self.waiting[:count])
-        del self.waiting_t[:count], self.waiting[:count]
-        in_time = t >= oldest
-        late = len(t) - int(np.count_nonzero(in_time))
-        t, values = np.concatenate([self.t, t[in_time]]), np.concatenate([self.values, values[in_time]])
-        steps = np.diff(t)
-        doubles = 0
-        if np.any(steps <= 0.0):
-            order = np.argsort(t, kind="stable")
-            t, values = t[order], values[order]
-            keep = np.concatenate([[True], np.diff(t) > 0.0])
-            doubles = len(t) - int(np.count_nonzero(keep))
-            t, values = t[keep], values[keep]
-        self.t, self.values = t, values
-        return late, doubles
-
-    def _count(self, arrived: int) -> int:
-        """Waiting samples among the first `arrived`."""
-        return len(self.waiting) - (self.arrived - arrived)
-
-    def forget(self, before: float) -> None:
-        """Drops samples before a time [s]."""
-        first = int(np.searchsorted(self.t, before))
-        if first:
-            self.t, self.values = self.t[first:], self.values[first:]
-
-    def between(self, name: str, a: float, b: float) -> Channel | None:
-        """The samples in [a, b] as a channel; None when there are fewer than two."""
-        low, high = int(np.searchsorted(self.t, a)), int(np.searchsorted(self.t, b, side="right"))
-        if high - low < 2:
-            return None
-        values = self.values[low:high]
-        return Channel(name, self.t[low:high], _continuous(values) if name == "attitude" else values, name)
-
-
 class Buffer:
     """Samples in, rows out.
 
@@ -154,7 +94,7 @@ class Buffer:
         self._step = 1.0 / rate
         rotors = len(vehicle.rotors)
         self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
-        self._lines = {name: _Line(count) for name, count in self._columns.items()}
+        self._lines = {name: Line(count) for name, count in self._columns.items()}
         self._due: deque[_Due] = deque()
         self._first = math.inf
         self._next = math.nan
@@ -183,7 +123,7 @@ class Buffer:
             self.faults[f"{name}: unconfirmed time"] += 1
             return
         line = self._lines[name]
-        if len(line.waiting_t) >= MOST_SAMPLES:
+        if line.waiting >= MOST_SAMPLES:
             self.faults[f"{name}: flood"] += 1
             return
         self._advance(name, t)
@@ -192,6 +132,42 @@ class Buffer:
         self.counts[name] += 1
         if t > self.last.get(name, -math.inf):
             self.last[name] = t
+
+    def push_block(self, block: Block) -> None:
+        """Takes messages as if their samples were pushed one by one."""
+        start, t = 0, self._plain(block)
+        while start < len(block.t):
+            # Up to the message with which a block of rows is settled, samples only add up.
+            stop = start if t is None else start + int(np.argmax(np.append(t[start:], np.inf) >= self._next))
+            if t is not None and stop > start:
+                self._extend(block, t, start, stop)
+            for sample in block.samples(stop, len(block.t) if t is None else stop + 1):
+                self.push(sample)
+            start = len(block.t) if t is None else stop + 1
+
+    def _plain(self, block: Block) -> FloatArray | None:
+        """Session times of messages with which nothing is wrong [s]; None where each must be looked at."""
+        if math.isnan(self._next) or len(self.time.steps) > self._steps_seen:
+            return None
+        for name, values in block.columns:
+            line = self._lines.get(name)
+            if line is None or values.shape[1] != self._columns[name]:
+                return None
+            if not np.abs(values).max(initial=0.0) < _LARGE or line.waiting + len(values) > MOST_SAMPLES:
+                return None
+            if name == "attitude" and not (np.abs(np.sqrt(np.sum(values * values, axis=1)) - 1.0) < 0.9e-3).all():
+                return None
+        return self.time.plain(block.t)
+
+    def _extend(self, block: Block, t: FloatArray, start: int, stop: int) -> None:
+        """Takes messages that are plain and settle nothing."""
+        times = t[start:stop]
+        newest = float(times.max())
+        self.time.newest = max(self.time.newest, newest)
+        for name, values in block.columns:
+            self._lines[name].extend(times, values[start:stop])
+            self.counts[name] += len(times)
+            self.last[name] = max(self.last.get(name, -math.inf), newest)
 
     def next_rows(self) -> Rows | None:
         """The next block of rows, or None until enough has arrived."""
@@ -286,12 +262,6 @@ def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
     if not 0.5 < norm < 2.0:
         return ()
     return q if abs(norm - 1.0) <= 1e-3 else tuple(c / norm for c in q)
-
-
-def _continuous(q: FloatArray) -> FloatArray:
-    """Signs such that neighbours are less than half a turn apart; shape (n, 4)."""
-    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
-    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
 
 
 __all__ = ["BLOCK", "HISTORY", "SETTLE", "Buffer", "Rows"]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.online.buffer import Rows
+from quadid.resample import median
 from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]
@@ -127,8 +128,8 @@ class Monitor:
         best: Change | None = None
         for split in range(first, len(t) - AFTER + 1):
             for c, name in enumerate(CHANNELS):
-                errors, size = _step(series[:split, c], series[split:, c])
-                if abs(size) >= LEAST[c] and errors > SIGNIFICANT and (best is None or errors > best.errors):
+                errors, size = _step(series[:split, c], series[split:, c], LEAST[c])
+                if errors > SIGNIFICANT and (best is None or errors > best.errors):
                     best = Change(float(t[split]) - 0.5 * CHUNK, name, size, errors)
         return best
 
@@ -145,11 +146,17 @@ class Monitor:
         return np.array(rows)
 
 
-def _step(before: FloatArray, after: FloatArray) -> tuple[float, float]:
-    """Size of a step in standard errors, and the step; every value after it must lie on the same side."""
-    size = float(np.median(after) - np.median(before))
-    spread = max(1.4826 * float(np.median(np.abs(before - np.median(before)))), 1e-6)
-    if not np.all(np.sign(size) * (after - np.median(before)) > 2.0 * spread):
+def _step(before: FloatArray, after: FloatArray, least: float) -> tuple[float, float]:
+    """Size of a step in standard errors, and the step; every value after it must lie on the same side.
+
+    A step smaller than `least` counts as none.
+    """
+    level = median(before)
+    size = median(after) - level
+    if abs(size) < least:
+        return 0.0, size
+    spread = max(1.4826 * median(np.abs(before - level)), 1e-6)
+    if not np.all(np.sign(size) * (after - level) > 2.0 * spread):
         return 0.0, size
     error = 1.25 * spread * np.sqrt(1.0 / len(after) + 1.0 / len(before))
     return abs(size) / float(error), size

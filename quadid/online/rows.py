@@ -144,7 +144,7 @@ def _joins(before: Rows, after: Rows) -> bool:
 
 def _stack(blocks: list[Rows], name: str) -> FloatArray:
     width = next(b.columns[name].shape[1] for b in blocks if name in b.columns)
-    parts = [b.columns.get(name, np.full((len(b.t), width), math.nan)) for b in blocks]
+    parts = [b.columns[name] if name in b.columns else np.full((len(b.t), width), math.nan) for b in blocks]
     return np.concatenate(parts)
 
 

@@ -30,7 +30,7 @@ from quadid.online.status import SessionStatus
 from quadid.online.study import STUDIED, Student, StudyReply
 from quadid.online.voice import Action, Voice
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
+from quadid.window import Block, Sample
 
 LEAD = 0.22
 """Flight before a window in which filters and delays settle [s]."""
@@ -77,6 +77,7 @@ class Session:
         self._reply: FitReply | ChangeReply | None = None
         self._outdated = 0
         self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
+        self._fit_at: float | None = None
         self._asked_now = False
         self._number = 0
         if self.ledger.in_force is not None:
@@ -88,6 +89,10 @@ class Session:
     def push(self, sample: Sample) -> None:
         """Takes one sample: stamp [s], channel, values in core units and frames."""
         self.buffer.push(sample)
+
+    def push_block(self, block: Block) -> None:
+        """Takes messages as if their samples were pushed one by one."""
+        self.buffer.push_block(block)
 
     def deliver(self, reply: FitReply | ChangeReply | StudyReply) -> None:
         """Takes the answer to the running request or study; an answer to any other is ignored."""
@@ -124,26 +129,35 @@ class Session:
         """The request whose reply the session waits for."""
         return self._waiting
 
+    @property
+    def backlog(self) -> float:
+        """Data that have arrived and were not worked through yet [s]."""
+        return max(self.buffer.time.newest - self._now, 0.0) if math.isfinite(self._now) else 0.0
+
     def poll(self, most: int | None = None) -> list[Action]:
         """Works through what has arrived and returns what to do, in order.
 
         Args:
-            most: blocks of rows to take in at most, so that a caller with other duties gets control back.
+            most: pieces of work (a block of rows, a tick, an answer) at most, so that a caller with other duties gets
+                control back.
         """
-        taken = 0
-        while True:
+        done = 0
+        while most is None or done < most:
             if self._waiting is not None:
                 if self._reply is None:
                     break
                 self._apply()
+            elif self._fit_at is not None:
+                tick, self._fit_at = self._fit_at, None
+                self._fit(tick)
             elif not math.isnan(self._tick_at) and self._now >= self._tick_at - _EPS:
                 tick, self._tick_at = self._tick_at, self._tick_at + self._tick
                 self._at(tick)
-            elif most is not None and taken >= most or (rows := self.buffer.next_rows()) is None:
-                break
-            else:
-                taken += 1
+            elif (rows := self.buffer.next_rows()) is not None:
                 self._take(rows)
+            else:
+                break
+            done += 1
         return self._voice.take()
 
     def status(self) -> SessionStatus:
@@ -167,7 +181,7 @@ class Session:
             stale=force is not None and force.state is SetState.STALE,
             approval=ledger.approval,
             faults=dict(self.buffer.faults),
-            backlog=max(newest - self._now, 0.0) if math.isfinite(self._now) else 0.0,
+            backlog=self.backlog,
         )
 
     # --- the walk of the data
@@ -187,7 +201,7 @@ class Session:
         self._now = float(rows.t[-1]) + 1.0 / self.settings.rate
 
     def _at(self, tick: float) -> None:
-        """One tick: first look for sudden changes, then fit."""
+        """One tick: first look for sudden changes; a fit is the next piece of work."""
         seen = self._sentry.look(tick, self._tick, self._learner)
         if seen is not None:
             self._voice.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
@@ -197,7 +211,7 @@ class Session:
         if self._sentry.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
-            self._fit(tick)
+            self._fit_at = tick
 
     def _study(self, tick: float) -> None:
         """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""

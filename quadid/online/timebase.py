@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one means a reboot or a clock step."""
 STEP_AHEAD = 30.0
@@ -55,6 +60,17 @@ class TimeBase:
                 self.newest = t
             return t
         return self._suspect(stamp)
+
+    def plain(self, stamps: FloatArray) -> FloatArray | None:
+        """Session times of stamps, shape (n,), where every one simply follows; None where `time` must look at each.
+
+        `newest` is left as it is.
+        """
+        if self.newest == -math.inf or self._suspects or not (np.abs(stamps) <= LARGEST).all():
+            return None
+        t = stamps + self._shift
+        low, high = float(t.min()), float(t.max())
+        return t if max(self.newest, high) - STEP_BACK < low and high < self.newest + STEP_AHEAD else None
 
     def _suspect(self, stamp: float) -> float | None:
         """Collects stamps of a possible new time base and moves to it when enough agree."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 from quadid.window import Sample
@@ -27,7 +26,6 @@ class Chooser:
         self._chosen: dict[str, int] = {}
         self._last: dict[str, float] = {}
         self._held: dict[str, dict[int, list[Sample]]] = {}
-        self._newest = -math.inf
 
     def take(self, sample: Sample, rank: int) -> Iterator[Sample]:
         """Yields what may be used now.
@@ -37,7 +35,6 @@ class Chooser:
             rank: of its source for this channel; 0 is the best.
         """
         channel = sample.channel
-        self._newest = max(self._newest, sample.t)
         chosen = self._chosen.get(channel)
         if chosen is not None and rank > chosen and sample.t > self._last[channel] + SILENT:
             chosen = None  # the chosen one fell silent
@@ -53,6 +50,17 @@ class Chooser:
                 yield sample
             return
         yield from self._hold(sample, rank)
+
+    def settled(self, channel: str, rank: int, newest: float) -> bool | None:
+        """Whether all samples of a source up to time `newest` [s] may be used; None: to be decided one by one."""
+        chosen = self._chosen.get(channel)
+        if chosen is None or rank < chosen or (rank > chosen and newest > self._last[channel] + SILENT):
+            return None
+        return rank == chosen
+
+    def used(self, channel: str, t: float) -> None:
+        """Notes that samples up to one at `t` [s] were used, as `settled` allowed."""
+        self._last[channel] = t
 
     def _hold(self, sample: Sample, rank: int) -> Iterator[Sample]:
         by_rank = self._held.setdefault(sample.channel, {})

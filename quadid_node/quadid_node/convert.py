@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,16 @@ from quadid_replay.cdr_blocks import BlockReader, Blocks, Read
 from quadid_replay.mcap_messages import SIGNALS, TYPES, Signals
 
 from quadid.errors import QuadidError
-from quadid.window import Sample
+from quadid.window import Block, Sample
 from quadid_node.chooser import Chooser
+from quadid_node.columns import COLUMNS
 from quadid_node.messages import Clock
 from quadid_node.presets import Input
+
+FEWEST = 2
+"""Fewer messages than these are quicker read one by one."""
+_BEHIND = {"pose_attitude": 5}
+"""The attitude of a pose stands behind a topic of its own, as when reading logs."""
 
 
 class MessageTypeError(QuadidError):
@@ -46,9 +52,10 @@ def message_class(name: str) -> Any:
 
 def deserializer(name: str) -> Callable[[bytes], Any]:
     """ROS' own decoder of ``package/Type``; raises MessageTypeError."""
-    from rclpy.serialization import deserialize_message
+    from rclpy.serialization import deserialize_message, serialize_message
 
     cls = message_class(name)
+    deserialize_message(serialize_message(cls()), cls)  # loads its type support now, not when the first one arrives
     return lambda data: deserialize_message(data, cls)
 
 
@@ -77,8 +84,11 @@ class Decoder:
         self._clock, self._chooser, self._rotors = clock, chooser, rotors
         self.failed = 0
 
+        self._columns = COLUMNS.get(entry.type)
+        self._layout: BlockReader | None = None
         if kind.stamp is None:
-            self._read = BlockReader(decode, kind.blocks, kind.extra).read
+            self._layout = BlockReader(decode, kind.blocks, kind.extra)
+            self._read = self._layout.read
         else:
             stamp = kind.stamp
 
@@ -87,6 +97,41 @@ class Decoder:
                 return Read(*stamp(message), kind.blocks(message), kind.extra(message))
 
             self._read = read
+
+    def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
+        """Yields what may be used now of messages in order, at once where only numbers differ between them."""
+        block = self._block(messages) if len(messages) >= FEWEST else None
+        if block is None:
+            for data in messages:
+                yield from self.samples(data)
+        elif block.columns:
+            yield block
+
+    def _block(self, messages: Sequence[bytes]) -> Block | None:
+        """The messages as one block, the numbers of `samples` to the bit; None where each must be looked at."""
+        read = self._layout.read_many(messages) if self._layout is not None else None
+        told = self._columns(read.blocks, read.extra) if self._columns is not None and read is not None else None
+        if read is None or told is None:
+            return None
+        ns = read.seconds * 10**9 + read.nanoseconds
+        if not (ns > 0).all():
+            return None
+        t = self._clock.many(ns)
+        columns = []
+        for name, values in told:
+            channel, convert = SIGNALS[name]
+            rank = self._ranks.get(channel)
+            if rank is None:
+                continue
+            used = self._chooser.settled(channel, rank + _BEHIND.get(name, 0), float(t.max()))
+            if used is None:
+                return None
+            if used:
+                width = self._rotors if channel in ("motor_command", "rotor_speed") else None
+                columns.append((channel, convert(values)[:, :width]))
+        for channel, _ in columns:
+            self._chooser.used(channel, float(t[-1]))
+        return Block(t, tuple(columns))
 
     def samples(self, data: bytes) -> Iterator[Sample]:
         """Yields the samples of one message that may be used now."""
@@ -109,9 +154,7 @@ class Decoder:
             plain = _FAST[name](values) if name in _FAST else tuple(convert(np.array([values]))[0].tolist())
             if channel in ("motor_command", "rotor_speed"):
                 plain = plain[: self._rotors]
-            # The attitude of an IMU or a pose stands behind a topic of its own, as when reading logs.
-            behind = 5 if name == "pose_attitude" else 0
-            yield from self._chooser.take(Sample(t, channel, plain), rank + behind)
+            yield from self._chooser.take(Sample(t, channel, plain), rank + _BEHIND.get(name, 0))
 
 
 def _flip(v: Any) -> tuple[float, ...]:

@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SetState
 from quadid.online.status import SessionStatus
 from quadid.parameters import NOMINAL_NAMES, Status
@@ -49,6 +52,12 @@ class Clock:
         if self.base_ns is None:
             self.base_ns = ns // _DAY_NS * _DAY_NS
         return (ns - self.base_ns) * 1e-9
+
+    def many(self, ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """As `seconds`, for many stamps."""
+        if self.base_ns is None:
+            self.base_ns = int(ns[0]) // _DAY_NS * _DAY_NS
+        return np.asarray((ns - self.base_ns) * 1e-9)
 
     def nanoseconds(self, t: float) -> int:
         """Nanoseconds of a time [s]; 0 for none."""

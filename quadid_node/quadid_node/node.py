@@ -21,9 +21,11 @@ from std_srvs.srv import Trigger
 from quadid.errors import QuadidError
 from quadid.online import Event, Publish
 from quadid.online.ledger import Answer
+from quadid.window import Block
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
+from quadid_node.intake import Intake
 from quadid_node.neighbours import Neighbours
 from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, read_vehicle, vehicle_id
 from quadid_node.presets import Input, Source, source
@@ -34,7 +36,10 @@ from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker
 
 STEP_SECONDS = 0.05
-BLOCKS_A_STEP = 2
+AT_ONCE, CATCHING_UP = 1, 4
+"""Pieces of the session's work in one step: messages wait no longer than one takes, unless there is a backlog,"""
+BACKLOG = 2.0
+"""... which is this much data [s]."""
 WARM_UP_SECONDS = 8.0
 """How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
 SENSOR_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -57,7 +62,7 @@ class IdentifyNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._on_set)
         self._service: Service | None = None
         self._recorder: Recorder | None = None
-        self._decoders: dict[str, Decoder] = {}
+        self._intake = Intake()
         self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -142,15 +147,16 @@ class IdentifyNode(LifecycleNode):
                 matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
             )
             subscription = self.create_subscription(
-                message_class(entry.type), entry.topic, lambda data, d=decoder, e=entry: self._on_message(d, e, data),
-                SENSOR_QOS,
+                message_class(entry.type), entry.topic, self._listener(entry, topic, decoder), SENSOR_QOS,
                 event_callbacks=events, raw=True,
             )  # fmt: skip
-            self._decoders[topic] = decoder
             self._open.append((self.destroy_subscription, subscription))
 
     def _types_on(self, topic: str) -> list[str]:
         return [info.topic_type for info in self.get_publishers_info_by_topic(topic)]
+
+    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
+        return self._intake.open(entry, topic, decoder)
 
     def _offer(self) -> None:
         self._speaker = Speaker(self, self._observer, self._neighbours.deaf)
@@ -169,7 +175,7 @@ class IdentifyNode(LifecycleNode):
         if self._speaker is not None:
             self._speaker.close()
             self._speaker = None
-        self._decoders.clear()
+        self._intake.clear()
         if self._service is not None:
             self._service.close()
             self._service = None
@@ -179,18 +185,24 @@ class IdentifyNode(LifecycleNode):
 
     # --- callbacks
 
-    def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
-        if self._active and not self._neighbours.paused and self._service is not None:
-            if self._recorder is not None:
-                self._recorder.take(entry.topic, entry.type.replace("/", "/msg/"), data)
-            for sample in decoder.samples(data):
-                self._service.push(sample)
-
     def _step(self) -> None:
         if self._service is None:
             return
-        for output in self._service.step(BLOCKS_A_STEP) if self._active else self._service.idle():
+        self._take_in(self._service)
+        most = CATCHING_UP if self._service.session.backlog > BACKLOG else AT_ONCE
+        for output in self._service.step(most) if self._active else self._service.idle():
             self._put(output)
+
+    def _take_in(self, service: Service) -> None:
+        """Gives the service what has arrived since the last step."""
+        if not self._active or self._neighbours.paused:
+            self._intake.drop()
+            return
+        for item in self._intake.take(self._recorder.take if self._recorder is not None else None):
+            if isinstance(item, Block):
+                service.push_block(item)
+            else:
+                service.push(item)
 
     def _put(self, output: Output) -> None:
         if isinstance(output, Event):
@@ -223,7 +235,7 @@ class IdentifyNode(LifecycleNode):
             fields["reason"] += f"; here: {self._hint}"
         self._speaker.publish("status", fields)
         notes = dict(self._neighbours.notes)
-        notes |= {t: f"{d.failed} messages could not be read" for t, d in self._decoders.items() if d.failed}
+        notes |= {t: f"{d.failed} messages could not be read" for t, d in self._intake.decoders.items() if d.failed}
         stamp = self.get_clock().now().to_msg()
         now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
         report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)

@@ -17,7 +17,7 @@ from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.online.status import SessionStatus
 from quadid.online.study import StudyReply, StudyRequest
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
+from quadid.window import Block, Sample
 from quadid_node.store import Restored, Store
 from quadid_node.worker import Trouble, Worker
 
@@ -99,11 +99,18 @@ class Service:
         self._arrived[sample.channel] = self._clock()
         self.session.push(sample)
 
+    def push_block(self, block: Block) -> None:
+        """Takes messages as if their samples were pushed one by one."""
+        now = self._clock()
+        for name, _ in block.columns:
+            self._arrived[name] = now
+        self.session.push_block(block)
+
     def step(self, most: int | None = None) -> list[Output]:
         """Moves everything on by what there is to do; never waits.
 
         Args:
-            most: blocks of rows to take in at most.
+            most: pieces of the session's work at most.
 
         Returns:
             What to publish and tell, already in the history.

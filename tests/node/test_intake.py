@@ -1,0 +1,122 @@
+"""Messages read a batch at a time: the samples, and the recording, are those of one message after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from mcap_ros2._dynamic import generate_dynamic
+from quadid_node.chooser import Chooser
+from quadid_node.columns import COLUMNS
+from quadid_node.convert import Decoder, best_ranks
+from quadid_node.intake import Intake
+from quadid_node.messages import Clock
+from quadid_node.presets import Input, source
+from quadid_replay import write_mcap
+from quadid_replay.mcap_messages import TYPES
+from quadid_replay.mcap_records import McapFile
+from quadid_replay.schemas import schema_text
+
+from quadid.flight import fly
+from quadid.vehicle import Vehicle
+from quadid.window import Block, Sample
+
+Message = tuple[str, bytes]
+INPUTS = source("canonical").inputs
+SIZES = {
+    "sensor_msgs/Imu": [37], "geometry_msgs/QuaternionStamped": [4], "sensor_msgs/JointState": [4, 0],
+    "nav_msgs/Odometry": [85], "quadid_msgs/AttitudeCommand": [4], "quadid_msgs/MotorCommand": [6],
+}  # fmt: skip
+"""Numbers in each message type, run by run."""
+
+
+@pytest.fixture(scope="module")
+def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+    flown = fly(Vehicle.shipped("pelican"), seconds=3.0, seed=1, log_rate=200.0, extras=["velocity", "battery"])
+    path = tmp_path_factory.mktemp("intake") / "k.mcap"
+    write_mcap(path, flown.recording, 1_700_000_000 * 10**9)
+    file = McapFile(path)
+    return [(file.topics[number].name, data) for number, _, data in file.messages(file.topics.keys())]
+
+
+def decoder(entry: Input, clock: Clock, chooser: Chooser) -> Decoder:
+    kind = entry.type.replace("/", "/msg/")
+    decode = generate_dynamic(kind, schema_text(kind))[kind]
+    return Decoder(entry, clock, chooser, 4, decode)
+
+
+def flat(items: Iterator[Sample | Block]) -> list[Sample]:
+    return [s for item in items for s in (item.samples() if isinstance(item, Block) else [item])]
+
+
+def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message], int]:
+    """Samples, what was recorded, and how many blocks there were, when taken in every `batch` messages."""
+    clock, chooser, intake = Clock(), Chooser(best_ranks(INPUTS)), Intake()
+    known = {e.topic: intake.open(e, e.topic, decoder(e, clock, chooser)) for e in INPUTS}
+    out: list[Sample] = []
+    recorded: list[Message] = []
+    blocks = 0
+    for k in range(0, len(messages), batch):
+        for topic, data in messages[k : k + batch]:
+            known[topic](data)
+        items = list(intake.take(lambda topic, kind, data: recorded.append((topic, data))))
+        blocks += sum(isinstance(item, Block) for item in items)
+        out += flat(iter(items))
+    return out, recorded, blocks
+
+
+def one_by_one(messages: list[Message]) -> list[Sample]:
+    clock, chooser = Clock(), Chooser(best_ranks(INPUTS))
+    known = {e.topic: decoder(e, clock, chooser) for e in INPUTS}
+    return [s for topic, data in messages for s in known[topic].samples(data)]
+
+
+@pytest.mark.parametrize("batch", [1, 7, 60])
+def test_a_batch_gives_the_samples_of_its_messages_in_the_order_recorded(messages: list[Message], batch: int) -> None:
+    samples, recorded, blocks = by_intake(messages, batch)
+    assert sorted(recorded) == sorted(messages)
+    assert samples == one_by_one(recorded)
+    assert (blocks > 0) == (batch > 1)
+    assert {s.channel for s in samples} >= {"gyro", "accel", "attitude", "rotor_speed", "velocity"}
+
+
+def test_the_gyro_comes_last(messages: list[Message]) -> None:
+    _, recorded, _ = by_intake(messages, 60)
+    topics = [topic for topic, _ in recorded[:60]]
+    assert topics.index("imu") == len(topics) - topics.count("imu")
+
+
+def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
+    imu = [data for topic, data in messages if topic == "imu"][:40]
+    imu[20] = imu[20][:30]
+    entry = next(e for e in INPUTS if e.topic == "imu")
+    whole = decoder(entry, Clock(), Chooser(best_ranks(INPUTS)))
+    single = decoder(entry, Clock(), Chooser(best_ranks(INPUTS)))
+    assert flat(whole.take(imu)) == [s for data in imu for s in single.samples(data)]
+    assert whole.failed == single.failed == 1
+
+
+@pytest.mark.parametrize("kind", sorted(COLUMNS))
+@pytest.mark.parametrize("seed", range(4))
+def test_columns_are_the_signals_of_each_message(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    runs = [rng.normal(size=(5, n)) for n in SIZES[kind]]
+    if seed and kind == "sensor_msgs/Imu":
+        runs[0][:, [4, 16, 28][seed - 1]] = -1.0
+    if seed == 1 and kind == "nav_msgs/Odometry":
+        runs[0][:, 0] = np.nan
+    extra = bool(seed % 2)
+    told = COLUMNS[kind](runs, extra)
+    assert told is not None
+    for row in range(5):
+        expected = TYPES[kind].signals([run[row].tolist() for run in runs], extra)
+        assert [name for name, _ in told] == [name for name, _ in expected]
+        for (_, values), (_, numbers) in zip(told, expected, strict=True):
+            assert np.array_equal(values[row], np.array(numbers), equal_nan=True)
+
+
+def test_messages_that_tell_different_signals_are_no_columns() -> None:
+    run = np.zeros((3, 37))
+    run[1, 16] = -1.0
+    assert COLUMNS["sensor_msgs/Imu"]([run], None) is None
