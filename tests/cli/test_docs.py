@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from quadid_cli.main import COMMANDS
+from quadid_cli.main import COMMANDS, EXAMPLES, load
 
 from tests.cli.conftest import Cli
 
@@ -42,6 +42,25 @@ def test_every_command_that_a_page_names_exists(repository: Path) -> None:
             assert (repository / example).exists(), (page.name, example)
         for module in re.findall(r"`python -m ([\w.]+)", text):
             assert importlib.util.find_spec(module) is not None, (page.name, module)
+
+
+def test_every_option_that_a_page_or_a_help_text_quotes_is_known(repository: Path) -> None:
+    pages = [repository / "README.md", repository / "SECURITY.md", *(repository / "docs").rglob("*.md")]
+    lines = [(page.name, line) for page in pages for line in commands(page)]
+    lines += [("--help", shlex.split(line)[1:]) for examples in EXAMPLES.values() for line in examples]
+    assert len(lines) > 60
+    for where, (name, *arguments) in lines:
+        # Parsed as when called: options, their values, and what must be given.
+        assert load(name).make_context(name, list(arguments)), (where, name, arguments)
+
+
+def test_every_option_quoted_in_a_sentence_is_known(repository: Path) -> None:
+    for page in [repository / "README.md", *(repository / "docs").rglob("*.md")]:
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        for name, rest in re.findall(r"`quadid ([a-z]+)\b([^`]*)`", text):
+            known = {option for parameter in load(name).params for option in parameter.opts}
+            for option in re.findall(r"(?<!\S)--[a-z-]+", rest):
+                assert option in known, (page.name, name, option)
 
 
 def test_every_test_that_a_wish_names_exists(repository: Path) -> None:
