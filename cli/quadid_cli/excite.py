@@ -26,7 +26,7 @@ MOST_SECONDS = 600.0
 
 
 def excite(
-    logs: Annotated[list[str] | None, typer.Argument(metavar="[LOG...]", help="Flights so far, if any.")] = None,
+    logs: Annotated[list[str] | None, typer.Argument(metavar="LOG", help="Flights so far, if any.")] = None,
     vehicle: VehicleName = "pelican",
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the manoeuvre.")] = 60.0,
     tilt: Annotated[float, typer.Option("--tilt", metavar="DEG", help="Largest tilt.")] = 25.0,

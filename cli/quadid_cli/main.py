@@ -17,19 +17,19 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 COMMANDS: dict[str, str] = {
-    "demo": "Fly, log, identify and diagnose a simulated Pelican; write a report.",
+    "demo": "Fly, identify and diagnose a simulated Pelican; write a report.",
     "simulate": "Fly the closed-loop vehicle and log it, to a file or live.",
-    "inspect": "What a log holds: channels, rates, gaps, faults, excitation, what is missing.",
+    "inspect": "What a log holds, whether it can be true, and what is missing.",
     "identify": "Identify the parameters of a vehicle from its flight logs.",
     "score": "Open-loop prediction error of a vehicle file on logs.",
-    "compare": "All optimisers and subspace methods side by side on the same data.",
-    "diagnose": "What the simulation gets wrong, why, and what the better model gains.",
+    "compare": "All optimisers and subspace methods on the same data.",
+    "diagnose": "What the simulation gets wrong, why, and what mending it gains.",
     "excite": "Which manoeuvre to fly next, and what it would gain.",
     "reproduce": "The paper's tables and figures.",
     "replay": "Drive the online session from a log.",
     "serve": "The online service on a MAVLink link, no ROS needed.",
     "watch": "Live terminal view of one or many vehicles.",
-    "history": "Stored parameter sets: what, when, from which data, who approved.",
+    "history": "Stored parameter sets: what, when, from which data, by whom.",
     "export": "The parameters for another program.",
     "fleet": "Identify a folder of logs in parallel.",
 }

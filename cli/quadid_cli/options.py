@@ -10,7 +10,7 @@ import typer
 Logs = Annotated[
     list[str],
     typer.Argument(
-        metavar="LOG...",
+        metavar="LOG",
         help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
     ),
 ]
