@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.fit import SWARM_SECONDS, SWARM_SEGMENTS
+from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.shooting import Shooting
 from quadid.model.kernel import LANES
 from quadid.parameters import NOMINAL_NAMES
@@ -20,6 +20,10 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
+
+
+SEGMENTS = 400
+"""Most segments, spread evenly."""
 
 
 class BoxProblem:
@@ -32,7 +36,7 @@ class BoxProblem:
     """
 
     def __init__(self, windows: Sequence[Window], vehicle: Vehicle) -> None:
-        """Cuts `windows` into short segments, thinned as for the swarm.
+        """Cuts `windows` into short segments, at most about `SEGMENTS` of them.
 
         Raises:
             NotIdentifiableError: no stretch is long enough.
@@ -40,7 +44,7 @@ class BoxProblem:
         shooting = Shooting(windows, vehicle, SWARM_SECONDS)
         if not shooting.rollouts:
             raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
-        every = -(-shooting.count // SWARM_SEGMENTS)
+        every = -(-shooting.count // SEGMENTS)
         shooting.segments = [s.every(every) for s in shooting.segments]
         self._shooting = shooting
         self._theta = shooting.layout.initial(vehicle)

@@ -29,8 +29,11 @@ Progress = Callable[[str, float], None]
 
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
-SWARM_SEGMENTS = 400
-SHORT_SEGMENTS = 3000
+RESOLUTION = 0.5
+"""Differences of the swarm's cost, a sum of squares over the noise, below which particles are equally good."""
+SWARM_SEGMENTS = 100
+"""Most segments the swarm simulates, spread evenly: it has to find the valley, whose bottom the polish finds."""
+SHORT_SEGMENTS = 1000
 """Most short segments of the first polish, whose result only starts the last one."""
 SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
 """Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
@@ -242,7 +245,7 @@ def swarm_search(
     settings = replace(options.swarm, iterations=options.iterations, initial_points=guess)
     swarm = Swarm(lower, upper, options.particles, options.seed, settings)
     done = 0
-    while swarm.stop is Stop.RUNNING:
+    while swarm.stop is Stop.RUNNING and not _resolved(swarm, settings):
         points = swarm.ask()
         thetas = np.repeat(theta[None], len(points), axis=0)
         thetas[:, free.index] = _from_box(free, points)
@@ -252,6 +255,12 @@ def swarm_search(
     best = theta.copy()
     best[free.index] = _from_box(free, swarm.best[None])[0]
     return best, done * options.particles
+
+
+def _resolved(swarm: Swarm, settings: SwarmOptions) -> bool:
+    """True when no particle's best is worse than the best of all by more than the data can tell."""
+    worst = float(np.max(swarm.personal_bests[1]))
+    return settings.tolerance > 0.0 and np.isfinite(worst) and worst - swarm.best_cost < RESOLUTION
 
 
 def _box(free: Free) -> tuple[FloatArray, FloatArray]:

@@ -64,25 +64,37 @@ class NoiseModel:
     def whitener(self, length: int, dt: float) -> FloatArray:
         """Returns W, shape (channels, length, length): W[c] @ r has unit variance and is white for pure noise r.
 
-        Rows look back only (inverse of a Cholesky factor), so a whitened residual keeps its order in time.
+        Rows look back only (inverse of a Cholesky factor), so a whitened residual keeps its order in time.  Read-only.
         """
-        out = np.zeros((len(self.white), length, length))
-        for c, (white, slow) in enumerate(zip(self.white, self.slow, strict=True)):
-            if slow > 0.0:
-                covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / self.slow_time)
-            elif self.shape is not None and np.ptp(self.shape[c]) > 0.0:
-                covariance = white**2 * _stationary(self.shape[c], length)
-            else:
-                out[c] = np.eye(length) / white
-                continue
-            out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
-        return out
+        shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
+        return _whitener(tuple(self.white), tuple(self.slow), self.slow_time, shape, length, dt)
 
     @property
     def coloured(self) -> NDArray[np.bool_]:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
+
+
+@lru_cache(maxsize=16)
+def _whitener(
+    whites: tuple[float, ...], slows: tuple[float, ...], slow_time: float, shape: tuple[tuple[int, ...], bytes] | None,
+    length: int, dt: float,
+) -> FloatArray:  # fmt: skip
+    """`NoiseModel.whitener` of these numbers, read-only; the same one is asked for again and again."""
+    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
+    out = np.zeros((len(whites), length, length))
+    for c, (white, slow) in enumerate(zip(whites, slows, strict=True)):
+        if slow > 0.0:
+            covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / slow_time)
+        elif shapes is not None and np.ptp(shapes[c]) > 0.0:
+            covariance = white**2 * _stationary(shapes[c], length)
+        else:
+            out[c] = np.eye(length) / white
+            continue
+        out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
+    out.setflags(write=False)
+    return out
 
 
 def _stationary(shape: FloatArray, length: int) -> FloatArray:
