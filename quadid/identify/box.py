@@ -21,7 +21,6 @@ from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
 
-
 SEGMENTS = 400
 """Most segments, spread evenly."""
 
@@ -44,9 +43,7 @@ class BoxProblem:
         shooting = Shooting(windows, vehicle, SWARM_SECONDS)
         if not shooting.rollouts:
             raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
-        every = -(-shooting.count // SEGMENTS)
-        shooting.segments = [s.every(every) for s in shooting.segments]
-        self._shooting = shooting
+        self._shooting = shooting = shooting.at_most(SEGMENTS)
         self._theta = shooting.layout.initial(vehicle)
         none = shooting.free([])
         self._index = shooting.free(NOMINAL_NAMES).index

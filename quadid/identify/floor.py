@@ -135,9 +135,8 @@ def flexible_fit(
 
 def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterations: int) -> tuple[Polished, int]:
     """Fits the flexible model to some of the longer segments, evenly spread, and settles all; and vectors simulated."""
-    every = max(-(-longer.count // LONG_SEGMENTS), 1)
     longer.restore({})
-    second = polish(longer.thinned(every), theta, longer.free(names), iterations=iterations)
+    second = polish(longer.at_most(LONG_SEGMENTS), theta, longer.free(names), iterations=iterations)
     simulated = second.iterations * (len(names) + 10)
     # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial states,
     # so that segments are started and filters warmed up as for all.
@@ -164,4 +163,4 @@ def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: No
     """Segments of `seconds`, at most about `most` of them spread evenly; vehicle and local parameters as in `like`."""
     out = Shooting(windows, like.vehicle, seconds, noise, like.layout)
     out.local = like.local
-    return out.thinned(max(-(-out.count // most), 1))
+    return out.at_most(most)

@@ -129,6 +129,10 @@ class Shooting:
         thin._reckoned = {n: [v[::every] for v in velocities] for n, velocities in self._reckoned.items()}
         return thin
 
+    def at_most(self, most: int) -> Shooting:
+        """The same problem on at most about `most` segments, spread evenly."""
+        return self.thinned(max(-(-self.count // most), 1))
+
     def swarm_cost(self, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
         """Cost of many parameter vectors at once on at most `most` segments, spread evenly.
 
