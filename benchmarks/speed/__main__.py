@@ -21,6 +21,7 @@ from benchmarks.speed import peers, whole
 from benchmarks.speed.assembly import instructions
 from benchmarks.speed.cases import kernel_table
 from benchmarks.speed.page import page
+from benchmarks.speed.pieces import pieces
 from benchmarks.speed.plots import draw
 from benchmarks.speed.timing import machine
 
@@ -31,6 +32,8 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
     return {
         "kernel": lambda: kernel_table(rounds),
         "instructions": instructions,
+        "pieces": lambda: pieces(rounds),
+        "objectives": lambda: peers.objectives(rounds),
         "peers": lambda: peers.swarms(few),
         "optimum": lambda: peers.time_to_optimum(rounds),
         "identification": lambda: whole.identification(rounds),
