@@ -84,10 +84,10 @@ def beliefs(truth: TruthParameters, effects: dict[str, dict[str, float]], seed: 
     nominal = fit([window], guess, options)
     extended = fit([window], guess, options, [*NOMINAL_NAMES, *EXTENDED])
     drag = effects["rotor_drag"]
-    known = [_known(guess.initial, 0.0, (0.0, 0.0)), _known(nominal.theta[:6], 0.0, (0.0, 0.0))]
-    known.append(_known(extended.theta[:6], _value(extended, 0), (_value(extended, 1), _value(extended, 2))))
+    known = [known_from(guess.initial, 0.0, (0.0, 0.0)), known_from(nominal.theta[:6], 0.0, (0.0, 0.0))]
+    known.append(known_from(extended.theta[:6], _value(extended, 0), (_value(extended, 1), _value(extended, 2))))
     exact = np.array([truth.as_dict()[n] for n in NOMINAL_NAMES])
-    known.append(_known(exact, effects["motor_lag"]["tau"], (drag["k_x"], drag["k_y"])))
+    known.append(known_from(exact, effects["motor_lag"]["tau"], (drag["k_x"], drag["k_y"])))
     return known
 
 
@@ -95,7 +95,8 @@ def _value(found: Fit, i: int) -> float:
     return found.parameters[EXTENDED[i]].value
 
 
-def _known(values: FloatArray, lag: float, drag: tuple[float, float]) -> Known:
+def known_from(values: FloatArray, lag: float, drag: tuple[float, float]) -> Known:
+    """What the controller is given: the six parameters, lag [s] and drag [1/s]."""
     b, d, j_xx, j_yy, j_zz, j_r = (float(v) for v in values)
     return Known(CRAFT.mass, b, d, np.array([j_xx, j_yy, j_zz]), j_r, lag, np.array(drag))
 
@@ -123,15 +124,20 @@ def flown(path: Reference, known: Known, setup: Setup, seed: int) -> tuple[float
     return float(np.sqrt(np.mean(error**2))), beyond, effort
 
 
-def run(seed: int) -> FloatArray:
-    """One vehicle: (paths, sets, 3)."""
+def individual(seed: int) -> tuple[TruthParameters, dict[str, dict[str, float]], Setup]:
+    """A Pelican whose rotors lag and drag: its parameters, its effects, and both ready to be flown."""
     truth = draw_truth(CRAFT, seed)
     rng = np.random.default_rng([seed, 4])
     effects = {
         "motor_lag": {"tau": float(rng.uniform(0.02, 0.05))},
         "rotor_drag": {"k_x": float(rng.uniform(0.2, 0.45)), "k_y": float(rng.uniform(0.2, 0.45))},
     }
-    setup = prepare(CRAFT, truth, effects, SECONDS, 0.0, (0.0, 0.0), np.zeros((6, 4)))
+    return truth, effects, prepare(CRAFT, truth, effects, SECONDS, 0.0, (0.0, 0.0), np.zeros((6, 4)))
+
+
+def run(seed: int) -> FloatArray:
+    """One vehicle: (paths, sets, 3)."""
+    truth, effects, setup = individual(seed)
     known = beliefs(truth, effects, seed)
     t = np.asarray(np.arange(-EDGE, round(SECONDS / CONTROL) + EDGE) * CONTROL, dtype=np.float64)
     out = np.empty((len(PATHS), len(SETS), 3))
@@ -171,8 +177,8 @@ REMARK = """\
   do not hold.
 * On the steps, whose rate reference jumps, making up for the lag drives the rotors into their limits: even the true
   parameters overshoot more and track worse than the nominal ones. That is the controller's doing, not the model's.
-* Attitude and position come from the simulation with noise, not from an estimator; the gate of the online service is
-  not part of this study, nor is a guess so wrong that it does not fly."""
+* Attitude and position come from the simulation with noise, not from an estimator. Parameters so wrong that the
+  vehicle is lost, and what the gate does with them, are looked at by `studies.detuned`."""
 
 PAIRS = (
     ("initial guess", "identified"), ("initial guess", "identified + lag and drag"),
