@@ -40,7 +40,7 @@ def print_parameters(
     from rich.table import Table
     from rich.text import Text
 
-    from quadid.report.verdict import percent, relative_halfwidth
+    from quadid.report.verdict import digits, percent, relative_halfwidth
 
     table = Table(title="Parameters")
     for heading in (
@@ -61,8 +61,8 @@ def print_parameters(
         table.add_row(
             p["name"],
             number(p["initial"]),
-            number(p["value"]),
-            f"{number(low)} .. {number(high)}",
+            number(p["value"], digits(p)),
+            f"{number(low, digits(p))} .. {number(high, digits(p))}",
             percent(relative_halfwidth(p)),
             *known,
             p["unit"] or "1",
@@ -119,6 +119,8 @@ def print_findings(console: Console, findings: Sequence[JsonDict]) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from quadid.report.verdict import digits
+
     table = Table(title="What the simulation gets wrong (error on unseen data in noise variances, 1 = noise floor)")
     for heading in ("cause", "value", "95 % interval", "error without", "with", "best look-alike"):
         table.add_column(heading, justify="right" if heading in ("error without", "with") else "left")
@@ -130,8 +132,8 @@ def print_findings(console: Console, findings: Sequence[JsonDict]) -> None:
             first = i == 0
             table.add_row(
                 name if first else "",
-                f"{p['name']} = {number(p['value'])} {p['unit']}".rstrip(),
-                f"{number(low)} .. {number(high)}",
+                f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip(),
+                f"{number(low, digits(p))} .. {number(high, digits(p))}",
                 number(finding["gain"]["mse_before"], 3) if first else "",
                 number(finding["gain"]["mse_after"], 3) if first else "",
                 f"{rival['effect']} ({number(rival['mse_after'], 3)})" if first and rival else "",

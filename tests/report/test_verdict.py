@@ -8,7 +8,7 @@ import pytest
 
 from quadid.effects import EFFECTS
 from quadid.report.advice import ADVICE
-from quadid.report.verdict import MOTION, identify_verdict, percent, reason
+from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason
 
 
 def _result(fitted: float | None = 1.0, status: str = "identified", role: str = "validate") -> dict[str, Any]:
@@ -85,3 +85,19 @@ def test_percent_keeps_two_digits() -> None:
 
 def test_every_effect_has_advice() -> None:
     assert set(ADVICE) == set(EFFECTS)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0.009988, 0.010004, 6),  # +-0.000008
+        (2.3294e-5, 2.3306e-5, 6),
+        (0.5, 1.5, 4),
+        (-0.01, 0.02, 4),
+        (1.0, 1.0, 4),
+        (None, 1.0, 4),
+        (1.0, 1.0 + 1e-12, 9),
+    ],
+)
+def test_digits_show_the_width_of_an_interval(low: float | None, high: float, expected: int) -> None:
+    assert digits({"value": high, "ci95": [low, high]}) == expected
