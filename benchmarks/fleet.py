@@ -89,8 +89,8 @@ def told(logs: int, workers: list[int], runs: list[Run], load: tuple[float, floa
         f"|{'---|' * len(HEAD)}",
         *(f"| {' | '.join(_cells(one, runs[0], logs, idle))} |" for one in runs),
         "",
-        "Logs are independent: a worker holds one at a time. What the parent (scheduler, SQLite) takes for a log bounds",
-        "how many workers one scheduler can keep busy.",
+        "Logs are independent: a worker holds one at a time. What the parent (scheduler, SQLite) takes for a log",
+        "bounds how many workers one scheduler can keep busy.",
         "",
     ]
     return "\n".join(lines)
