@@ -36,6 +36,10 @@ def serve(
         str | None,
         typer.Option("--zenoh", metavar="WHERE", help="Publish on Zenoh too: a locator, a config file, or 'local'."),
     ] = None,
+    ground: Annotated[
+        str | None,
+        typer.Option("--worker", metavar="WHERE", help="Let a 'quadid worker' fit that is found there on Zenoh."),
+    ] = None,
     name: Annotated[
         str, typer.Option("--id", metavar="NAME", help="Name of this vehicle; default the vehicle's.")
     ] = "",
@@ -66,7 +70,7 @@ def serve(
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.store import Store, default_path
-    from quadid_node.worker import ProcessWorker
+    from quadid_node.worker import ProcessWorker, with_ground
 
     from quadid_cli import output, terminal
     from quadid_cli.loading import load_vehicle
@@ -83,7 +87,9 @@ def serve(
         opened.callback(store.close)
         link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
         opened.callback(link.close)
-        service = Service(described, settings, ProcessWorker(described), store)
+        worker = with_ground(ProcessWorker(described), ground or "", known)
+        opened.callback(worker.close)
+        service = Service(described, settings, worker, store)
         opened.callback(service.close)
         outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
         if zenoh is not None:

@@ -33,7 +33,7 @@ from quadid_node.recorder import Beginning, Recorder
 from quadid_node.service import Output, Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
-from quadid_node.worker import ProcessWorker
+from quadid_node.worker import ProcessWorker, with_ground
 
 STEP_SECONDS = 0.05
 AT_ONCE, CATCHING_UP = 1, 4
@@ -126,7 +126,7 @@ class IdentifyNode(LifecycleNode):
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
         worker = ProcessWorker(vehicle, values["worker_memory"])
-        self._service = Service(vehicle, settings, worker, store)
+        self._service = Service(vehicle, settings, with_ground(worker, values["ground_worker"], self._id), store)
         if values["record"]:
             beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)

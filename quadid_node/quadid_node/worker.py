@@ -256,6 +256,19 @@ class ProcessWorker:
         child.wait()
 
 
+def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
+    """The worker itself, or, with a place on Zenoh, one that lets ground machines there fit for `vehicle`.
+
+    Raises:
+        ZenohError: a configuration that is none.
+    """
+    if not where:
+        return worker
+    from quadid_node.remote_worker import Ground, RemoteWorker  # Zenoh is loaded by those who use it
+
+    return RemoteWorker(worker, Ground(where, vehicle))
+
+
 def _widen(descriptor: int) -> None:
     """A pipe that holds a whole request, where the system allows it."""
     import fcntl

@@ -53,7 +53,7 @@ def open_session(where: str) -> Any:
     Raises:
         ZenohError: no such file, not a configuration, or nothing listens there.
     """
-    return _connect(where, _config(where))
+    return _connect(where, config_of(where))
 
 
 def _connect(where: str, config: Any) -> Any:
@@ -66,7 +66,8 @@ def _connect(where: str, config: Any) -> Any:
         ) from error  # fmt: skip
 
 
-def _config(where: str) -> Any:
+def config_of(where: str) -> Any:
+    """The Zenoh configuration that `where` stands for, see `open_session`; raises ZenohError."""
     if where == "local":
         return zenoh.Config()
     if re.match(r"^(tcp|udp|tls|quic|ws|unixsock-stream)/", where):
@@ -110,7 +111,7 @@ class ZenohLink:
         Raises:
             ZenohError: a configuration that is none.
         """
-        self._where, self._config = where, _config(where)
+        self._where, self._config = where, config_of(where)
         self._vehicle, self._service = vehicle, service
         self._latest: dict[str, bytes] = {}
         self._commands: queue.Queue[tuple[str, Any]] = queue.Queue(MOST_COMMANDS)

@@ -1,0 +1,104 @@
+"""Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`).
+
+quadid/<vehicle>/work/fit        query: a request as `parcel`; reply: the answer as `parcel`
+quadid/worker/<id>/alive         liveliness token of a worker whose kernels are warm
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from quadid.online.answering import Request, answer
+from quadid_node.parcel import ParcelError, pack, unpack
+from quadid_node.zenoh_link import ROOT, ZenohError, open_session
+
+WORK = f"{ROOT}/*/work/fit"
+ALIVE = f"{ROOT}/worker/*/alive"
+MOST_WAITING = 64
+WAIT = 0.1
+RETRY = 3.0
+
+
+@dataclass
+class Done:
+    """What a worker has done: requests answered, requests refused, seconds spent on them."""
+
+    answered: int = 0
+    refused: int = 0
+    seconds: float = 0.0
+
+
+def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Done:
+    """Answers requests until `stop` says so; waits for a router that is not there yet.
+
+    Args:
+        where: see `zenoh_link.open_session`.
+        stop: asked often.
+        told: takes a sentence for people.
+
+    Raises:
+        ZenohError: a configuration that is none.
+    """
+    done, session = Done(), _connected(where, stop, told)
+    if session is None:
+        return done
+    waiting: queue.Queue[Any] = queue.Queue(MOST_WAITING)
+
+    def take(query: Any) -> None:
+        try:
+            waiting.put_nowait(query)
+        except queue.Full:
+            with query:
+                query.reply_err(b"too much to do")
+
+    try:
+        served = session.declare_queryable(WORK, take)
+        alive = session.liveliness().declare_token(ALIVE.replace("*", str(session.zid())))
+        told("ready: takes windows and answers fits")
+        while not stop():
+            try:
+                query = waiting.get(timeout=WAIT)
+            except queue.Empty:
+                continue
+            begin = time.monotonic()
+            with query:
+                _answer(query, done, told)
+            done.seconds += time.monotonic() - begin
+        alive.undeclare()
+        served.undeclare()
+    finally:
+        session.close()
+    return done
+
+
+def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Any:
+    said = ""
+    while not stop():
+        try:
+            return open_session(where)
+        except ZenohError as error:
+            if "configuration" in str(error):
+                raise
+            if str(error) != said:
+                said = str(error)
+                told(f"{said}; trying again")
+            time.sleep(RETRY)
+    return None
+
+
+def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
+    try:
+        request = unpack(query.payload.to_bytes() if query.payload is not None else b"")
+        if not isinstance(request, get_args(Request)):
+            raise ParcelError(f"a parcel with a {type(request).__name__}", "a request of a fit")
+    except ParcelError as error:
+        done.refused += 1
+        told(f"refused: {error}")
+        query.reply_err(str(error).encode())
+        return
+    query.reply(query.key_expr, pack(answer(request)))
+    done.answered += 1
