@@ -18,7 +18,8 @@ SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal says nothing about what happened between its samples; it is refused."""
 _HOW_TO_GET_MOTORS = (
     "log rotor speeds or motor outputs at 50 Hz or more: PX4 SDLOG_PROFILE high rate (actuator_motors, esc_status); "
-    "ArduPilot LOG_BITMASK with RCOUT and FAST_ATTITUDE; ROS a rotor_speeds or motor_command topic"
+    "ArduPilot LOG_BITMASK with RCOUT and FAST_ATTITUDE; ROS a rotor_speeds or motor_command topic; "
+    "live, references suffice where the vehicle file holds the gains of the stabiliser"
 )
 
 

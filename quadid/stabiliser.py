@@ -169,6 +169,38 @@ def stabilise(
     steer(gains, mixer, wanted, reference[3], attitude, rate, dt, integral, torque, command)
 
 
+@_kernel
+def stabilise_rows(
+    gains: FloatArray,
+    mixer: FloatArray,
+    reference: FloatArray,
+    attitude: FloatArray,
+    rate: FloatArray,
+    dt: FloatArray,
+    integral: FloatArray,
+    command: FloatArray,
+) -> None:
+    """Many steps of the stabiliser in a row, in place.
+
+    Args:
+        gains: `pack_gains`.
+        mixer: `mixer_matrix`.
+        reference: roll, pitch, yaw [rad], throttle 0..1, shape (n, 4).
+        attitude: measured unit quaternions, body to world, scalar first, shape (n, 4).
+        rate: measured body rates [rad/s], shape (n, 3).
+        dt: time to the next step [s], shape (n,).
+        integral: integral torques [N m], shape (3,); updated.
+        command: rotor speeds [rad/s], shape (n, rotors); written.
+    """
+    matrix = np.empty((3, 3))
+    for k in range(reference.shape[0]):
+        w, x, y, z = attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3]
+        matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
+
+
 def stabiliser_step(
     gains: Mapping[str, float],
     mixer: FloatArray,

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.online.lines import Line
+from quadid.online.steering import Steering
 from quadid.online.timebase import TimeBase
-from quadid.resample import split_stretches
-from quadid.rotor_signal import rotor_signal
+from quadid.resample import HALF_WIDTH, split_stretches
+from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import GAP, OPTIONAL, REQUIRED, Track, make_plan, on_grid
 from quadid.vehicle import Vehicle
 from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
@@ -95,6 +96,7 @@ class Buffer:
         rotors = len(vehicle.rotors)
         self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
         self._lines = {name: Line(count) for name, count in self._columns.items()}
+        self._steering = Steering(vehicle)
         self._due: deque[_Due] = deque()
         self._first = math.inf
         self._next = math.nan
@@ -175,6 +177,7 @@ class Buffer:
             due = self._due.popleft()
             if due.row < 0:
                 self._fresh = True
+                self._steering.restart()
                 for line, arrived in zip(self._lines.values(), due.arrived, strict=True):
                     line.restart(arrived)
                 continue
@@ -235,7 +238,7 @@ class Buffer:
                 channels[name] = channel
         recording = Recording("live", "stream", channels)
         try:
-            rotor = rotor_signal(recording, self._vehicle)
+            rotor = self._rotor_signal(recording, at)
         except QuadidError as error:
             empty = np.full((len(at), len(self._vehicle.rotors)), np.nan)
             return Rows(at, {"rotor_speed": empty}, "held", "", self._fresh, str(error))
@@ -247,6 +250,15 @@ class Buffer:
                 if name in REQUIRED or not np.isnan(values).all():
                     columns[name] = values
         return Rows(at, columns, plan.sampling, rotor.source, self._fresh)
+
+    def _rotor_signal(self, recording: Recording, at: FloatArray) -> RotorSignal:
+        """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
+        told = self.counts["rotor_speed"] or self.counts["motor_command"]
+        if told or not self._steering.known or not self.counts["attitude_reference"]:
+            return rotor_signal(recording, self._vehicle)
+        until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
+        self._steering.advance(self._lines, until, float(at[0]) - HISTORY)
+        return self._steering.signal(until)
 
     def _mended(self, track: Track) -> Track:
         """The track with stretches joined where only a few packets of a fast stream were lost."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ EXCITED = 0.02
 """A window is excited when roll and pitch inertia can be had from it alone to this relative standard deviation."""
 TIGHTEST = 0.2
 """Smallest standard deviation (log scale) that a vehicle file's own may have as a prior online."""
+INFLATED = 9.0
+"""Noise whose variance is above this multiple of the usual in some channel may have been taken from bad data."""
 RATED = ("J_xx", "J_yy")
 """Parameters whose bound decides on excitation."""
 
@@ -72,7 +74,7 @@ class FitReply:
         excited: whether they suffice.
         estimate: quadratic model at the optimum.
         theta: full parameter vector there.
-        noise: noise it was weighted with.
+        noise: noise it was weighted with: the request's, or one that had to be found anew.
         measured: noise measured in this window, when that was asked for.
     """
 
@@ -126,12 +128,15 @@ def _fit(request: FitRequest) -> FitReply:
     if shooting.count == 0:
         return FitReply(request.number, problem="no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
-    bounds = bounds_of(shooting.linearise(theta, free).gram.sum(axis=0))
-    if not is_excited(bounds):
+    bounds = _bounds(shooting, theta, free)
+    drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)
+    if not is_excited(bounds) and not drowned:
         return FitReply(request.number, excitation=bounds)
-    if request.search or noise is None:
-        theta, noise = _search(request, layout)
+    if request.search or noise is None or drowned:
+        theta, noise = _search(replace(request, noise=None) if drowned else request, layout)
         shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+        if drowned and not is_excited(bounds := _bounds(shooting, theta, free)):
+            return FitReply(request.number, excitation=bounds)
     result = _polish(shooting, theta, free)
     if not np.isfinite(result.cost):
         return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
@@ -149,6 +154,25 @@ def is_excited(bounds: FloatArray) -> bool:
     """Whether a window reveals roll and pitch dynamics."""
     place = [NOMINAL_NAMES.index(name) for name in RATED]
     return bool(np.all(bounds[place] <= EXCITED))
+
+
+def _bounds(shooting: Shooting, theta: FloatArray, free: Free) -> FloatArray:
+    return bounds_of(shooting.linearise(theta, free).gram.sum(axis=0))
+
+
+def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
+    """Whether the motion suffices with usual noise, and the noise at hand is far above that.
+
+    Noise once taken from bad data would call every later motion too small, and so never be measured again.
+    """
+    usual = NoiseModel.guess(shooting.channels, shooting.vehicle.noise)
+    if not np.any(shooting.noise.variance > INFLATED * usual.variance):
+        return False
+    found, shooting.noise = shooting.noise, usual
+    try:
+        return is_excited(_bounds(shooting, theta, free))
+    finally:
+        shooting.noise = found
 
 
 def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel]:

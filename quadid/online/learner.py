@@ -130,8 +130,8 @@ class Learner:
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
             return
-        if self._noise is None or self._search:
-            self._noise, self._pool = reply.noise, 1
+        if self._noise is None or self._search or not np.array_equal(reply.noise.white, self._noise.white):
+            self._noise, self._pool = reply.noise, 1  # the first one, or the fit had to find it anew
             return
         if reply.measured is None:
             return

@@ -105,10 +105,10 @@ class Line:
         if high - low < 2:
             return None
         values = self.values[low:high]
-        return Channel(name, self.t[low:high], _continuous(values) if name == "attitude" else values, name)
+        return Channel(name, self.t[low:high], continuous(values) if name == "attitude" else values, name)
 
 
-def _continuous(q: FloatArray) -> FloatArray:
+def continuous(q: FloatArray) -> FloatArray:
     """Signs such that neighbours are less than half a turn apart; shape (n, 4)."""
     flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
     return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
