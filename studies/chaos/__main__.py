@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/results"), help="folder of chaos.md")
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=1, help="of the order of the faults")
+    parser.add_argument("--only", choices=sorted(FAULTS), action="append", help="this fault (may be repeated)")
     given = parser.parse_args()
     flight = fly(Pelican.shipped("pelican"), seconds=120.0, seed=3)
     truth = {n: getattr(flight.truth.parameters, n) for n in NOMINAL_NAMES}
@@ -56,7 +57,7 @@ def main() -> None:
         vehicle.start()
         scene = Scene(service, vehicle, port, random.Random(given.seed), small)
         try:
-            minutes = _attack(scene, entries, 60.0 * given.minutes)
+            minutes = _attack(scene, given.only or list(FAULTS), entries, 60.0 * given.minutes)
         finally:
             _land(scene)
     wrong, sets = judge(vehicle.told, truth, service.rows)
@@ -67,14 +68,14 @@ def main() -> None:
     sys.exit(bool(service.crashes or wrong))
 
 
-def _attack(scene: Scene, entries: list[Entry], seconds: float) -> float:
+def _attack(scene: Scene, names: Sequence[str], entries: list[Entry], seconds: float) -> float:
     """Waits for a first estimate, then throws faults for `seconds`; returns how long it did so [min]."""
     first = _recovered(scene.service, time.time(), START_LIMIT)
     if first is None:
         sys.exit(f"the service made no estimate within {START_LIMIT:.0f} s: {scene.service.lines[-3:]}")
     _say(f"first estimate after {first:.0f} s; now the faults")
     begin = time.time()
-    _throw(scene, entries, begin + seconds)
+    _throw(scene, names, entries, begin + seconds)
     return (time.time() - begin) / 60.0
 
 
@@ -88,12 +89,12 @@ def _land(scene: Scene) -> None:
     scene.service.newest_estimate()
 
 
-def _throw(scene: Scene, entries: list[Entry], until: float) -> None:
+def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: float) -> None:
     """Every fault once in random order, then again in another, until the time is over."""
     waiting: list[str] = []
     while time.time() < until:
         if not waiting:
-            waiting = scene.rng.sample(list(FAULTS), len(FAULTS))
+            waiting = scene.rng.sample(list(names), len(names))
         name = waiting.pop()
         row, harm = FAULTS[name]
         at = time.time()
@@ -106,7 +107,9 @@ def _throw(scene: Scene, entries: list[Entry], until: float) -> None:
         })  # fmt: skip
         _say(f"{name} ({did}): {'not recovered' if recovered is None else f'{recovered:.1f} s'}")
         if recovered is None:
-            scene.service.crashes.append(f"{name}: no estimate within {RECOVERY_LIMIT:.0f} s")
+            said = "; ".join(scene.service.lines[-2:])
+            scene.service.crashes.append(f"{name}: no estimate within {RECOVERY_LIMIT:.0f} s; said: {said}")
+            _say(said)
         time.sleep(scene.rng.uniform(0.0, 3.0))
 
 

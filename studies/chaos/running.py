@@ -103,7 +103,7 @@ class Running:
         for line in child.stdout:
             self.lines = [*self.lines[-200:], line.rstrip()]
             if "Traceback" in line:
-                self.crashes.append("a traceback was said")
+                self.crashes.append(f"a traceback was said, after: {self.lines[-2:-1]}")
 
 
 def stop_quietly(process: subprocess.Popen[Any]) -> None:
