@@ -32,7 +32,7 @@ $(BIN)/python:
 
 $(RUNTIME): pyproject.toml | $(BIN)/python
 	@echo "Installing quadid and what it needs into $(VENV): a minute or so ..."
-	$(PIP) install --editable .
+	$(PIP) install --no-compile --editable .
 	@touch $@
 
 $(DEV): pyproject.toml $(RUNTIME)

@@ -46,6 +46,11 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
     return Verdict(_LEVELS[verdict], headline, details, _next_steps(result))
 
 
+def chance(p_value: float) -> str:
+    """A p-value in words that claim no more than its distribution holds: below a billionth only that it is."""
+    return number(p_value, 2) if p_value >= 1e-9 else "less than one in a billion"
+
+
 def _short(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
@@ -122,7 +127,7 @@ def finding_part(finding: JsonDict, floor: float, identifier: str, seen: Residua
     if low is not None and high is not None:
         worth.append(f" (95 % interval {low:.3g} to {high:.3g})")
     if finding["p_value"] is not None:
-        worth.append(f"; chance of that without {name}: {number(max(finding['p_value'], 1e-300), 2)}")
+        worth.append(f"; chance of that without {name}: {chance(finding['p_value'])}")
     rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
     return {
         **finding,

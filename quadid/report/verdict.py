@@ -188,7 +188,7 @@ def _number(value: Any) -> float:
 def digits(parameter: JsonDict) -> int:
     """Digits that value and interval of a parameter need for two digits of the interval's half; from 4 to 9."""
     low, high = (_number(v) for v in parameter["ci95"])
-    half, size = 0.5 * (high - low), max(abs(low), abs(high))
-    if not (math.isfinite(half) and math.isfinite(size) and half > 0.0):
+    half, size = 0.5 * (high - low), abs(_number(parameter["value"]))
+    if not (math.isfinite(half) and half > 0.0 and math.isfinite(size) and size > 0.0):
         return 4
     return min(max(math.floor(math.log10(size)) - math.floor(math.log10(half)) + 2, 4), 9)

@@ -15,7 +15,7 @@ import pytest
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import ChannelScore, Series, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.diagnose_page import diagnosis_part
+from quadid.report.diagnose_page import chance, diagnosis_part
 from quadid.report.identify_page import identify_page
 from quadid.report.page import code, number, packed, render
 from tests.faults.evidence import Happened
@@ -242,3 +242,8 @@ def test_numbers_for_people(value: float | None, text: str) -> None:
 def test_code_between_backticks() -> None:
     assert str(code("see `a <b>` & c")) == "see <code>a &lt;b&gt;</code> &amp; c"
     assert str(code("one ` alone <")) == "one ` alone &lt;"
+
+
+def test_a_chance_claims_no_more_than_its_distribution_holds() -> None:
+    assert chance(0.012) == "0.012"
+    assert chance(1e-300) == chance(0.0) == "less than one in a billion"
