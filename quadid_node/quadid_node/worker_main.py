@@ -31,13 +31,16 @@ def main() -> None:
     from quadid.online.answering import answer
     from quadid.online.fitting import warm_up
 
-    vehicle = _read(requests)
-    if vehicle is None:
-        return
-    warm_up(vehicle)
-    _write(channel, READY)
-    while (request := _read(requests)) is not None:
-        _write(channel, answer(request))
+    try:
+        vehicle = _read(requests)
+        if vehicle is None:
+            return
+        warm_up(vehicle)
+        _write(channel, READY)
+        while (request := _read(requests)) is not None:
+            _write(channel, answer(request))
+    except MemoryError:
+        sys.exit("the fit process needs more memory than it may have")  # one line; the parent says what follows
 
 
 def _behave(megabytes: int) -> None:

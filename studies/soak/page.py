@@ -36,10 +36,10 @@ def _accelerated(r: Result) -> list[str]:
     short = (
         ""
         if last["hours"] > 0.99 * r["asked_hours"]
-        else f" (**stopped before the {r['asked_hours']:.0f} h asked for**)"
+        else f", **stopped before the {r['asked_hours']:.0f} h asked for,**"
     )
     lines = [
-        f"**{last['hours']:.1f} h of flight{short}** in {r['wall_seconds'] / 60:.0f} min: {FLIGHT:.0f} s flown, "
+        f"**{last['hours']:.1f} h of flight**{short} in {r['wall_seconds'] / 60:.0f} min: {FLIGHT:.0f} s flown, "
         f"{GROUND:.0f} s of silence, and again; a fit every {r['refit']:.0f} s, a diagnosis every "
         f"{r['diagnose']:.0f} s ({last['fits']} in all), {last['published']} sets published. The history keeps the "
         f"newest {r['kept']} candidates and events here, so that its limit is reached (in service "
