@@ -23,6 +23,7 @@ from quadid.identify.horizon import horizon_scores
 from quadid.identify.noise import NoiseModel
 from quadid.identify.polish import Polished, polish
 from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -86,10 +87,9 @@ class Foresight:
 
     def to_dict(self) -> dict[str, object]:
         """Plain data for JSON; errors that the logs lack are None."""
-        plain = [{k: v if np.isfinite(v) else None for k, v in e.items()} for e in (self.diagnosed, self.refitted)]
         return {
             "seconds_ahead": AHEAD, "on": self.on, "stand_ins": list(self.stand_ins),
-            "diagnosed": plain[0], "refitted": plain[1],
+            "diagnosed": jsonable(self.diagnosed), "refitted": jsonable(self.refitted),
         }  # fmt: skip
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
 from quadid.diagnose.foresight import Foresight
 from quadid.diagnose.remainder import Remainder
+from quadid.jsonable import jsonable
 
 
 class Verdict(StrEnum):
@@ -87,7 +87,7 @@ class Finding:
             "effect": self.effect,
             "confident": self.confident,
             "parameters": [
-                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": [_plain(x) for x in p.ci95]}
+                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": jsonable(p.ci95)}
                 for p in self.parameters
             ],
             "gain": {
@@ -169,7 +169,3 @@ class Diagnosis:
             "prediction": None if self.foresight is None else self.foresight.to_dict(),
             "warnings": list(self.warnings),
         }
-
-
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None
