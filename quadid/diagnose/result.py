@@ -87,8 +87,7 @@ class Finding:
             "effect": self.effect,
             "confident": self.confident,
             "parameters": [
-                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": jsonable(p.ci95)}
-                for p in self.parameters
+                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": jsonable(p.ci95)} for p in self.parameters
             ],
             "gain": {
                 "mse_before": self.gain.mse_before,
