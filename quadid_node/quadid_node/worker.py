@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from quadid.errors import QuadidError
 from quadid.online.answering import Reply, Request, answer, failed
 from quadid.online.changes import ChangeReply
 from quadid.online.fitting import FitReply
@@ -266,7 +267,11 @@ def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
         return worker
     from quadid_node.remote_worker import Ground, RemoteWorker  # Zenoh is loaded by those who use it
 
-    return RemoteWorker(worker, Ground(where, vehicle))
+    try:
+        return RemoteWorker(worker, Ground(where, vehicle))
+    except QuadidError:
+        worker.close()
+        raise
 
 
 def _widen(descriptor: int) -> None:
