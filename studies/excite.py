@@ -104,6 +104,12 @@ def sentences(widths: FloatArray, inside: float, kept: int) -> list[str]:
     return out
 
 
+REMARK = """\
+* Why the forecast is off where it is: a relative interval depends on the parameter's own value, and after a gentle
+  minute d, J_zz and J_r are not known at all, so their forecasts rest on the guess and are as far off as it is. With
+  the values that the manoeuvre taught the same calculation agrees: neither linearisation nor noise is the limit."""
+
+
 def main() -> None:
     """Command line of the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -127,7 +133,7 @@ def main() -> None:
         ratio = np.median(widths[:, 5, j] / widths[:, 4, j])
         cells = " | ".join(f"{middle[k, j]:.3g}" for k in range(6))
         text.append(f"| {name} | {cells} | {ratio:.2f} | {gain:.1f} |")
-    text += ["", *sentences(widths, float(inside), sum(r[2] for r in results))]
+    text += ["", *sentences(widths, float(inside), sum(r[2] for r in results)), REMARK]
     print("\n".join(text))
     if options.out:
         put_section(Path(options.out) / "excite.md", "What to fly next", "measured", "\n".join(text))

@@ -58,10 +58,11 @@ class Steering:
         self._rate = (known.rate if known is not None else None) or 0.0
         self.restart()
         if self._gains is not None:  # compiled before the first flight, not in it
-            rows = [np.zeros((1, n)) for n in (4, 4, 3)]
-            rows[1][0, 0] = 1.0
-            commands = np.empty((1, len(self._mixer)))
-            stabilise_rows(self._gains, self._mixer, *rows, np.full(1, 0.02), np.zeros(3), commands)
+            still, level = np.zeros((1, 4)), np.array([[1.0, 0.0, 0.0, 0.0]])
+            stabilise_rows(
+                self._gains, self._mixer, still, level, np.zeros((1, 3)), np.full(1, 0.02), np.zeros(3),
+                np.empty((1, len(self._mixer))),
+            )  # fmt: skip
 
     @property
     def known(self) -> bool:
