@@ -2,11 +2,13 @@
 
 A test asks for the fixture `happened` and says what it saw, in one sentence with figures, next to the assertion that
 holds it.  `pytest --faults-page FILE tests` (`make faults`) runs the tests that do so, and writes the table.  Only what
-a passed test said gets into it.
+a passed test said gets into it.  An account beside the page (JSON) keeps what was said when: a run of some of the tests
+replaces what these said, and takes out those that failed.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,11 +24,12 @@ _KEY = "fault"
 
 
 class Evidence(NamedTuple):
-    """One sentence of a test about one row."""
+    """One sentence of a test about one row, and the day on which it passed."""
 
     row: int
     text: str
     test: str
+    date: str = ""
 
 
 @pytest.fixture
@@ -65,7 +68,7 @@ class Collector:
             self.skipped.append(report.nodeid)
         elif report.when == "call":
             self.evidence += [
-                Evidence(value[0], value[1], report.nodeid)
+                Evidence(value[0], value[1], report.nodeid, f"{datetime.now(UTC):%Y-%m-%d}")
                 for key, value in report.user_properties
                 if key == _KEY and isinstance(value, (list, tuple))
             ]
@@ -74,8 +77,15 @@ class Collector:
         """Writes the page when all tests are done."""
         if not self.writes:
             return
+        account = self.page.with_suffix(".json")
+        known = (
+            [Evidence(*entry) for entry in json.loads(account.read_text(encoding="utf-8"))] if account.exists() else []
+        )
+        ran = {e.test for e in self.evidence} | set(self.failed)
+        told = sorted([*(e for e in known if e.test not in ran), *self.evidence], key=lambda e: (e.row, e.test))
         self.page.parent.mkdir(parents=True, exist_ok=True)
-        self.page.write_text(page(self.evidence, self.failed, self.skipped, self.command), encoding="utf-8")
+        account.write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        self.page.write_text(page(told, self.failed, self.skipped, self.command), encoding="utf-8")
 
 
 def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[str], command: str) -> str:
@@ -85,13 +95,14 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
     lines = [
         "# Faults, what is promised, what happened",
         "",
-        f"Written {datetime.now(UTC):%Y-%m-%d} by `{command}`: tests with the real thing failing "
-        "(`tests/faults` and the tests named below). A sentence stands here only when its test passed.",
+        f"Written by `{command}`: tests with the real thing failing (`tests/faults` and the tests named below). A "
+        "sentence stands here only when its test passed, with the day; a later run of some of the tests replaces what "
+        "these said.",
         "",
         f"{green} of {len(FAULTS)} rows have evidence.",
         "",
-        "| # | fault | promise | what happened | test |",
-        "|---|---|---|---|---|",
+        "| # | fault | promise | what happened | test | passed |",
+        "|---|---|---|---|---|---|",
     ]
     for number, (fault, promise) in FAULTS.items():
         lines += _rows(number, fault, promise, rows[number])
@@ -103,10 +114,10 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
 
 def _rows(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> list[str]:
     if not said:
-        return [f"| {number} | {_cell(fault)} | {_cell(promise)} | **no test of this row passed** | |"]
+        return [f"| {number} | {_cell(fault)} | {_cell(promise)} | **no test of this row passed** | | |"]
     lines, left = [], (str(number), _cell(fault), _cell(promise))
     for e in sorted(said, key=lambda e: e.test):
-        lines.append(f"| {' | '.join(left)} | {_cell(e.text)} | `{e.test}` |")
+        lines.append(f"| {' | '.join(left)} | {_cell(e.text)} | `{e.test}` | {e.date} |")
         left = ("", "", "")
     return lines
 
