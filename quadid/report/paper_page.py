@@ -38,7 +38,11 @@ def _about_table_1(result: JsonDict) -> list[str]:
         f"Here the swarm (median of {result['swarm']['seeds']} seeds, {result['swarm']['particles']} particles) ends "
         f"{abs(swarm):.1%} {'above' if swarm >= 0.0 else 'below'} quasi-Newton on the training set. Both minimise the "
         "same smooth function of six numbers from the same guess, so neither can gain 16 to 24 % over the other once "
-        "both have converged; that the paper's swarm does suggests that its quasi-Newton run had not.",
+        "both have converged; that the paper's swarm does suggests that its quasi-Newton run had not. That ours ends "
+        f"above it is what Algorithm 1 does in its {result['swarm']['iterations']} iterations: on the smooth benchmark "
+        "of [optimisers.md](optimisers.md) it came within 1 % of the optimum in 14 of 30 runs in narrow bounds, in 1 of "
+        "30 in wide ones, with 1500 evaluations; the swarm with constriction in 30 and 22, polished in 30 and 30. "
+        "How much more of a budget would mend here was not measured.",
     ]
 
 
@@ -71,7 +75,8 @@ def _about_parameters(result: JsonDict) -> list[str]:
     inside, wrong = (sum(p[key][0] <= p["truth"] <= p[key][1] for p in rows) for key in ("extended_ci95", "ci95"))
     return [
         f"Of the six 95 % intervals of the extended model {inside} hold the truth, of those of the nominal model "
-        f"{wrong}: it is pulled off by what it lacks, and no interval tells how wrong its equations are.",
+        f"{wrong}: it is pulled off by what it lacks, and no interval tells how wrong its equations are. Honest and "
+        "independent intervals would hold four or fewer of six in 3 % of flights; this is one training flight.",
         "d and J_zz, and J_r with them, are told apart only by small terms: look at their correlations below.",
     ]
 
