@@ -40,8 +40,8 @@ def _about_table_1(result: JsonDict) -> list[str]:
         "same smooth function of six numbers from the same guess, so neither can gain 16 to 24 % over the other once "
         "both have converged; that the paper's swarm does suggests that its quasi-Newton run had not. That ours ends "
         f"above it is what Algorithm 1 does in its {result['swarm']['iterations']} iterations: on the smooth benchmark "
-        "of [optimisers.md](optimisers.md) it came within 1 % of the optimum in 14 of 30 runs in narrow bounds, in 1 of "
-        "30 in wide ones, with 1500 evaluations; the swarm with constriction in 30 and 22, polished in 30 and 30. "
+        "of [optimisers.md](optimisers.md) it came within 1 % of the optimum in 14 of 30 runs in narrow bounds, in 1 "
+        "of 30 in wide ones, with 1500 evaluations; the swarm with constriction in 30 and 22, polished in 30 and 30. "
         "How much more of a budget would mend here was not measured.",
     ]
 
