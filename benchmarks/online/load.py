@@ -73,7 +73,7 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
             node.communicate(timeout=30)
         noted = json.loads(out.read_text())
     return {**result, "seconds": seconds, "profile": profile, "record": record, "exit_code": node.returncode,
-            **{k: _latency(noted[k]) for k in ("idle", "fitting", "spent")},
+            **{k: _latency(noted[k]) for k in ("idle", "fitting", "step")},
             "imu_received": (len(noted["idle"]) + len(noted["fitting"])) / (seconds * 1000.0)}  # fmt: skip
 
 

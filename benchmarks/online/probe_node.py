@@ -26,7 +26,7 @@ class ProbeNode(quadid_node.node.IdentifyNode):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.idle, self.fitting, self.spent = array("d"), array("d"), array("d")
+        self.idle, self.fitting, self.steps = array("d"), array("d"), array("d")
 
     def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
         take = super()._listener(entry, topic, decoder)
@@ -45,11 +45,11 @@ class ProbeNode(quadid_node.node.IdentifyNode):
     def _step(self) -> None:
         begin = time.time()
         super()._step()
-        self.spent.append(time.time() - begin)
+        self.steps.append(time.time() - begin)
 
     def destroy_node(self) -> None:
         """Writes what was noted."""
-        noted = {"idle": self.idle.tolist(), "fitting": self.fitting.tolist(), "spent": self.spent.tolist()}
+        noted = {"idle": self.idle.tolist(), "fitting": self.fitting.tolist(), "step": self.steps.tolist()}
         Path(os.environ[OUT]).write_text(json.dumps(noted))
         super().destroy_node()
 
