@@ -153,7 +153,7 @@ class Shooting:
             columns = rolled[0, ..., : self.channels, 1 : k + 1] - rolled[0, ..., : self.channels, :1]
             flat = (columns / steps * weights[..., None]).reshape(len(x0), -1, k)
             flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / _RIDGE[:k])[None], len(flat), axis=0)], axis=1)
-            basis = np.linalg.qr(flat)[0][:, :-k]
+            basis = np.ascontiguousarray(np.linalg.qr(flat)[0][:, :-k])  # once, not at every call
             row_weights = rollout.valid[:, : self.channels] / np.sqrt(self.noise.variance)
             jobs.append((rollout, cut, x0, row_weights, basis))
 
