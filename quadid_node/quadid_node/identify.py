@@ -42,7 +42,7 @@ class Starter:
 
 def main(args: list[str] | None = None) -> int:
     """Runs the node; returns the exit code: 0 done, 2 bad parameters."""
-    stop = Stop()
+    stop = Stop(nothing_open=True)
     import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.experimental.events_executor import EventsExecutor
@@ -51,6 +51,7 @@ def main(args: list[str] | None = None) -> int:
 
     from quadid_node.node import IdentifyNode
 
+    stop.opens()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = IdentifyNode(stop)
     executor = EventsExecutor()

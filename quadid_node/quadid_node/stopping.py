@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from types import FrameType
 
@@ -11,15 +12,23 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Stop:
     """Says whether the process was asked to end."""
 
-    def __init__(self) -> None:
-        """Takes the signals over."""
-        self._asked = False
+    def __init__(self, nothing_open: bool = False) -> None:
+        """Takes the signals over.
+
+        Args:
+            nothing_open: until `opens` is called a signal ends the process at once: imports may take long.
+        """
+        self._asked, self._nothing_open = False, nothing_open
         for number in _SIGNALS:
             signal.signal(number, self._on_signal)
 
     def __call__(self) -> bool:
         """True once a signal has come."""
         return self._asked
+
+    def opens(self) -> None:
+        """From now on there is something to put away: signals are only noted."""
+        self._nothing_open = False
 
     def ignore_more(self) -> None:
         """Lets further signals change nothing any more.
@@ -32,3 +41,5 @@ class Stop:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._asked = True
+        if self._nothing_open:
+            os._exit(0)
