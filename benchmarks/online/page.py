@@ -99,9 +99,9 @@ def _refit(r: Result) -> list[str]:
 
 
 BEFORE_BATCHES = (
-    "These figures are from before messages were read a batch at a time; each was worked on in its callback. Since then "
-    "two runs of 24 s took 14.7 and 20.7 % of a core, with other programs at work (load averages 6 and 13) and 99 % or "
-    "more of the IMU received; latencies say nothing there, and a quiet machine was not to be had."
+    "These figures are from before messages were read a batch at a time; each was worked on in its callback. Since "
+    "then two runs of 24 s took 14.7 and 20.7 % of a core, with other programs at work (load averages 6 and 13) and "
+    "99 % or more of the IMU received; latencies say nothing there, and a quiet machine was not to be had."
 )
 
 
@@ -109,9 +109,9 @@ def _load(r: Result) -> list[str]:
     lines = [
         "The node in its own process, a feeder in another: IMU 1 kHz, attitude and rotor speeds 250 Hz, references and "
         "odometry 50 Hz. A callback only keeps the message; a step every 50 ms reads all that wait at once and does "
-        "one piece of the session's work. Latency: from publishing an IMU message to the begin of its callback; a step: "
-        "how long it holds up callbacks; both by the clock, so other programs on the machine count too (load average: "
-        "runnable programs, 2 cores). Goals: under 15 % of a core, p99 under 5 ms.", "",
+        "one piece of the session's work. Latency: from publishing an IMU message to the begin of its callback; a "
+        "step: how long it holds up callbacks; both by the clock, so other programs on the machine count too "
+        "(load average: runnable programs, 2 cores). Goals: under 15 % of a core, p99 under 5 ms.", "",
         "| run | node, % of a core | fit process, % | IMU received % | latency idle p50 / p99 ms | while fitting "
         "p50 / p99 ms | a step p50 / p99 ms | memory MiB begin → end | load average |",
         "|---|---|---|---|---|---|---|---|---|",
