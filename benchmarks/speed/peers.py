@@ -99,7 +99,9 @@ def objectives(rounds: int) -> dict[str, Any]:
         objective = NumpyObjective(500.0, most)
         for m in counts:
             points = np.random.default_rng(2).uniform(objective.lower, objective.upper, (m, 6))
-            cases = {"kernel": partial(_repeated, objective.kernel, points, 10), "NumPy": partial(objective, points)}
+            cases: dict[str, Callable[[], object]] = {
+                "kernel": partial(_repeated, objective.kernel, points, 10), "NumPy": partial(objective, points)
+            }  # fmt: skip
             times = interleaved(cases, rounds)
             kernel, plain = times["kernel"]["processor"] / 10.0, times["NumPy"]["processor"]
             rows.append({"segments": len(objective.x0), "particles": m, "kernel": kernel, "numpy": plain,
@@ -176,7 +178,8 @@ def _told(runs: list[tuple[float, int] | None]) -> dict[str, Any]:
 
 
 def _reach(name: str, problem: BoxProblem, start: FloatArray, seed: int, limit: float) -> tuple[float, int] | None:
-    evaluations, reached, begin = 0, [], time.perf_counter()
+    evaluations, begin = 0, time.perf_counter()
+    reached: list[tuple[float, int]] = []
 
     def residual(points: FloatArray) -> FloatArray:
         nonlocal evaluations
