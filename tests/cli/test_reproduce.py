@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_cli.output import plain
 from quadid_cli.reproduce import summary, write
 from quadid_cli.reproducing import Plan, reproduce
 
+from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 from quadid.report.paper_tables import PAPER_GAIN, PAPER_MSE
 
@@ -22,7 +22,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     folder = tmp_path_factory.mktemp("reproduced")
     plan = Plan(seconds=40.0, particles=32, iterations=12, seeds=1)
     found = reproduce(folder / "flights", plan, 1, lambda stage, share: None)
-    result = plain(summary(found, plan, 1, 1.0, "a test"))
+    result = jsonable(summary(found, plan, 1, 1.0, "a test"))
     return {**result, "files": write(found, result, folder)}, folder
 
 
