@@ -45,6 +45,7 @@ def main() -> None:
             "measured": time.strftime("%Y-%m-%d"),
             "machine": f"{machine()}, {load:.1f} at the begin",
         }
+        given.out.mkdir(parents=True, exist_ok=True)
         file = given.out / "soak.json"  # read again each time: the parts may run side by side
         results = json.loads(file.read_text()) if file.exists() else {}
         results[name] = result

@@ -9,6 +9,7 @@ import sys
 import time
 from array import array
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,17 @@ class CountingNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
 
-    def _on_message(self, decoder: Decoder, entry: Input, data: bytes) -> None:
-        begin = time.time()
-        super()._on_message(decoder, entry, data)
-        self.counted[entry.topic] += 1
-        if entry.topic == "imu":
-            self.late.append(begin - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
+    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
+        take = super()._listener(entry, topic, decoder)
+
+        def counted(data: bytes) -> None:
+            begin = time.time()
+            take(data)
+            self.counted[entry.topic] += 1
+            if entry.topic == "imu":
+                self.late.append(begin - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
+
+        return counted
 
     def _report(self) -> None:
         super()._report()
