@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks.speed.goals import goals
+
 Result = Mapping[str, Any]
 _STEP_OPERATIONS = 190
 """Arithmetic of one nominal step and particle; see `benchmarks.kernel.NOMINAL_OPERATIONS`."""
@@ -18,7 +20,15 @@ INTRODUCTION = (
 
 def page(results: Result) -> str:
     """Markdown of all parts that were measured."""
-    out = ["# Speed", "", "`make bench`, that is `python -m benchmarks.speed --out docs/results`", "", INTRODUCTION, ""]
+    out = [
+        "# Speed",
+        "",
+        "`make bench`, that is `python -m benchmarks.speed --out docs/results`",
+        "",
+        INTRODUCTION,
+        "",
+        *goals(results),
+    ]
     for name, (title, write) in PARTS.items():
         found = results.get(name)
         out += [f"## {title}", ""]

@@ -1,0 +1,45 @@
+"""What was wanted of the speed, and what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+Result = Mapping[str, Any]
+
+GOALS: tuple[tuple[str, str, str, Callable[[Result], str]], ...] = (
+    ("kernel", "share of the processor's peak", "40 %", lambda r: f"{r['share_of_peak']:.0%}"),
+    ("kernel", "full equations against nominal", "3 times", lambda r: f"{r['extended_over_nominal']:.1f} times"),
+    ("kernel", "every effect against nominal", "3 times", lambda r: f"{r['every_over_nominal']:.1f} times"),
+    ("objectives", "NumPy's objective against ours, per core", "60 times",
+     lambda r: f"{min(o['gain'] for o in r['rows']):.0f} to {max(o['gain'] for o in r['rows']):.0f} times"),
+    ("peers", "pyswarms with NumPy against ours, by the clock", "50 times", lambda r: f"{r['gain']:.0f} times"),
+    ("optimum", "swarm and polish against least squares", "3 times",
+     lambda r: f"{_seconds(r, 'pso_polish') / _seconds(r, 'least_squares'):.1f} times"),
+    ("optimum", "swarm and polish against CMA-ES", "1 time",
+     lambda r: f"{_seconds(r, 'pso_polish') / _seconds(r, 'cma_es'):.1f} times"),
+    ("identification", "500 s, 64 x 100, polish, intervals", "2 s",
+     lambda r: f"{r['times']['64 x 100, polish, intervals']['wall']:.1f} s"),
+    ("commands", "diagnosis of 120 s, whole command", "3 s",
+     lambda r: f"{r['times']['quadid diagnose, 120 s MCAP']['wall']:.1f} s"),
+    ("refits", "warm refit of a 10 s window", "250 ms",
+     lambda r: f"{1e3 * r['times']['warm, one second later']['wall']:.0f} ms"),
+    ("memory", "peak memory, 500 s", "400 MB", lambda r: f"{r['peak_mb']:.0f} MB"),
+    ("help", "quadid --help", "0.3 s", lambda r: f"{r['times']['quadid --help']['wall']:.2f} s"),
+    ("starts", "second start to first fit", "1.5 s",
+     lambda r: f"{r['times']['second start to first fit']['wall']:.1f} s"),
+)  # fmt: skip
+
+
+def _seconds(r: Result, method: str) -> float:
+    return float(r["methods"][method]["seconds"])
+
+
+def goals(results: Result) -> list[str]:
+    """Lines of a table: what, what was wanted, what was measured; only of parts that were measured."""
+    rows = [
+        f"| {what} | {wanted} | {told(results[part])} | {results[part]['machine']['load']:.1f} |"
+        for part, what, wanted, told in GOALS
+        if part in results
+    ]
+    return ["| what | wanted | measured | load |", "|---|---|---|---|", *rows, ""]
