@@ -170,7 +170,8 @@ class McapFile:
                     self._note_safely(opcode, file.read(length))
             except _DamagedError:
                 self.bad_chunks += 1
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            if opcode == Opcode.FOOTER:
+                self.lost_bytes = max(self._size - end - len(MAGIC), 0)
                 return
             offset = end
         self.lost_bytes = self._size - offset
