@@ -10,7 +10,7 @@ from mcap_ros2._dynamic import generate_dynamic
 from quadid_node.chooser import Chooser
 from quadid_node.columns import COLUMNS
 from quadid_node.convert import Decoder, best_ranks
-from quadid_node.intake import Intake
+from quadid_node.intake import MOST, Intake
 from quadid_node.messages import Clock
 from quadid_node.presets import Input, source
 from quadid_replay import write_mcap
@@ -85,6 +85,16 @@ def test_the_gyro_comes_last(messages: list[Message]) -> None:
     _, recorded, _ = by_intake(messages, 60)
     topics = [topic for topic, _ in recorded[:60]]
     assert topics.index("imu") == len(topics) - topics.count("imu")
+
+
+def test_no_topic_runs_far_ahead_when_much_has_piled_up(messages: list[Message]) -> None:
+    _, recorded, _ = by_intake(messages, len(messages))
+    at = {topic: [k for k, (name, _) in enumerate(messages) if name == topic] for topic, _ in messages}
+    arrived = [at[topic].pop(0) for topic, _ in recorded]
+    rate = len({topic for topic, _ in messages})
+    behind = max(newest - k for newest, k in zip(np.maximum.accumulate(arrived), arrived, strict=True))
+    assert 0 < behind <= rate * MOST
+    assert len(messages) > 10 * rate * MOST
 
 
 def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
