@@ -47,6 +47,11 @@ class Ground:
         return self._session is not None and bool(self._alive) and self._clock() >= self._rests_until
 
     @property
+    def count(self) -> int:
+        """Ground machines that live."""
+        return len(self._alive)
+
+    @property
     def vanished(self) -> bool:
         """Whether no ground machine lives any more."""
         return not self._alive
@@ -152,7 +157,7 @@ class RemoteWorker:
         while not self._answers.empty():
             number, data = self._answers.get_nowait()
             if self._asked is not None and number == self._asked.number:
-                self._take(data, out)
+                self._take(number, data, out)
         if self._asked is not None and (self._ground.vanished or self._clock() > self._until):
             self._fall_back("vanished" if self._ground.vanished else "does not answer")
         self._tell_changes()
@@ -172,13 +177,13 @@ class RemoteWorker:
         self._local.close()
         self._ground.close()
 
-    def _take(self, data: bytes | None, out: list[Reply | Trouble]) -> None:
+    def _take(self, number: int, data: bytes | None, out: list[Reply | Trouble]) -> None:
         try:
             reply = unpack(data) if data is not None else None
         except ParcelError as error:
             self._fall_back(f"answers what cannot be read ({error})")
             return
-        if not isinstance(reply, get_args(Reply)) or reply.number != (self._asked.number if self._asked else -1):
+        if not isinstance(reply, get_args(Reply)) or reply.number != number:
             self._fall_back("refused the request" if data is None else "answers something else")
             return
         self._asked = None

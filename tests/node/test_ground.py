@@ -5,24 +5,31 @@ from __future__ import annotations
 import builtins
 import os
 import pickle
+import queue
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
+from quadid_node.ground import work
 from quadid_node.parcel import LARGEST, ParcelError, pack, unpack
 from quadid_node.remote_worker import Ground, RemoteWorker
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
+from quadid_node.zenoh_link import Fleet, ZenohLink
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node import remote_worker
 from tests.cli.conftest import QUADID
-from tests.node.zenoh_net import free_port, until
+from tests.faults.evidence import Happened
+from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.driving import flight, samples
 
 PELICAN = Vehicle.shipped("pelican")
@@ -154,6 +161,83 @@ def test_a_ground_machine_ends_in_peace_and_refuses_what_is_no_request(router: s
     out, _ = machine.communicate(timeout=20)
     assert machine.returncode == 0
     assert "4 refused" in out
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
+    made = Net(tmp_path_factory.mktemp("zenoh"))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def secure_ground(net: Net) -> Iterator[None]:
+    """A ground machine with the certificate `ground` behind the example's router."""
+    stop, told = threading.Event(), list[str]()
+    thread = threading.Thread(target=work, args=(net.client("ground"), stop.is_set, told.append))
+    thread.start()
+    assert until(lambda: any("ready" in text for text in told)), told
+    yield
+    stop.set()
+    thread.join(20)
+
+
+@pytest.mark.usefixtures("secure_ground")
+def test_through_mutual_tls_only_the_ground_machine_fits(net: Net, request_: FitRequest, happened: Happened) -> None:
+    inline = InlineWorker()
+    inline.submit(request_)
+    (here,) = inline.poll()
+    assert isinstance(here, FitReply)
+    impostor, asked = zenoh.open(zenoh.Config.from_file(net.client("quad2"))), list[str]()
+    declared: list[Any] = [impostor.liveliness().declare_token("quadid/worker/impostor/alive")]
+    declared += [
+        impostor.declare_queryable(key, lambda query: asked.append(str(query.key_expr)))
+        for key in ("quadid/quad1/work/fit", "quadid/*/work/fit")
+    ]
+    ground, answers = Ground(net.client("quad1"), "quad1"), queue.Queue[tuple[int, object]]()
+    try:
+        assert until(lambda: ground.there)
+        for _ in range(3):
+            ground.ask(request_, answers, 30.0)
+            number, data = answers.get(timeout=60.0)
+            assert isinstance(data, bytes)
+            far = unpack(data)
+            assert isinstance(far, FitReply)
+            assert number == request_.number
+            assert same(here, far)
+        assert asked == [], "windows of a vehicle go to the ground machine only"
+        assert ground.count == 1, "the impostor is not seen"
+        payload = pack(request_)
+        stolen = impostor.get("quadid/quad1/work/fit", payload=payload, timeout=1.0)
+        assert [reply for reply in stolen if reply.ok is not None] == []
+        happened(16, "fits on a ground machine: another vehicle can neither answer nor ask for them")
+    finally:
+        ground.close()
+        for one in declared:
+            one.undeclare()
+        impostor.close()  # type: ignore[no-untyped-call]
+
+
+def test_the_ground_machine_sees_and_sends_windows_and_fits_only(net: Net) -> None:
+    ground, heard = zenoh.open(zenoh.Config.from_file(net.client("ground"))), list[bytes]()
+    spy = ground.declare_subscriber("quadid/**", lambda sample: heard.append(sample.payload.to_bytes()))
+    link, fleet = ZenohLink(net.client("quad1"), "quad1", service()), Fleet(net.client("watch"))
+    try:
+        assert until(lambda: fleet.alive.get("quad1", False))
+        time.sleep(0.3)
+        ground.put("quadid/quad1/health", b'{"sequence": 666}')
+        link.publish(accepted(1))
+        assert until(lambda: "parameters" in fleet.latest.get("quad1", {}))
+        time.sleep(0.3)
+        assert "health" not in fleet.latest["quad1"]
+        for key in ("quadid/quad1/command/rollback", "quadid/quad1/parameters"):
+            assert [reply for reply in ground.get(key, timeout=1.0) if reply.ok is not None] == []
+        assert heard in ([], [b'{"sequence": 666}']), "at most its own, from its own session"
+    finally:
+        spy.undeclare()  # type: ignore[no-untyped-call]
+        ground.close()  # type: ignore[no-untyped-call]
+        link.close()
+        fleet.close()
 
 
 def test_a_parcel_comes_out_as_it_went_in(request_: FitRequest) -> None:

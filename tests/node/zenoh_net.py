@@ -41,7 +41,8 @@ class Net:
     def __init__(self, folder: Path) -> None:
         self.folder, self.port = folder, free_port()
         certs = folder / "certs"
-        for place, names in ((certs, ("router", "quad1", "quad2", "quad3", "watch")), (folder / "foreign", ("quad1",))):
+        names_here = ("router", "quad1", "quad2", "quad3", "ground", "watch")
+        for place, names in ((certs, names_here), (folder / "foreign", ("quad1",))):
             subprocess.run([str(EXAMPLES / "certificates.sh"), str(place), *names], check=True)
         router = self._write("router.json5", (EXAMPLES / "router.json5").read_text())
         self.process = subprocess.Popen(
