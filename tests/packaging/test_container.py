@@ -48,6 +48,13 @@ def test_the_last_user_is_not_root(dockerfile: str) -> None:
     assert user not in ("0", "root")
 
 
+def test_the_history_outlives_the_container(dockerfile: str, services: dict[str, Any]) -> None:
+    (volume,) = re.findall(r'^VOLUME \["(.+)"\]$', dockerfile, re.MULTILINE)
+    (history,) = re.findall(r"^ENV QUADID_HISTORY=(\S+)$", dockerfile, re.MULTILINE)
+    assert Path(history).parent == Path(volume)
+    assert services["node"]["volumes"] == [f"history:{volume}"]
+
+
 def test_launch_arguments_of_the_node_service_exist(services: dict[str, Any], repository: Path) -> None:
     package, launch, *arguments = services["node"]["command"].split()[2:]
     assert package == "quadid_node"
