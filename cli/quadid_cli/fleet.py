@@ -48,7 +48,7 @@ def fleet(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = GRID,
     seed: Seed = 1,
     json: JsonTarget = None,
-    out: OutFolder = Path("fleet-out"),
+    out: OutFolder = Path(),
 ) -> None:
     """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
     from quadid_cli import fleet_folder, loading, output, terminal

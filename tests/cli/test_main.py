@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from quadid_cli.main import COMMANDS
 
 from quadid import __version__
 from tests.cli.conftest import Cli, one_line
@@ -14,16 +15,17 @@ from tests.cli.conftest import Cli, one_line
 def test_help_lists_every_installed_command(quadid: Cli) -> None:
     run = quadid("--help")
     assert run.code == 0
-    for command in ("demo", "simulate", "inspect", "identify", "score", "diagnose", "export"):
+    for command in COMMANDS:
         assert f"  {command} " in run.out
     assert quadid().out == run.out
 
 
-@pytest.mark.parametrize("command", ["identify", "score", "diagnose", "demo", "export", "simulate", "inspect"])
-def test_every_command_has_help_and_the_common_options(inside: Cli, command: str) -> None:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_examples_and_json(inside: Cli, command: str) -> None:
     run = inside(command, "--help")
     assert run.code == 0
     assert "--json" in run.out
+    assert "Examples:" in run.out
 
 
 def test_start_imports_nothing_heavy() -> None:
