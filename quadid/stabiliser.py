@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, nearest
+from quadid.rotation import write_rotation
 from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]
@@ -194,10 +195,7 @@ def stabilise_rows(
     """
     matrix = np.empty((3, 3))
     for k in range(reference.shape[0]):
-        w, x, y, z = attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3]
-        matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-        matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-        matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
         stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
 
 
@@ -224,14 +222,9 @@ def stabiliser_step(
     Returns:
         Commanded rotor speeds [rad/s], shape (rotors,), and the integral torques after the step.
     """
+    matrix = np.empty((3, 3))
     w, x, y, z = (float(c) for c in attitude)
-    matrix = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    write_rotation(w, x, y, z, matrix)
     after = np.array(integral, dtype=np.float64)
     command = np.empty(len(mixer))
     stabilise(

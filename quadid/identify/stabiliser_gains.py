@@ -109,39 +109,20 @@ class _Rows(NamedTuple):
 
 
 def _rows(window: Window) -> _Rows | None:
+    from scipy.spatial.transform import Rotation  # slow to load
+
     reference, attitude, gyro = window.attitude_reference, window.attitude, window.gyro
     if reference is None or attitude is None or gyro is None or window.sampling != "held":
         return None
     good = np.isfinite(np.column_stack([reference, attitude, gyro])).all(axis=1)
     if not good.all():
         return None
-    is_ = _rotation(attitude)
-    wanted = _wanted(reference[:, :3])
+    is_ = Rotation.from_quat(attitude, scalar_first=True).as_matrix()
+    wanted = Rotation.from_euler("ZYX", reference[:, 2::-1]).as_matrix()
     relative = np.einsum("nki,nkj->nij", is_, wanted)  # R' Rd
     skew = 0.5 * (relative - relative.transpose(0, 2, 1))
     error = np.column_stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]])
     return _Rows(error, gyro, reference[:, 3], window.rotor_speed**2, np.full(len(gyro), window.dt))
-
-
-def _rotation(q: FloatArray) -> FloatArray:
-    """Rotation matrices (n, 3, 3) of quaternions."""
-    w, x, y, z = q.T
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
-
-
-def _wanted(angles: FloatArray) -> FloatArray:
-    """Rotation matrices (n, 3, 3) of roll, pitch, yaw."""
-    half = 0.5 * angles
-    (cx, cy, cz), (sx, sy, sz) = np.cos(half).T, np.sin(half).T
-    q = (cx * cy * cz + sx * sy * sz, sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz,
-         cx * cy * sz - sx * sy * cz)  # fmt: skip
-    return _rotation(np.column_stack(q))
 
 
 def _throttle(rows: Sequence[_Rows]) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_
 
 # isort: on
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
+from quadid.rotation import write_rotation
 from quadid.stabiliser import rotation_of, steer
 
 FloatArray = NDArray[np.float64]
@@ -45,11 +46,7 @@ def _see(lane: int, tilted: bool, s: FloatArray, attitude: FloatArray, rate: Flo
             a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
             a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
         )  # fmt: skip
-    attitude[0, 0], attitude[0, 1] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z)
-    attitude[0, 2], attitude[1, 0] = 2.0 * (x * z + w * y), 2.0 * (x * y + w * z)
-    attitude[1, 1], attitude[1, 2] = 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
-    attitude[2, 0], attitude[2, 1] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
-    attitude[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    write_rotation(w, x, y, z, attitude)
     p, q, r = s[X_P + lane], s[X_P + LANES + lane], s[X_P + 2 * LANES + lane]
     for i in range(3):
         row = C_R + 3 * i * LANES + lane

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.rotation import continuous_sign
 from quadid.window import Channel
 
 FloatArray = NDArray[np.float64]
@@ -105,10 +106,4 @@ class Line:
         if high - low < 2:
             return None
         values = self.values[low:high]
-        return Channel(name, self.t[low:high], continuous(values) if name == "attitude" else values, name)
-
-
-def continuous(q: FloatArray) -> FloatArray:
-    """Signs such that neighbours are less than half a turn apart; shape (n, 4)."""
-    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
-    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+        return Channel(name, self.t[low:high], continuous_sign(values) if name == "attitude" else values, name)

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError
-from quadid.online.lines import Line, continuous
+from quadid.online.lines import Line
+from quadid.rotation import continuous_sign
 from quadid.rotor_signal import RotorSignal
 from quadid.stabiliser import mixer_matrix, pack_gains, stabilise_rows
 from quadid.tracks import GAP
@@ -165,5 +166,5 @@ def _between(line: Line, at: FloatArray) -> FloatArray:
 
 def _turned(line: Line, at: FloatArray) -> FloatArray:
     """Attitudes at times, quaternions, by straight lines between neighbours of the same sign."""
-    out = np.column_stack([np.interp(at, line.t, column) for column in continuous(line.values).T])
+    out = np.column_stack([np.interp(at, line.t, column) for column in continuous_sign(line.values).T])
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))

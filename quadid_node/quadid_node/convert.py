@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from quadid_replay.cdr_blocks import BlockReader, Blocks, Read
-from quadid_replay.mcap_messages import SIGNALS, TYPES, Signals
+from quadid_replay.cdr_blocks import BlockReader, Read
+from quadid_replay.mcap_messages import SIGNALS, TYPES
+from quadid_replay.signal_columns import SignalColumns
 
 from quadid.errors import QuadidError
 from quadid.window import Block, Sample
 from quadid_node.chooser import Chooser
-from quadid_node.columns import COLUMNS
 from quadid_node.messages import Clock
 from quadid_node.presets import Input
 
@@ -79,12 +79,11 @@ class Decoder:
             decode: serialized bytes to a message of the type; see `deserializer`.
         """
         kind = TYPES[entry.type]
-        self._signals: Callable[[Blocks, Any], Signals] = kind.signals
+        self._kind, self._columns = kind, SignalColumns(kind)
         self._ranks = dict(entry.channels)
         self._clock, self._chooser, self._rotors = clock, chooser, rotors
         self.failed = 0
 
-        self._columns = COLUMNS.get(entry.type)
         self._layout: BlockReader | None = None
         if kind.stamp is None:
             self._layout = BlockReader(decode, kind.blocks, kind.extra)
@@ -110,7 +109,7 @@ class Decoder:
     def _block(self, messages: Sequence[bytes]) -> Block | None:
         """The messages as one block, the numbers of `samples` to the bit; None where each must be looked at."""
         read = self._layout.read_many(messages) if self._layout is not None else None
-        told = self._columns(read.blocks, read.extra) if self._columns is not None and read is not None else None
+        told = self._columns.pick(read.blocks, read.extra) if read is not None else None
         if read is None or told is None:
             return None
         ns = read.seconds * 10**9 + read.nanoseconds
@@ -137,7 +136,7 @@ class Decoder:
         """Yields the samples of one message that may be used now."""
         try:
             message = self._read(data)
-            signals = self._signals(message.blocks, message.extra)
+            signals = self._kind.signals(message.blocks, message.extra)
         except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
             self.failed += 1
             return

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.resample import sample_period
+from quadid.rotation import continuous_sign
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
-from quadid_replay.frames import continuous_sign, unit_quaternions
+from quadid_replay.frames import unit_quaternions
 
 FloatArray = NDArray[np.float64]
 

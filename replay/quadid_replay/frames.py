@@ -61,14 +61,6 @@ def to_euler(q: FloatArray) -> FloatArray:
     return np.column_stack([roll, pitch, yaw])
 
 
-def continuous_sign(q: FloatArray) -> FloatArray:
-    """Chooses signs so that neighbouring quaternions are less than half a turn apart; the first keeps its own."""
-    if len(q) < 2:
-        return q
-    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
-    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
-
-
 def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Returns the quaternions with those off unit length by more than 1e-3 normalised, and which rows are attitudes.
 

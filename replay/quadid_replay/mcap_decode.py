@@ -7,19 +7,18 @@ so it is with stamps and the clock they follow.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.exceptions import McapError
 from numpy.typing import NDArray
 
-from quadid_replay.cdr_blocks import BlockReader, Blocks, Read
+from quadid_replay.cdr_blocks import BlockReader, Read
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns
 from quadid_replay.mcap_messages import MessageType
 from quadid_replay.mcap_records import Topic
+from quadid_replay.signal_columns import UNDECODABLE, SignalColumns
 
 FloatArray = NDArray[np.float64]
 Message = tuple[int, int, bytes]
@@ -30,8 +29,6 @@ FIRST_BATCH, LARGEST_BATCH = 64, 8192
 """Messages in the first batch, from which layouts are learnt; each further one holds twice as many, up to the most."""
 BATCH_BYTES = 8 << 20
 """A batch ends when its payloads have this many bytes."""
-UNDECODABLE = (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError)
-"""What the library and the types' functions raise on damaged data."""
 _EPOCH_NS = 10**17
 """Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
 _OTHER_CLOCK = 3600.0
@@ -40,12 +37,14 @@ _LARGEST_BASE = 1 << 62
 
 
 class Source(NamedTuple):
-    """A topic that is read: its description, its type, the library's decoder, and the reader of its layout if any."""
+    """A topic that is read: its description, its type, the library's decoder, the reader of its layout if any, and
+    which columns of many messages are which signal."""
 
     topic: Topic
     kind: MessageType
     decode: Callable[[bytes], Any]
     layout: BlockReader | None
+    columns: SignalColumns
 
     def read(self, data: bytes) -> Read:
         """Reads one message; raises what the library raises on damaged data."""
@@ -59,7 +58,7 @@ class Source(NamedTuple):
 def source_of(topic: Topic, kind: MessageType, decode: Callable[[bytes], Any]) -> Source:
     """The reader of a topic; messages without a header have no layout that could be learnt."""
     layout = BlockReader(decode, kind.blocks, kind.extra) if kind.stamp is None else None
-    return Source(topic, kind, decode, layout)
+    return Source(topic, kind, decode, layout, SignalColumns(kind))
 
 
 class Stamps:
@@ -141,19 +140,6 @@ def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
         yield batch
 
 
-class _Number(float):
-    """A number of a message that knows where it stands: run of numbers and place in it."""
-
-    at: tuple[int, int]
-
-    @classmethod
-    def placed(cls, value: float, at: tuple[int, int]) -> _Number:
-        """A number and where it stands."""
-        number = cls(value)
-        number.at = at
-        return number
-
-
 class _Part(NamedTuple):
     """Samples of one signal in a batch: which messages, and values (n, size)."""
 
@@ -196,7 +182,7 @@ def _read_at_once(
 ) -> list[_Part]:
     """Reads all messages of a topic by columns; nothing where that would not be the same as one by one."""
     read = source.layout.read_many(data) if source.layout is not None else None
-    signals = None if read is None else _signals(source.kind, read.blocks, read.extra)
+    signals = None if read is None else source.columns.pick(read.blocks, read.extra)
     if read is None or signals is None:
         return []
     stamped[rows, 0], stamped[rows, 1] = read.seconds, read.nanoseconds
@@ -221,30 +207,3 @@ def _read_each(
         here = np.array([row])
         parts += [_Part((number, name), order, here, sample) for order, (name, sample) in enumerate(samples)]
     return parts
-
-
-def _signals(kind: MessageType, blocks: list[FloatArray], extra: Any) -> list[tuple[str, FloatArray]] | None:
-    """Signals of messages whose runs of numbers have shapes (n, size); None where they differ in which they tell.
-
-    The type's own function picks them from the first message; where each number stood tells the columns.
-    """
-    for run, column in kind.deciding:
-        values = blocks[run][:, column]
-        if np.any((values == -1.0) != (values[0] == -1.0)) or np.any(np.isnan(values) != np.isnan(values[0])):
-            return None
-    first: Blocks = [
-        [_Number.placed(value, (run, column)) for column, value in enumerate(block[0])]
-        for run, block in enumerate(blocks)
-    ]
-    try:
-        told = kind.signals(first, extra)
-    except UNDECODABLE:
-        return None
-    out = []
-    for name, picked in told:
-        places = [one.at for one in picked if isinstance(one, _Number)]
-        if len(places) != len(picked):
-            return None
-        columns = [blocks[run][:, column] for run, column in places]
-        out.append((name, np.stack(columns, axis=1) if columns else np.empty((len(blocks[0]), 0))))
-    return out

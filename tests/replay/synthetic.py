@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from quadid_replay.frames import continuous_sign, from_euler
+from quadid_replay.frames import from_euler
 
+from quadid.rotation import continuous_sign
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from quadid_replay.clocks import LogClock, WrapCounter
 from quadid_replay.columns import Columns, RawChannel, clean_channel, fastest_first
 from quadid_replay.frames import (
-    continuous_sign,
     flip_attitude,
     flip_body,
     flip_world,
@@ -19,6 +18,8 @@ from quadid_replay.frames import (
     unit_quaternions,
 )
 from scipy.spatial.transform import Rotation
+
+from quadid.rotation import continuous_sign
 
 FloatArray = NDArray[np.float64]
 angles = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
