@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from quadid_cli.options import JsonTarget, OutFolder, VehicleName
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
 
 
 def export(
@@ -15,6 +18,15 @@ def export(
     form: Annotated[
         str, typer.Option("--format", metavar="F", help="yaml, px4, ardupilot, gazebo, rotorpy or agilicious.")
     ] = "yaml",
+    history: Annotated[
+        Path | None,
+        typer.Option(
+            "--history", metavar="FILE", help="Values of the set in force in this history, not of the vehicle file."
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--id", metavar="NAME", help="Whose sets of the history; default the vehicle's.")
+    ] = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -24,8 +36,12 @@ def export(
     from quadid_cli.identify import file_name
 
     output.check_file(json, "--json")
-    described = loading.load_vehicle(vehicle)
-    texts = written_as(described, form, Path(vehicle).name)
+    described, source = loading.load_vehicle(vehicle), Path(vehicle).name
+    if history is not None:
+        described, source = _accepted(described, history, name or described.name)
+    elif name is not None:
+        raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
+    texts = written_as(described, form, source)
     folder = output.out_folder(out)
     targets = {folder / f"{file_name(described.name)}{ending}": text for ending, text in texts.items()}
     for path in targets:
@@ -42,3 +58,19 @@ def export(
     for file in files:
         console.print(f"Written: {file}", soft_wrap=True)
     terminal.warn(warnings)
+
+
+def _accepted(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:
+    """The vehicle with the values that a service put in force last, and where they come from."""
+    from quadid_node.codec import set_from_dict
+    from quadid_node.store_file import StoreError, read_history
+
+    from quadid.identify.result import with_values
+
+    found = read_history(history, name)
+    accepted = [item for item in found["sets"] if item["state"] in ("accepted", "rolled_back")]
+    if not accepted:
+        names = ", ".join(entry["name"] for entry in found["vehicles"]) or "none"
+        raise StoreError(f"no set of '{name}' was ever in force in {history}", f"one of: {names}", "give --id")
+    last = set_from_dict(accepted[-1])
+    return with_values(vehicle, last.parameters), f"{history.name}, set {last.sequence} of {name}"

@@ -9,12 +9,20 @@ from typing import Annotated, Any
 
 import typer
 
-from quadid_cli.options import JsonTarget, VehicleName
+from quadid_cli.options import JsonTarget, shipped_names
 from quadid_cli.tables import number
 
 
 def history(
-    vehicle: VehicleName,
+    vehicle: Annotated[
+        str,
+        typer.Option(
+            "--vehicle",
+            metavar="V",
+            help="A name in the history (--id of a service, a namespace), a shipped name, or a YAML file.",
+            autocompletion=shipped_names,
+        ),
+    ],
     file: Annotated[
         Path | None,
         typer.Option("--history", metavar="FILE", help="History file; default QUADID_HISTORY, else the user's own."),
@@ -26,15 +34,24 @@ def history(
     json: JsonTarget = None,
 ) -> None:
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
-    from quadid_node.store import default_path, read_history
+    from quadid_node.store import default_path
+    from quadid_node.store_file import StoreError, read_history
 
+    from quadid.errors import VehicleError
     from quadid_cli import output
     from quadid_cli.loading import load_vehicle
 
     output.check_file(json, "--json")
-    name = load_vehicle(vehicle).name
-    path = file or default_path()
+    path, name = file or default_path(), vehicle
     found = read_history(path, name, candidates, events)
+    names = [entry["name"] for entry in found["vehicles"]]
+    if vehicle not in names:
+        try:
+            name = load_vehicle(vehicle).name
+        except VehicleError as error:
+            there = ", ".join(names) or "none"
+            raise StoreError(f"{error.found}, and no vehicle of {path}", f"there: {there}") from error
+        found = read_history(path, name, candidates, events)
     result = {"schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), **found}
     output.write_json(result, json)
     show(result, quiet=json == "-")

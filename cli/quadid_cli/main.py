@@ -59,7 +59,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "worker": ("quadid worker --connect tcp/192.168.1.5:7447",),
     "watch": ("quadid watch", "quadid watch --zenoh tcp/192.168.1.5:7447"),
     "history": ("quadid history --vehicle mine.yaml --events 20",),
-    "export": ("quadid export --vehicle pelican.fitted.yaml --format px4 --out params",),
+    "export": (
+        "quadid export --vehicle pelican.fitted.yaml --format px4 --out params",
+        "quadid export --vehicle pelican --history h.sqlite --format ardupilot",
+    ),
     "fleet": (
         "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
         "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",

@@ -127,6 +127,8 @@ class _Console:
         self._said = time.monotonic()
         traffic = self._link.traffic()
         rates = ", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"
+        if traffic.denied:
+            rates += f" | the autopilot refused some messages ({', '.join(traffic.denied)})"
         if traffic.refused:
             rates += f" | {traffic.refused} frames refused"
         if traffic.behind:
@@ -155,6 +157,7 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
         "in_force": set_to_dict(force) if force is not None else None,
         "status": status_to_dict(health.status),
         "rates": traffic.rates,
+        "denied": list(traffic.denied),
         "refused": traffic.refused,
         "behind": traffic.behind,
         "dropped": traffic.dropped,

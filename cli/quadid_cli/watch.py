@@ -50,7 +50,10 @@ def watch(
     try:
         for vehicle, name in ((approve, "approve"), (rollback, "rollback")):
             if vehicle:
-                _command(fleet, vehicle, name)
+                done = _command(fleet, vehicle, name)
+                if json != "-":
+                    typer.echo(f"{vehicle}: {done['text']}")
+                output.write_json(done, json)
         if approve or rollback:
             return
         if json is not None:
@@ -63,11 +66,12 @@ def watch(
         fleet.close()
 
 
-def _command(fleet: Fleet, vehicle: str, name: str) -> None:
+def _command(fleet: Fleet, vehicle: str, name: str) -> dict[str, Any]:
+    """What the vehicle said to a command that it carried out, of the form ``quadid.command/1``."""
     done, text = fleet.command(vehicle, name)
     if not done:
         raise WatchError(f"{vehicle}: {name} was not done: {text}")
-    typer.echo(f"{vehicle}: {text}")
+    return {"schema": "quadid.command/1", "vehicle": vehicle, "command": name, "text": plain(text)}
 
 
 def _live(fleet: Fleet, seconds: float, console: Any) -> None:

@@ -168,16 +168,25 @@ def answered(parameters: ParameterSet) -> bool:
 
 def fitted_vehicle(fit: Fit) -> Vehicle:
     """The vehicle with fitted values as initial guess, their standard deviations, fitted effects; bounds are kept."""
-    priors = dict(fit.vehicle.parameters)
     effects = {name: dict(values) for name, values in fit.vehicle.effects.items()}
     layout = Layout(fit.vehicle)
     for p in fit.parameters:
-        if p.name in NOMINAL_NAMES:
-            priors[p.name] = _prior(priors[p.name], p)
-        else:
+        if p.name not in NOMINAL_NAMES:
             effect = p.name.split(".")[0]
             effects[effect] = {k: _rounded(v) for k, v in layout.read_effect(fit.theta, effect).items()}
-    return fit.vehicle.model_copy(update={"parameters": priors, "effects": effects})
+    return with_values(fit.vehicle, fit.parameters).model_copy(update={"effects": effects})
+
+
+def with_values(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
+    """The vehicle with these nominal values as initial guess, and their standard deviations; bounds are kept.
+
+    What the data say nothing about stays as the vehicle file has it, so that nobody takes it for measured.
+    """
+    priors = dict(vehicle.parameters)
+    for p in parameters:
+        if p.name in NOMINAL_NAMES and p.status is not Status.PRIOR_DOMINATED:
+            priors[p.name] = _prior(priors[p.name], p)
+    return vehicle.model_copy(update={"parameters": priors})
 
 
 def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:

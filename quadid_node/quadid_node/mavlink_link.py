@@ -87,7 +87,7 @@ class MavlinkLink:
         self._begin = clock()
         self._before: dict[str, int] = {}
         self._rates: dict[str, float] = {}
-        self._denied: dict[str, str] = {}
+        self._denied: set[str] = set()
         self._set: OnlineSet | None = None
         self._budget, self._budget_second = FRAMES_A_SECOND, 0
 
@@ -132,8 +132,12 @@ class MavlinkLink:
                 self._wire.send(dialect.MAVLink_param_request_read_message(self.vehicle_system, self._target, name, -1))
 
     def _on_ack(self, message: Any) -> None:
-        if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL and message.result not in (0, 5):
-            self._denied[str(message.result)] = f"result {message.result}"
+        """Notes a refused request for messages; what it refused the protocol does not say, the rates do."""
+        if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+            return
+        if message.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
+            known = dialect.enums["MAV_RESULT"].get(message.result)
+            self._denied.add(known.name if known is not None else f"result {message.result}")
 
     def _for_us(self, message: Any) -> bool:
         return message.target_system in (0, self._wire.mav.srcSystem) and message.target_component in (0, COMPONENT)
@@ -201,7 +205,7 @@ class MavlinkLink:
     def traffic(self) -> Traffic:
         """What comes over the link."""
         wire = self._wire
-        return Traffic(dict(self._rates), tuple(self._denied.values()), wire.refused, wire.dropped, wire.mav.behind)
+        return Traffic(dict(self._rates), tuple(sorted(self._denied)), wire.refused, wire.dropped, wire.mav.behind)
 
     def close(self) -> None:
         """Closes the link."""

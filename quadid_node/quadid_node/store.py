@@ -14,15 +14,15 @@ import queue
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any
 
-from quadid.errors import QuadidError
 from quadid.online.records import Diagnosed, Event, OnlineSet
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
+from quadid_node.store_file import StoreError, connect
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS sets (
@@ -41,13 +41,8 @@ KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_0
 """Rows kept; older ones are forgotten, numbered sets never."""
 PRUNE_EVERY = 1000
 MOST_WAITING = 5000
-BUSY_SECONDS = 5.0
 AGAIN = 1.0
 """Time after which entries that could not be written are tried again [s]."""
-
-
-class StoreError(QuadidError):
-    """A history that another service writes, or that is not there."""
 
 
 def default_path() -> Path:
@@ -109,7 +104,7 @@ class Store:
         if not self.path.is_file():
             return Restored(None, 1)
         try:
-            with contextlib.closing(_connect(self.path)) as db:
+            with contextlib.closing(connect(self.path)) as db:
                 (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
                 last = self._set(db, "state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
                 approved = self._set(db, "approved_by NOT IN ('auto', '') ORDER BY rowid DESC")
@@ -196,7 +191,7 @@ class Store:
         self.notes.append(f"the history was damaged ({error}); it was set aside as {aside.name}, a new one begins")
 
     def _make_tables(self) -> None:
-        with contextlib.closing(_connect(self.path)) as db:
+        with contextlib.closing(connect(self.path)) as db:
             if db.execute("PRAGMA quick_check(1)").fetchone()[0] != "ok":
                 raise sqlite3.DatabaseError("malformed: its pages do not add up")
             db.executescript(SCHEMA)
@@ -229,7 +224,7 @@ class Store:
         if self._lock is None:
             return True
         try:
-            with contextlib.closing(_connect(self.path)) as db, db:
+            with contextlib.closing(connect(self.path)) as db, db:
                 for statement, values in batch:
                     db.execute(statement, values)
                 self._written += len(batch)
@@ -266,59 +261,6 @@ def _is_damage(error: sqlite3.Error) -> bool:
     """Whether an error says that the file is no sound database, not that it cannot be reached now."""
     told = str(error)
     return "malformed" in told or "not a database" in told or "no such table" in told
-
-
-def read_history(path: Path, vehicle: str, candidates: int = 0, events: int = 0) -> dict[str, list[dict[str, Any]]]:
-    """Reads a history without touching it.
-
-    Args:
-        path: database file.
-        vehicle: name of the vehicle.
-        candidates: newest candidates to return; events: newest events.
-
-    Raises:
-        StoreError: no such file, or not a history.
-    """
-    if not path.is_file():
-        raise StoreError(f"no history {path}", "a history that a service has written", "give --history")
-    try:
-        with contextlib.closing(_connect(path, read_only=True)) as db:
-            return {
-                "sets": _rows(db, "SELECT wall, data FROM sets WHERE vehicle = ? ORDER BY rowid", (vehicle,)),
-                "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),
-                "events": _newest(db, "SELECT wall, t, level, kind, text", "events", vehicle, events),
-                "vehicles": [{"name": n} for (n,) in db.execute("SELECT DISTINCT vehicle FROM sets ORDER BY vehicle")],
-            }
-    except (sqlite3.Error, ValueError) as error:
-        raise StoreError(f"{path} cannot be read ({error})", "a history of quadid") from error
-
-
-def _newest(db: sqlite3.Connection, what: str, table: str, vehicle: str, most: int) -> list[dict[str, Any]]:
-    found = _rows(db, f"{what} FROM {table} WHERE vehicle = ? ORDER BY id DESC LIMIT ?", (vehicle, most))
-    return found[::-1]
-
-
-def _rows(db: sqlite3.Connection, statement: str, values: tuple[Any, ...]) -> list[dict[str, Any]]:
-    cursor = db.execute(statement, values)
-    names = [c[0] for c in cursor.description]
-
-    def entries() -> Iterator[dict[str, Any]]:
-        for row in cursor:
-            entry = dict(zip(names, row, strict=True))
-            if "data" in entry:
-                entry |= json.loads(entry.pop("data"))
-            yield entry
-
-    return list(entries())
-
-
-def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
-    if read_only:
-        return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
-    db = sqlite3.connect(path, timeout=BUSY_SECONDS)
-    db.execute("PRAGMA journal_mode = WAL")
-    db.execute("PRAGMA synchronous = FULL")
-    return db
 
 
 def _take_lock(path: Path, vehicle: str) -> IO[str]:

@@ -104,7 +104,7 @@ def test_px4_geometry_and_hover(vehicle: Vehicle) -> None:
     assert values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY / (4 * 2.3e-5 * SPEED**2))
     assert values["CA_ROTOR0_CT"] * 4 * values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY)
     assert "gyro_scale" in text
-    assert "b = 2.3e-05 N s^2/rad^2: fitted, 95 % within 0.85 %" in text
+    assert "b = 2.3e-05 N s^2/rad^2: fitted, or given with its uncertainty: 95 % within 0.85 %" in text
     assert "J_xx = 0.008 kg m^2: not from data" in text
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 from quadid_node.mavlink_link import MavlinkLink
-from quadid_node.store import read_history
+from quadid_node.store_file import read_history
 
 from tests.node.mavlink_ends import Sender, accepted, free_port
 from tests.node.peers import Process

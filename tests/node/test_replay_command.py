@@ -16,6 +16,7 @@ from quadid_node.store import Store
 from quadid_replay import write_mcap
 from quadid_replay.mcap_records import McapFile
 
+from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
 
@@ -122,3 +123,29 @@ def test_history_shows_what_was_stored(
     missing = run("history", "--vehicle", "pelican", "--history", str(tmp_path / "none"))
     assert missing.code == 2
     assert "no history" in missing.err
+
+
+def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(
+    tmp_path: Path, run: Callable[..., Ran]
+) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "quad1")
+    store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann"))
+    store.close()
+    told = run("history", "--vehicle", "quad1", "--history", str(path), "--json", "-")
+    assert [s["sequence"] for s in json.loads(told.out)["sets"]] == [1]
+    unknown = run("history", "--vehicle", "quad7", "--history", str(path))
+    assert unknown.code == 2
+    assert "quad1" in unknown.err
+    where = ("--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path))
+    done = run("export", *where, "--id", "quad1", "--json", "-")
+    assert done.code == 0, done.err
+    (file,) = json.loads(done.out)["files"]
+    exported = Vehicle.from_yaml(Path(file).read_text(encoding="utf-8"))
+    assert exported.parameters["b"].initial == pytest.approx(TRUE["b"], rel=1e-6)
+    assert exported.parameters["b"].sigma is not None
+    assert "set 1 of quad1" in Path(file).read_text(encoding="utf-8")
+    other = run("export", *where)
+    assert other.code == 2
+    assert "one of: quad1" in other.err
+    assert "--history" in run("export", "--vehicle", "pelican", "--id", "quad1").err

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_node.codec import set_from_dict, set_to_dict
-from quadid_node.store import Store, StoreError, read_history
+from quadid_node.store import Store
+from quadid_node.store_file import StoreError, connect, read_history
 
 from quadid.online.records import Diagnosed, Event, OnlineFinding, SetState
 from tests.faults.evidence import Happened
@@ -132,21 +133,21 @@ def test_a_full_disk_is_told_and_later_forgotten(tmp_path: Path, monkeypatch: py
 
     store = filled(tmp_path / "h.sqlite")
     time.sleep(0.3)
-    real = storing._connect
+    real = connect
 
     def full(path: Path, read_only: bool = False) -> sqlite3.Connection:
         db = real(path, read_only)
         db.execute("PRAGMA max_page_count = 1")  # SQLite's own "database or disk is full"
         return db
 
-    monkeypatch.setattr(storing, "_connect", full)
+    monkeypatch.setattr(storing, "connect", full)
     for k in range(50):
         store.event(Event(float(k), "info", "test", "x" * 4000))
     deadline = time.monotonic() + 5.0
     while not store.problem and time.monotonic() < deadline:
         time.sleep(0.02)
     assert "full" in store.problem
-    monkeypatch.setattr(storing, "_connect", real)
+    monkeypatch.setattr(storing, "connect", real)
     store.event(Event(99.0, "info", "test", "room again"))
     store.close(seconds=5.0)
     assert store.problem == ""

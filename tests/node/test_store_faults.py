@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 from quadid_node.service import Output, Service
-from quadid_node.store import Store, read_history
+from quadid_node.store import Store
+from quadid_node.store_file import read_history
 from quadid_node.worker import InlineWorker
 
 from quadid.online import SessionSettings, SetState

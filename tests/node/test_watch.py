@@ -46,9 +46,9 @@ def test_quadid_watch_shows_the_fleet_and_carries_commands(net: Net) -> None:
         with quadid(*where, "--json", "-") as once:
             assert once.child.wait(60) == 0
         assert json.loads(once.text)["vehicles"]["quad1"]["parameters"]["sequence"] == 2
-        with quadid(*where, "--approve", "quad1") as approve:
+        with quadid(*where, "--approve", "quad1", "--json", "-") as approve:
             assert approve.child.wait(60) == 0, approve.text
-        assert "approved, in force as set" in approve.text
+        assert "approved, in force as set" in json.loads(approve.text)["text"]
         with quadid(*where, "--rollback", "quad9") as nobody:
             assert nobody.child.wait(60) == 3
         assert "no answer from 'quad9'" in nobody.text

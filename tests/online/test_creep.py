@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from quadid_node.store import read_history
+from quadid_node.store_file import read_history
 
 from quadid.online import SetState
 from quadid.parameters import NOMINAL_NAMES

@@ -25,7 +25,8 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from quadid_node.service import Output, Service
-from quadid_node.store import Store, read_history
+from quadid_node.store import Store
+from quadid_node.store_file import read_history
 from quadid_node.worker import Trouble
 
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState

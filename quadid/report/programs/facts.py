@@ -40,11 +40,11 @@ class Facts:
         return float(self.vehicle.effects.get(name, {}).get(key, 0.0))
 
     def origin(self, name: str) -> str:
-        """Says whether a nominal parameter came from data."""
+        """Says whether a nominal parameter came from data, or from whoever stated its uncertainty in the file."""
         prior = self.vehicle.parameters[name]
         if prior.sigma is None:
             return "not from data: the guess of the vehicle file"
-        return f"fitted, 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
+        return f"fitted, or given with its uncertainty: 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
 
     @cached_property
     def arms(self) -> FloatArray:
