@@ -136,6 +136,33 @@ soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, 
 chaos: $(MESSAGES) ## random faults at the running service for 20 min, into docs/results/chaos.md
 	$(STUDY) studies.chaos --minutes 20 --out docs/results
 
+# What holds quadid/: the node's tests are waited for by clocks, and bring little to it.
+COVERED_BY := $(filter-out tests/node tests/ros tests/fuzz tests/browser tests/packaging tests/examples tests/docs,$(patsubst %/,%,$(wildcard tests/*/)))
+
+.PHONY: coverage mutation audit pins
+coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into docs/results/coverage.md (20 min)
+	$(BIN)/coverage erase
+	OPENBLAS_NUM_THREADS=1 $(BIN)/coverage run -m pytest -q -n 2 --dist loadgroup -m "not browser and not slow" $(COVERED_BY)
+	$(BIN)/coverage combine --quiet
+	$(STUDY) studies.coverage --out docs/results
+
+QUALITY := $(VENV)/.stamp-quality
+$(QUALITY): pyproject.toml $(DEV)
+	$(PIP) install --editable ".[quality]"
+	@touch $@
+
+mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line: which tests notice? into docs/results/mutation.md
+	OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run --max-children 2
+	$(STUDY) studies.mutation --out docs/results
+
+audit: $(QUALITY) ## known holes in what the container installs; fails where the advisories cannot be reached
+	$(BIN)/pip-audit --requirement docker/requirements.txt --require-hashes --disable-pip --progress-spinner off --timeout 20
+
+pins: $(QUALITY) ## exact versions with hashes of what the container installs, into docker/requirements.txt
+	$(BIN)/uv pip compile --quiet --no-config --upgrade --generate-hashes --python-version 3.12 \
+		--python-platform x86_64-unknown-linux-gnu --no-emit-index-url --no-emit-find-links \
+		--custom-compile-command "make pins" --output-file docker/requirements.txt pyproject.toml docker/build.in
+
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow
 
@@ -170,5 +197,5 @@ docs: $(DOCS) ## the documentation as pages in site/, every link checked
 
 .PHONY: clean
 clean: ## remove the environment, caches and what commands wrote
-	rm -rf $(VENV) build install log dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo-out reproduce-out
+	rm -rf $(VENV) build install log dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo-out reproduce-out mutants
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -26,6 +26,7 @@ from studies.chaos.faults import FAULTS, Scene
 from studies.chaos.page import page
 from studies.chaos.running import Running
 from studies.chaos.vehicle import Vehicle
+from studies.judged import judged
 
 KEY = bytes(range(32))
 Entry = dict[str, Any]
@@ -63,7 +64,8 @@ def main() -> None:
     wrong, sets = judge(vehicle.told, truth, service.rows)
     command = f"python -m studies.chaos --minutes {given.minutes:g} --seed {given.seed}"
     given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "chaos.md").write_text(page(command, minutes, entries, service.crashes, wrong, sets))
+    where = given.out / "chaos.md"
+    where.write_text(page(command, minutes, entries, service.crashes, wrong, sets) + judged(where))
     _say(f"{len(entries)} faults, {len(service.crashes)} crashes, {len(wrong)} wrong publications")
     sys.exit(bool(service.crashes or wrong))
 

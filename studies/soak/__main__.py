@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 from benchmarks.online.__main__ import machine
+from studies.judged import judged
 from studies.soak import accelerated, live
 from studies.soak.page import page
 
@@ -50,7 +51,8 @@ def main() -> None:
         results = json.loads(file.read_text()) if file.exists() else {}
         results[name] = result
         file.write_text(json.dumps(results, indent=1) + "\n")
-        (given.out / "soak.md").write_text(page(results))
+        where = given.out / "soak.md"
+        where.write_text(page(results) + judged(where))
 
 
 if __name__ == "__main__":

@@ -14,17 +14,16 @@ from quadid_node.store import Store
 from quadid_node.worker import InlineWorker, Trouble
 
 from benchmarks.online.accuracy import PELICAN, flown
-from benchmarks.online.driving import samples
 from benchmarks.online.memory import resident
 from quadid.online import Publish, SessionSettings
 from quadid.online.answering import Reply
-from quadid.window import Sample
+from quadid.window import Block, Recording
 from studies.soak import memory
 
 FLIGHT, GROUND = 120.0, 5.0
 """A flight of so long [s] over and over, with a pause of so long between two."""
-STEP_EVERY = 50
-"""Samples between two looks at the session."""
+BATCH = 0.4
+"""Time between two looks at the session [s]: 20 messages at 50 Hz, as far as the node lets a topic run ahead."""
 
 
 class TimedWorker(InlineWorker):
@@ -68,7 +67,7 @@ def day(
     Returns:
         One entry an hour of flight: memory, files, time a sample and a fit, samples sent, taken and dropped.
     """
-    flight = list(samples(flown(FLIGHT, 3).recording))
+    flight = batches(flown(FLIGHT, 3).recording)
     begin, points = time.monotonic(), []
     with tempfile.TemporaryDirectory() as folder:
         worker = TimedWorker()
@@ -99,11 +98,28 @@ def day(
     }
 
 
+def batches(recording: Recording) -> list[tuple[Block, ...]]:
+    """The recording as the node takes messages in: `BATCH` seconds of one channel, then of the next one."""
+    channels = recording.channels
+    begin, end = min(c.t[0] for c in channels.values()), max(c.t[-1] for c in channels.values())
+    edges = np.arange(begin, end + BATCH, BATCH)
+    places = {name: np.searchsorted(c.t, [*edges, np.inf]) for name, c in channels.items()}
+    made = (
+        tuple(
+            Block(c.t[p[k] : p[k + 1]], ((name, c.values[p[k] : p[k + 1]]),))
+            for (name, c), p in zip(channels.items(), places.values(), strict=True) if p[k + 1] > p[k]
+        )
+        for k in range(len(edges))
+    )  # fmt: skip
+    return [batch for batch in made if batch]
+
+
 class _Tally:
     """Flies, and counts since the last point."""
 
-    def __init__(self, service: Service, worker: TimedWorker, flight: list[Sample]) -> None:
+    def __init__(self, service: Service, worker: TimedWorker, flight: list[tuple[Block, ...]]) -> None:
         self._service, self._worker, self._flight = service, worker, flight
+        self._size = sum(len(block.t) * len(block.columns) for batch in flight for block in batch)
         self._sent = self._published = 0
         self._sent_before = self._fits_before = 0
         self._own = self._fits_spent = 0.0
@@ -112,13 +128,13 @@ class _Tally:
         """One flight, `shift` [s] later than the recording."""
         service, spent = self._service, self._worker.spent
         begin = time.thread_time()
-        for k, sample in enumerate(self._flight):
-            service.push(Sample(sample.t + shift, sample.channel, sample.values))
-            if k % STEP_EVERY == 0:
+        for batch in self._flight:
+            for block in batch:
+                service.push_block(Block(block.t + shift, block.columns))
+            self._note(service.step())
+            while service.session.running is not None:
                 self._note(service.step())
-                while service.session.running is not None:
-                    self._note(service.step())
-        self._sent += len(self._flight)
+        self._sent += self._size
         self._own += time.thread_time() - begin - (self._worker.spent - spent)
 
     def _note(self, outputs: list[Any]) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +38,26 @@ def test_everything_copied_exists_and_passes_the_ignore_file(dockerfile: str, re
 
 
 def test_the_packages_of_the_wheel_are_all_copied(dockerfile: str, repository: Path) -> None:
-    import tomllib
-
     project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
     for package in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         folder = package.split("/")[0]
         assert f"COPY {folder} src/{folder}" in dockerfile
+
+
+def test_everything_of_the_package_index_is_pinned_with_hashes(dockerfile: str, repository: Path) -> None:
+    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
+    wanted = [Requirement(line) for line in (*project["project"]["dependencies"], *project["build-system"]["requires"])]
+    text = (repository / "docker" / "requirements.txt").read_text(encoding="utf-8").replace("\\\n", " ")
+    pinned = dict(re.findall(r"^([\w.-]+)==(\S+) .*--hash=sha256:[0-9a-f]{64}", text, re.MULTILINE))
+    assert len(pinned) == len(re.findall(r"^\w", text, re.MULTILINE)), "a line without version or hash"
+    for requirement in wanted:
+        version = pinned.get(canonicalize_name(requirement.name))
+        assert version, f"{requirement.name} is not in docker/requirements.txt: make pins"
+        assert requirement.specifier.contains(version), f"{requirement} against {version}: make pins"
+    assert "//" not in text.replace("# ", ""), "no address of a package host belongs there"
+    installs = re.findall(r"pip install[^&]+", dockerfile)
+    assert installs
+    assert all("--require-hashes" in i or "--no-index" in i for i in installs)
 
 
 def test_the_last_user_is_not_root(dockerfile: str) -> None:
