@@ -35,7 +35,7 @@ def parts(given: argparse.Namespace) -> dict[str, Callable[[], Any]]:
             "hover": load.under_load(given.load_seconds, "hover"),
             "recording": load.under_load(given.load_seconds, "excited", record=True),
         },
-        "costs": lambda: {"bare": load.bare(given.load_seconds), "own": own_code(20.0)},
+        "costs": lambda: {**{w: load.bare(given.load_seconds, w) for w in load.WAYS}, "own": own_code(20.0)},
         "memory": lambda: memory.day(given.hours, given.refit, progress=True),
     }
 

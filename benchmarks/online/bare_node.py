@@ -1,27 +1,57 @@
-"""A node that takes the same messages and does nothing with them: what executor and middleware cost by themselves."""
+"""A node that takes the same messages and does nothing with them: what executor and middleware cost by themselves.
+
+``woken``: a callback for each message; ``polled``: taken every 50 ms, as the node itself does.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import rclpy
 from quadid_node.convert import message_class
-from quadid_node.node import SENSOR_QOS
+from quadid_node.node import SENSOR_QOS, STEP_SECONDS
 from quadid_node.presets import source
 from quadid_node.stopping import Stop
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+
+
+class BareNode(Node):
+    """Listens to what `identify` listens to."""
+
+    def __init__(self, polled: bool) -> None:
+        super().__init__("bare")
+        self._polled: list[Subscription[Any]] = []
+        for entry in source("canonical").inputs:
+            kind = message_class(entry.type)
+            one = self.create_subscription(kind, entry.topic, lambda data: None, SENSOR_QOS, raw=True)
+            if polled:
+                self._polled.append(one)
+        if polled:
+            self.create_timer(STEP_SECONDS, self._empty)
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription[Any]]:
+        """What the executor waits for."""
+        return (s for s in super().subscriptions if s not in self._polled)
+
+    def _empty(self) -> None:
+        for one in self._polled:
+            with one.handle:
+                while one.handle.take_message(one.msg_type, True) is not None:
+                    pass
 
 
 def main() -> int:
     """Listens until a signal comes."""
     stop = Stop()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("bare")
-    for entry in source("canonical").inputs:
-        node.create_subscription(message_class(entry.type), entry.topic, lambda data: None, SENSOR_QOS, raw=True)
+    node = BareNode(sys.argv[1] == "polled")
     executor = EventsExecutor()
     executor.add_node(node)
     print("ready", flush=True)

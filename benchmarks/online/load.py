@@ -17,6 +17,8 @@ import numpy as np
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
 START_LIMIT = 240.0
+WAYS = ("woken", "polled")
+"""How a node gets its messages: a callback for each, or all that wait every 50 ms."""
 SETTLE = 2.0
 """Time after the first message before anything counts [s]."""
 
@@ -77,13 +79,13 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
             "imu_received": (len(noted["idle"]) + len(noted["fitting"])) / (seconds * 1000.0)}  # fmt: skip
 
 
-def bare(seconds: float) -> dict[str, float]:
-    """A node that takes the same messages and does nothing with them: its share of a core."""
+def bare(seconds: float, way: str) -> dict[str, float]:
+    """A node that takes the same messages and does nothing with them: its share of a core; see `bare_node`."""
     environment = {
         **os.environ, "PYTHONUNBUFFERED": "1", "AMENT_PREFIX_PATH": sys.prefix,
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }  # fmt: skip
-    node = _start(["benchmarks.online.bare_node"], environment)
+    node = _start(["benchmarks.online.bare_node", way], environment)
     try:
         _wait_for(node, "ready")
         feeder = _start(["benchmarks.online.feeder", str(seconds), "excited"], environment)

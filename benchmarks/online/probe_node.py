@@ -1,4 +1,4 @@
-"""The node itself, watched: how late each IMU callback began and whether a fit ran, how long each step took."""
+"""The node itself, watched: how late each IMU message was taken and whether a fit ran, how long each step took."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import quadid_node.node
-from quadid_node.convert import Decoder
 from quadid_node.identify import main
 from quadid_node.presets import Input
+from rclpy.subscription import Subscription
 
 OUT = "QUADID_PROBE_OUT"
 _LAST_DOUBLE = struct.Struct("<d")
@@ -28,19 +28,20 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.idle, self.fitting, self.steps = array("d"), array("d"), array("d")
 
-    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
-        take = super()._listener(entry, topic, decoder)
+    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
+        take = super()._taker(entry, subscription)
         if entry.topic != "imu":
             return take
 
-        def note(data: bytes) -> None:
-            begin = time.time()
-            take(data)
-            (published,) = _LAST_DOUBLE.unpack_from(data, len(data) - 8)
-            busy = self._service is not None and self._service.session.running is not None
-            (self.fitting if busy else self.idle).append(begin - published)
+        def noted() -> bytes | None:
+            data = take()
+            if data is not None:
+                (published,) = _LAST_DOUBLE.unpack_from(data, len(data) - 8)
+                busy = self._service is not None and self._service.session.running is not None
+                (self.fitting if busy else self.idle).append(time.time() - published)
+            return data
 
-        return note
+        return noted
 
     def _step(self) -> None:
         begin = time.time()

@@ -120,7 +120,7 @@ class Buffer:
         if name == "attitude" and (values := _unit(values)) == ():
             self.faults["attitude: not a unit quaternion"] += 1
             return
-        t = self.time.time(sample.t)
+        t = self.time.time(sample.t, name)
         if t is None:
             self.faults[f"{name}: unconfirmed time"] += 1
             return
@@ -159,13 +159,13 @@ class Buffer:
                 return None
             if name == "attitude" and not (np.abs(np.sqrt(np.sum(values * values, axis=1)) - 1.0) < 0.9e-3).all():
                 return None
-        return self.time.plain(block.t)
+        return self.time.plain(block.t, [name for name, _ in block.columns])
 
     def _extend(self, block: Block, t: FloatArray, start: int, stop: int) -> None:
         """Takes messages that are plain and settle nothing."""
         times = t[start:stop]
         newest = float(times.max())
-        self.time.newest = max(self.time.newest, newest)
+        self.time.note(newest, [name for name, _ in block.columns])
         for name, values in block.columns:
             self._lines[name].extend(times, values[start:stop])
             self.counts[name] += len(times)

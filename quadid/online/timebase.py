@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 STEP_BACK = 1.0
-"""A stamp this far [s] before the newest one means a reboot or a clock step."""
+"""A stamp this far [s] before the newest one of its channel means a reboot or a clock step; one that is only behind
+other channels is late."""
 STEP_AHEAD = 30.0
 """A stamp this far [s] after the newest one is suspect until others confirm it."""
 CONFIRMATIONS = 3
@@ -37,42 +39,54 @@ class TimeBase:
         self.wild = 0
         self._shift = 0.0
         self._suspects: list[float] = []
+        self._newest_of: dict[str, float] = {}
 
     def stamp(self, t: float) -> float:
         """The stamp that belongs to session time `t` in the present time base."""
         return t - self._shift
 
-    def time(self, stamp: float) -> float | None:
-        """Session time of a stamp; None for one that is refused or waits for confirmation."""
+    def time(self, stamp: float, channel: str) -> float | None:
+        """Session time of a channel's stamp; None for one that is refused or waits for confirmation."""
         if not abs(stamp) <= LARGEST:
             self.wild += 1
             return None
         if self.newest == -math.inf:
             self._shift = -math.floor(stamp / DAY) * DAY
-            self.newest = stamp + self._shift
+            self.note(stamp + self._shift, (channel,))
             return self.newest
         t = stamp + self._shift
-        if self.newest - STEP_BACK < t < self.newest + STEP_AHEAD:
+        if self._earliest(channel) < t < self.newest + STEP_AHEAD:
             if self._suspects:
                 self.wild += len(self._suspects)
                 self._suspects.clear()
-            if t > self.newest:
-                self.newest = t
+            self.note(t, (channel,))
             return t
-        return self._suspect(stamp)
+        return self._suspect(stamp, channel)
 
-    def plain(self, stamps: FloatArray) -> FloatArray | None:
+    def note(self, newest: float, channels: Iterable[str]) -> None:
+        """Takes note of a session time [s] that these channels have reached."""
+        self.newest = max(self.newest, newest)
+        for channel in channels:
+            self._newest_of[channel] = max(newest, self._newest_of.get(channel, -math.inf))
+
+    def plain(self, stamps: FloatArray, channels: Iterable[str]) -> FloatArray | None:
         """Session times of stamps, shape (n,), where every one simply follows; None where `time` must look at each.
 
-        `newest` is left as it is.
+        Nothing is noted.
         """
         if self.newest == -math.inf or self._suspects or not (np.abs(stamps) <= LARGEST).all():
             return None
         t = stamps + self._shift
         low, high = float(t.min()), float(t.max())
-        return t if max(self.newest, high) - STEP_BACK < low and high < self.newest + STEP_AHEAD else None
+        earliest = max([high - STEP_BACK, *(self._earliest(channel) for channel in channels)])
+        return t if earliest < low and high < self.newest + STEP_AHEAD else None
 
-    def _suspect(self, stamp: float) -> float | None:
+    def _earliest(self, channel: str) -> float:
+        """Session time after which a stamp of a channel is no step back."""
+        known = self._newest_of.get(channel)
+        return self.newest - STEP_AHEAD if known is None else known - STEP_BACK
+
+    def _suspect(self, stamp: float, channel: str) -> float | None:
         """Collects stamps of a possible new time base and moves to it when enough agree."""
         if self._suspects and abs(stamp - self._suspects[-1]) > STEP_BACK:
             self.wild += len(self._suspects)
@@ -83,6 +97,9 @@ class TimeBase:
         start = self.newest + PAUSE
         self._shift = start - min(self._suspects)
         self.steps.append(start)
-        self.newest = stamp + self._shift
         self._suspects.clear()
-        return self.newest
+        self._newest_of.clear()
+        self.newest = start
+        t = stamp + self._shift
+        self.note(t, (channel,))
+        return t

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 from quadid.online.answering import Request, answer
 from quadid_node.parcel import ParcelError, pack, unpack
-from quadid_node.zenoh_link import ROOT, ZenohError, open_session
+from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
 
 WORK = f"{ROOT}/*/work/fit"
 ALIVE = f"{ROOT}/worker/*/alive"
@@ -43,6 +43,7 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
     Raises:
         ZenohError: a configuration that is none.
     """
+    config_of(where)
     done, session = Done(), _connected(where, stop, told)
     if session is None:
         return done
@@ -81,8 +82,6 @@ def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]
         try:
             return open_session(where)
         except ZenohError as error:
-            if "configuration" in str(error):
-                raise
             if str(error) != said:
                 said = str(error)
                 told(f"{said}; trying again")

@@ -1,23 +1,34 @@
-"""Messages wait here, topic by topic, until the service next looks: many of a kind are read for little more than one.
+"""Messages are taken from the middleware many at a time, topic by topic, whenever the service looks for them.
 
-A subscription's callback only appends the serialized message to a list, so that no message waits for the work on
-another one.
+Nobody is woken for a message: each carries its own time, and the rows of the grid wait half a second for the slowest
+channel anyway.  Many of a kind are read for little more than one.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import NamedTuple
 
 from quadid.window import Block, Sample
 from quadid_node.convert import Decoder
 from quadid_node.presets import Input
 
 Record = Callable[[str, str, bytes], None]
-Waiting = tuple[Input, Decoder, list[bytes]]
 
-MOST = 20
-"""Messages of one topic that are taken in before those of the others: when a busy machine has let seconds of them pile
-up, no topic runs far ahead, which would look as if the clock had stepped back."""
+SLICE = 0.2
+"""When longer than this [s] nobody looked, the messages of that time are taken in by slices of this length, so that no
+topic runs far ahead of the others, which would then come too late."""
+DEPTH = 4000
+"""Messages of a topic that are kept for the next look, and the most that one look takes."""
+
+
+class _Topic(NamedTuple):
+    entry: Input
+    decoder: Decoder
+    take: Callable[[], bytes | None]
 
 
 class Intake:
@@ -27,37 +38,40 @@ class Intake:
         decoders: by topic name as resolved.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Takes a clock that never steps [s]."""
         self.decoders: dict[str, Decoder] = {}
-        self._topics: list[Waiting] = []
-        self._full: list[Waiting] = []
+        self._topics: list[_Topic] = []
+        self._clock, self._looked = clock, clock()
 
-    def open(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
-        """Adds a topic; returns what takes its messages."""
-        waiting: list[bytes] = []
+    def open(self, entry: Input, topic: str, decoder: Decoder, take: Callable[[], bytes | None]) -> None:
+        """Adds a topic.
+
+        Args:
+            entry: topic, type, channels with ranks.
+            topic: its name as resolved.
+            decoder: of its messages.
+            take: gives the next serialized message that waits; None when there is none.
+        """
         self.decoders[topic] = decoder
-        self._topics.append((entry, decoder, waiting))
+        self._topics.append(_Topic(entry, decoder, take))
         # The gyro sets the pace of the grid: what came with it has been taken in before it.
-        self._topics.sort(key=lambda item: any(channel == "gyro" for channel, _ in item[0].channels))
-
-        def keep(data: bytes) -> None:
-            if len(waiting) >= MOST:
-                self._set_aside()
-            waiting.append(data)
-
-        return keep
+        self._topics.sort(key=lambda item: any(channel == "gyro" for channel, _ in item.entry.channels))
 
     def take(self, record: Record | None = None) -> Iterator[Sample | Block]:
-        """Empties the lists, at most `MOST` messages of each topic at a time.
+        """Takes all messages that wait.
 
         Args:
             record: writes a message down (topic, type, bytes), in the order in which they are taken in.
         """
-        for entry, decoder, messages in self._emptied():
-            if record is not None:
-                for data in messages:
-                    record(entry.topic, entry.type.replace("/", "/msg/"), data)
-            yield from decoder.take(messages)
+        slices, waiting = self._emptied()
+        for k in range(slices):
+            for (entry, decoder, _), messages in zip(self._topics, waiting, strict=True):
+                piece = messages[k * len(messages) // slices : (k + 1) * len(messages) // slices]
+                if record is not None:
+                    for data in piece:
+                        record(entry.topic, entry.type.replace("/", "/msg/"), data)
+                yield from decoder.take(piece)
 
     def drop(self) -> None:
         """Forgets what waits."""
@@ -66,16 +80,10 @@ class Intake:
     def clear(self) -> None:
         """Forgets the topics as well."""
         self._topics.clear()
-        self._full.clear()
         self.decoders.clear()
 
-    def _set_aside(self) -> None:
-        """What waits is taken in before anything that comes later."""
-        self._full += [(entry, decoder, waiting.copy()) for entry, decoder, waiting in self._topics if waiting]
-        for _, _, waiting in self._topics:
-            waiting.clear()
-
-    def _emptied(self) -> list[Waiting]:
-        self._set_aside()
-        full, self._full = self._full, []
-        return full
+    def _emptied(self) -> tuple[int, list[list[bytes]]]:
+        """How many slices of time passed since the last look, and the messages of each topic."""
+        before, self._looked = self._looked, self._clock()
+        waiting = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
+        return max(1, math.ceil((self._looked - before) / SLICE)), waiting

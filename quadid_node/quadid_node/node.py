@@ -6,16 +6,17 @@ Callbacks convert, call and publish; everything else is in `service` and in the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
@@ -25,9 +26,9 @@ from quadid.window import Block
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
-from quadid_node.intake import Intake
+from quadid_node.intake import DEPTH, Intake
 from quadid_node.neighbours import Neighbours
-from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, read_vehicle, vehicle_id
+from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
 from quadid_node.presets import Input, Source, source
 from quadid_node.recorder import Beginning, Recorder
 from quadid_node.service import Output, Service
@@ -36,13 +37,12 @@ from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker, with_ground
 
 STEP_SECONDS = 0.05
-AT_ONCE, CATCHING_UP = 1, 4
-"""Pieces of the session's work in one step: messages wait no longer than one takes, unless there is a backlog,"""
-BACKLOG = 2.0
-"""... which is this much data [s]."""
+"""Messages are taken from the middleware this often [s]: waking for each would cost twice the processor time."""
+AT_ONCE, CATCHING_UP, BACKLOG = 1, 4, 2.0
+"""Pieces of the session's work in one step, and when there is a backlog, which is this much data [s]."""
 WARM_UP_SECONDS = 8.0
 """How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
-SENSOR_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -55,10 +55,11 @@ class IdentifyNode(LifecycleNode):
         Args:
             stopping: says that the process is asked to end, so that nothing is waited for any more.
         """
+        self._polled: list[Subscription[Any]] = []
         super().__init__("quadid")
         self._stopping = stopping
         for p in PARAMETERS:
-            self.declare_parameter(p.name, p.default, _descriptor(p.default, p.description, p.span))
+            self.declare_parameter(p.name, p.default, descriptor(p))
         self.add_on_set_parameters_callback(self._on_set)
         self._service: Service | None = None
         self._recorder: Recorder | None = None
@@ -147,16 +148,29 @@ class IdentifyNode(LifecycleNode):
                 matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
             )
             subscription = self.create_subscription(
-                message_class(entry.type), entry.topic, self._listener(entry, topic, decoder), SENSOR_QOS,
-                event_callbacks=events, raw=True,
-            )  # fmt: skip
-            self._open.append((self.destroy_subscription, subscription))
+                message_class(entry.type), entry.topic, _never, SENSOR_QOS, event_callbacks=events, raw=True
+            )
+            self._polled.append(subscription)
+            self._intake.open(entry, topic, decoder, self._taker(entry, subscription))
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription[Any]]:
+        """What the executor waits for: not the topics of the vehicle, whose messages are taken at each step."""
+        return (s for s in super().subscriptions if s not in self._polled)
+
+    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
+        """What takes the next message that waits from the middleware."""
+        handle, kind = subscription.handle, subscription.msg_type
+
+        def take() -> bytes | None:
+            with handle:
+                taken = handle.take_message(kind, True)
+            return None if taken is None else taken[0]
+
+        return take
 
     def _types_on(self, topic: str) -> list[str]:
         return [info.topic_type for info in self.get_publishers_info_by_topic(topic)]
-
-    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
-        return self._intake.open(entry, topic, decoder)
 
     def _offer(self) -> None:
         self._speaker = Speaker(self, self._observer, self._neighbours.deaf)
@@ -169,13 +183,16 @@ class IdentifyNode(LifecycleNode):
 
     def _tear_down(self) -> None:
         self._active = False
+        self._intake.clear()
+        for subscription in self._polled:
+            self.destroy_subscription(subscription)
+        self._polled.clear()
         for destroy, item in reversed(self._open):
             destroy(item)
         self._open.clear()
         if self._speaker is not None:
             self._speaker.close()
             self._speaker = None
-        self._intake.clear()
         if self._service is not None:
             self._service.close()
             self._service = None
@@ -278,10 +295,5 @@ class IdentifyNode(LifecycleNode):
         return response
 
 
-def _descriptor(default: Any, description: str, span: tuple[float, float] | None) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=description)
-    if span is not None and isinstance(default, float):
-        descriptor.floating_point_range = [FloatingPointRange(from_value=span[0], to_value=span[1], step=0.0)]
-    elif span is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(span[0]), to_value=int(span[1]), step=0)]
-    return descriptor
+def _never(message: bytes) -> None:
+    """Stands where rclpy wants a callback; messages are taken by `Intake`."""

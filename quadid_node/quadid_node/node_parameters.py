@@ -93,3 +93,16 @@ def check_change(name: str, value: Any) -> str:
     except QuadidError as error:
         return str(error)
     return ""
+
+
+def descriptor(parameter: NodeParameter) -> Any:
+    """A parameter's description and range as a ROS message."""
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor  # this module needs no ROS
+
+    out = ParameterDescriptor(description=parameter.description)
+    if parameter.span is not None and isinstance(parameter.default, float):
+        out.floating_point_range = [FloatingPointRange(from_value=parameter.span[0], to_value=parameter.span[1])]
+    elif parameter.span is not None:
+        low, high = (int(end) for end in parameter.span)
+        out.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    return out

@@ -1,4 +1,4 @@
-"""The node itself, with a count of what its callbacks take in and how late they are, a line a minute."""
+"""The node itself, with a count of the messages it takes and how late it does, a line a minute."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import quadid_node.node
-from quadid_node.convert import Decoder
 from quadid_node.identify import main
 from quadid_node.presets import Input
+from rclpy.subscription import Subscription
 
 from studies.soak import memory
 
@@ -32,15 +32,16 @@ class CountingNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
 
-    def _listener(self, entry: Input, topic: str, decoder: Decoder) -> Callable[[bytes], None]:
-        take = super()._listener(entry, topic, decoder)
+    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
+        take = super()._taker(entry, subscription)
 
-        def counted(data: bytes) -> None:
-            begin = time.time()
-            take(data)
-            self.counted[entry.topic] += 1
-            if entry.topic == "imu":
-                self.late.append(begin - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
+        def counted() -> bytes | None:
+            data = take()
+            if data is not None:
+                self.counted[entry.topic] += 1
+                if entry.topic == "imu":
+                    self.late.append(time.time() - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
+            return data
 
         return counted
 

@@ -12,16 +12,16 @@ from quadid.online.timebase import CONFIRMATIONS, TimeBase
 
 def test_a_single_wild_stamp_moves_nothing() -> None:
     clock = TimeBase()
-    assert clock.time(1.7e9) == 1.7e9 % 86400
-    assert clock.time(9e12) is None
-    assert clock.time(1.7e9 + 0.01) is not None
+    assert clock.time(1.7e9, "gyro") == 1.7e9 % 86400
+    assert clock.time(9e12, "gyro") is None
+    assert clock.time(1.7e9 + 0.01, "gyro") is not None
     assert (clock.wild, clock.steps) == (1, [])
 
 
 def test_a_reboot_begins_a_new_stretch_after_the_old_one() -> None:
     clock = TimeBase()
-    clock.time(500.0)
-    times = [clock.time(0.1 * k) for k in range(10)]
+    clock.time(500.0, "gyro")
+    times = [clock.time(0.1 * k, "gyro") for k in range(10)]
     assert times[:CONFIRMATIONS] == [None] * CONFIRMATIONS
     later = [t for t in times if t is not None]
     assert len(clock.steps) == 1
@@ -31,11 +31,21 @@ def test_a_reboot_begins_a_new_stretch_after_the_old_one() -> None:
     assert math.isclose(clock.stamp(last), 0.9, abs_tol=1e-9)
 
 
+def test_a_channel_that_comes_late_is_late_and_no_reboot() -> None:
+    clock = TimeBase()
+    for k in range(100):
+        assert clock.time(500.0 + 0.1 * k, "gyro") is not None
+        t = clock.time(500.0 + 0.1 * (k - 40), "velocity")
+        assert t is not None
+        assert math.isclose(clock.stamp(t), 500.0 + 0.1 * (k - 40), abs_tol=1e-9)
+    assert (clock.steps, clock.wild) == ([], 0)
+
+
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
 def test_any_stamps_give_finite_times_and_a_newest_that_never_falls(stamps: list[float]) -> None:
     clock, newest = TimeBase(), -math.inf
     for stamp in stamps:
-        t = clock.time(stamp)
+        t = clock.time(stamp, "gyro")
         assert t is None or math.isfinite(t)
         assert clock.newest >= newest
         newest = clock.newest
