@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from quadid.window import Recording
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "unknown": "dim"}
-_LONGEST = 120.0
-"""Excitation is computed from this much flight at most [s]."""
 
 
 def inspect(
@@ -90,20 +88,15 @@ def _part(recording: Recording, start: float | None, stop: float | None) -> Reco
 
 
 def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any], ...]:
-    """Expected relative standard deviation per parameter, from up to `_LONGEST` s of flight; none when refused."""
+    """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
     from quadid.errors import QuadidError
     from quadid.grid import to_windows
     from quadid.identify.excitation import excitation
     from quadid.parameters import NOMINAL_UNITS
+    from quadid_cli.loading import LONGEST, beginning
 
     try:
-        windows, seconds = [], 0.0
-        for window in to_windows(recording, vehicle):
-            rows = int((_LONGEST - seconds) / window.dt)
-            if rows < 50:
-                break
-            windows.append(window if len(window) <= rows else window.slice(0, rows))
-            seconds += len(windows[-1]) * window.dt
+        windows, _ = beginning(to_windows(recording, vehicle), LONGEST)
         found = excitation(windows, vehicle)
     except QuadidError:
         return ()  # the inspection itself says what is missing or too slow

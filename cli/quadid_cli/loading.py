@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
+LONGEST = 3600.0
+"""Excitation is computed from this much flight at most [s]."""
 _FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order")
 """Checks of units, frames and motors; what fails them would give numbers that look fine and mean nothing."""
 
@@ -141,6 +143,19 @@ def load_logs(
 ) -> list[Log]:  # fmt: skip
     """Opens several logs, see `load_log`."""
     return [load_log(text, vehicle, rate, start, stop, preset, unchecked) for text in texts]
+
+
+def beginning(windows: Iterable[Window], longest: float) -> tuple[list[Window], float]:
+    """The first `longest` seconds of windows, and how long they are [s]; rests of less than a second are left out."""
+    taken: list[Window] = []
+    seconds = 0.0
+    for window in windows:
+        rows = int((longest - seconds) / window.dt)
+        if rows < 1.0 / window.dt:
+            break
+        taken.append(window if len(window) <= rows else window.slice(0, rows))
+        seconds += len(taken[-1]) * window.dt
+    return taken, seconds
 
 
 def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from quadid_cli.diagnose import Diagnosed
     from quadid_cli.loading import Log
 
-_LONGEST = 120.0
-"""Excitation is computed from this much flight at most [s]."""
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
@@ -53,17 +51,12 @@ def identify_html(
 
 
 def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
-    """What the fitted logs can tell about each parameter, from `_LONGEST` s of them at most."""
+    """What the fitted logs can tell about each parameter, from `LONGEST` s of them at most."""
     from quadid.identify.excitation import excitation
     from quadid.report.excitation_part import excitation_part
+    from quadid_cli.loading import LONGEST, beginning
 
-    windows, seconds = [], 0.0
-    for window in (w for log in logs for w in log.windows):
-        rows = int((_LONGEST - seconds) / window.dt)
-        if rows < 2.0 / window.dt:
-            break
-        windows.append(window if len(window) <= rows else window.slice(0, rows))
-        seconds += len(windows[-1]) * window.dt
+    windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)
     return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
 
 

@@ -39,11 +39,9 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
     if named and verdict != "unknown":
         headline = f"Found: {', '.join(named)}. {headline}"
     v = result["validation"]
-    details = (
-        f"Error on data the fit did not see, in noise variances (1 is the noise floor): {_short(v['mse_nominal'])} "
-        f"without and {_short(v['mse_extended'])} with what was found.",
-    )
-    return Verdict(_LEVELS[verdict], headline, details, _next_steps(result))
+    error = f"Error on data the fit did not see, in noise variances (1 is the noise floor): {_short(v['mse_nominal'])}"
+    gained = f" without and {_short(v['mse_extended'])} with what was found" if result["findings"] else ""
+    return Verdict(_LEVELS[verdict], headline, (f"{error}{gained}.",), _next_steps(result))
 
 
 def chance(p_value: float) -> str:

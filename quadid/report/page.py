@@ -112,7 +112,9 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def fit(value: float | None) -> str:
     """A fit in per cent with one decimal; a dash for none."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.1f}\u00a0%".replace("-", "−")
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{round(value, 1) + 0.0:.1f}\u00a0%".replace("-", "−")  # + 0.0: no minus before a zero
 
 
 def code(text: str) -> Any:

@@ -17,7 +17,7 @@ from quadid.identify.score import ChannelScore, Series, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.diagnose_page import chance, diagnosis_part
 from quadid.report.identify_page import identify_page
-from quadid.report.page import code, number, packed, render
+from quadid.report.page import code, fit, number, packed, render
 from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"
@@ -237,6 +237,13 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
 )
 def test_numbers_for_people(value: float | None, text: str) -> None:
     assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(-0.04, "0.0\u00a0%"), (-3.0, "−3.0\u00a0%"), (97.16, "97.2\u00a0%"), (None, "–")]
+)
+def test_fit_in_per_cent(value: float | None, text: str) -> None:
+    assert fit(value) == text
 
 
 def test_code_between_backticks() -> None:
