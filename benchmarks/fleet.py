@@ -50,7 +50,7 @@ HEAD = (
 
 
 BUSY = (
-    "Other work was running: it lengthens the clock's time, so that a speed-up cannot be told, but hardly the\n"
+    "Other work was running: it lengthens the clock's time, so that a speed-up is not sure, but hardly the\n"
     "processor time: that of a log decides how many logs one more worker with a core of its own adds."
 )
 
@@ -100,7 +100,7 @@ def _cells(one: Run, first: Run, logs: int, idle: bool) -> list[str]:
     outcomes = ", ".join(f"{number} {status}" for status, number in one.outcomes.items())
     return [
         f"{one.workers}", f"{one.seconds:.0f}", f"{logs / one.seconds:.2f}",
-        f"{first.seconds / one.seconds:.2f}" if idle else "not told",
+        f"{first.seconds / one.seconds:.2f}{'' if idle or one is first else ', not sure'}",
         f"{one.worker_cpu / logs:.3f}", f"{one.parent_cpu / logs:.4f}", f"{one.parent_memory:.0f}",
         f"{one.worker_memory:.0f}", outcomes,
     ]  # fmt: skip

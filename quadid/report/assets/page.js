@@ -3,18 +3,24 @@
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const root = document.documentElement;
   const chosen = new Map();
-  const colour = (name) => getComputedStyle(root).getPropertyValue("--" + name).trim();
+  // Asked for once: to compute a style anew for every trace takes time. Forgotten when the page changes its dress.
+  const colours = new Map();
+  function colour(name) {
+    if (!colours.has(name)) colours.set(name, getComputedStyle(root).getPropertyValue("--" + name).trim());
+    return colours.get(name);
+  }
 
   // Long rows of numbers travel as 16 bit integers; see packed() in page.py.
   function unpacked(value) {
     if (Array.isArray(value)) return value.map(unpacked);
     if (value === null || typeof value !== "object") return value;
     if (typeof value.i2 === "string") {
-      const raw = atob(value.i2), bytes = new DataView(Uint8Array.from(raw, (c) => c.charCodeAt(0)).buffer);
-      return Array.from({ length: raw.length / 2 }, (_, i) => {
-        const n = bytes.getInt16(2 * i, true);
-        return n === -32768 ? null : value.low + value.step * (n + 32767);
-      });
+      const raw = atob(value.i2), out = new Array(raw.length / 2);
+      for (let i = 0; i < out.length; i++) {
+        const n = (raw.charCodeAt(2 * i) | raw.charCodeAt(2 * i + 1) << 8) << 16 >> 16; // with its sign
+        out[i] = n === -32768 ? null : value.low + value.step * (n + 32767);
+      }
+      return out;
     }
     return Object.fromEntries(Object.entries(value).map(([key, inner]) => [key, unpacked(inner)]));
   }
@@ -50,11 +56,11 @@
   const raised = (text) => text.replace(/\^(\d)/g, (_, digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[Number(digit)]);
 
   function layoutOf(view) {
-    const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), automargin: true, exponentformat: "power" };
+    const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), automargin: true, exponentformat: "power", ticklabeloverflow: "allow" };
     const layout = {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: colour("ink"), size: 12, family: getComputedStyle(document.body).fontFamily },
-      margin: { l: 60, r: 8, t: 8, b: 40 }, hovermode: "x unified", dragmode: "zoom",
+      margin: { l: 60, r: 20, t: 8, b: 40 }, hovermode: "x unified", dragmode: "zoom",
       hoverlabel: { bgcolor: colour("card"), font: { color: colour("ink") } },
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" },
     };
@@ -68,8 +74,8 @@
   }
 
   function draw(box) {
-    const figure = figures[box.dataset.figure] = unpacked(figures[box.dataset.figure]);
-    const view = figure.views[chosen.get(figure.id) || 0];
+    const figure = figures[box.dataset.figure], number = chosen.get(figure.id) || 0;
+    const view = figure.views[number] = unpacked(figure.views[number]);
     box.dataset.drawn = "yes";
     return Plotly.react(box, view.data.map((trace) => painted(trace, view)), layoutOf(view), { responsive: true, displaylogo: false, displayModeBar: false });
   }
@@ -112,6 +118,7 @@
   function dress() {
     const dark = own === null ? system.matches : own;
     root.classList.toggle("dark", dark);
+    colours.clear();
     root.style.colorScheme = dark ? "dark" : "light";
     redraw();
   }
@@ -125,6 +132,7 @@
     was = Array.from(document.querySelectorAll("details")).filter((d) => !d.open);
     was.forEach((d) => { d.open = true; });
     root.classList.remove("dark");
+    colours.clear();
     boxes().forEach(draw);
   });
   window.addEventListener("afterprint", () => { was.forEach((d) => { d.open = false; }); dress(); });
