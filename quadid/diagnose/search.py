@@ -30,7 +30,10 @@ MOST_CAUSES = 12
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
 ERRORS = 2.0
-"""A gain on unseen blocks must exceed this many of its standard errors, or be spread over most of them …"""
+"""A gain on unseen blocks must exceed this many of its standard errors, or be spread over most of them, or …"""
+BEYOND_DOUBT = 100.0
+"""… exceed one, the evidence on the fitted data being this chi-square or more: an effect that shows in a few manoeuvres
+only gains in few blocks, whose spread says little about chance …"""
 LEAST_SHARE = 0.004
 """… and `LEAST_GAIN`, and this share of the noise that no model can remove: less is of no use to anybody, and within
 what the time step of a simulation or of an autopilot's own filter can imitate."""
@@ -241,8 +244,9 @@ def _significant(gain: Gain, evidence: float, cause: Candidate, tests: int, cont
         RELATIVE_GAIN * context.earned,
         FAMILY_SHARE * context.families.get(cause.family, 0.0),
     )
+    errors = 1.0 if evidence > BEYOND_DOUBT else ERRORS
     return (
-        (gain.total > ERRORS * gain.error or gain.spread)
+        (gain.total > errors * gain.error or gain.spread)
         and gain.total > least
         and survival(evidence, len(cause.names)) * tests < FALSE_ALARM
     )

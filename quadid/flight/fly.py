@@ -14,7 +14,7 @@ from quadid.flight.march import CRASHED, march
 from quadid.flight.outside import apply_outside, check_outside
 from quadid.flight.outside_flight import Scene
 from quadid.flight.pilot import PILOT_STEP, Pilot
-from quadid.flight.profiles import Segment, scripted, stick_profile
+from quadid.flight.profiles import Segment, band_noise, scripted, stick_profile
 from quadid.flight.record import Flight, Flown, as_recording, true_states, write_window
 from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, prepare
@@ -26,7 +26,9 @@ FloatArray = NDArray[np.float64]
 LEAD_IN = 5.0
 """Flown before the first log row [s], so that filters, delays and integrals have settled."""
 LOW_FLIGHT = 3.0
-"""Below this height the pilot holds the altitude more firmly [m]."""
+"""Below this height the pilot holds the altitude more firmly [m], and on an excited flight rises and sinks."""
+HOPS, HOP_SIZE = (0.08, 0.3), 0.095
+"""Band [Hz] of that, and its collective per height [fraction of hover thrust, 1/m]: about a fifth of the height."""
 
 
 class FlightError(QuadidError):
@@ -73,6 +75,8 @@ def _sticks(profile: str, seed: int, plan: Plan, segments: Sequence[Segment] | N
         ramp = np.minimum(1.0, np.arange(total) / max(lead, 1))
         sticks[:, [0, 1, 3]] *= ramp[:, None]
     sticks[:, 3] *= min(1.0, altitude / LOW_FLIGHT)
+    if profile == "excited" and altitude < LOW_FLIGHT:
+        sticks[:, 3] += band_noise(np.random.default_rng([seed, 0x40B5]), total, *HOPS, HOP_SIZE * altitude)
     return sticks
 
 
@@ -144,7 +148,7 @@ def fly(
         log_rate: of the log [Hz].
         command_rate: of the rotor command [Hz], a multiple of `log_rate`; default the log rate, so that the logged
             command is exactly what acted.  At 1000 the log holds the command's mean over the sample.
-        altitude: height above the ground [m]; default 30, or 0.6 with ground_effect.
+        altitude: mean height above the ground [m]; default 30, or 0.6 with ground_effect.
         gains: of the stabiliser; default the vehicle file's, else `default_gains`.
         segments: the manoeuvre of profile ``scripted``.
         extras: optional channels to log: velocity, position, battery.
