@@ -38,15 +38,15 @@ inlined: dict[str, Any] = {**jit, "forceinline": True}
 
 
 def _sources() -> int:
-    """Checksum of the source of the kernels and of the control law that one of them calls."""
+    """Checksum of the source of the kernels, and of the control law and rotations that one of them calls."""
     folder = resources.files("quadid.model")
     names = sorted(
         entry.name
         for entry in folder.iterdir()
         if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py"))
     )
-    stabiliser = (resources.files("quadid") / "stabiliser.py").read_bytes()
-    return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), stabiliser]))
+    outside = [(resources.files("quadid") / name).read_bytes() for name in ("stabiliser.py", "rotation.py")]
+    return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside]))
 
 
 SOURCES = _sources()
