@@ -1,6 +1,6 @@
 """What the kernel's steps are made of: instructions in their machine code, counted.
 
-Both steps are one loop over lanes without branches, so the code is read off once per vector of lanes.
+All steps are one loop over lanes without branches, so the code is read off once per vector of lanes.
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from typing import Any
 
 import numba as nb
 
-from quadid.model.kernel import step_core, step_full
+from quadid.model.body_kernel import step_air, step_full, step_solid
+from quadid.model.kernel import step_core
 
 WIDEST = ("zmm", "ymm", "xmm")
 _ARITHMETIC = re.compile(r"v(fn?m(add|sub)|add|sub|mul|min|max|rcp|rsqrt)")
 
 
 def instructions() -> dict[str, Any]:
-    """Compiles both steps afresh and counts; by step."""
-    return {"steps": {name: _counted(step) for name, step in (("nominal", step_core), ("full", step_full))}}
+    """Compiles the steps afresh and counts; by step."""
+    steps = {"nominal": step_core, "body alone": step_solid, "rotor drag": step_air, "full": step_full}
+    return {"steps": {name: _counted(step) for name, step in steps.items()}}
 
 
 def _counted(step: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from benchmarks.kernel import every_effect, particles, peak_case
-from quadid.model import kernel, rollout_kernel, rotor_kernel, sensor_kernel
+from quadid.model import body_kernel, kernel, rollout_kernel, rotor_kernel, sensor_kernel
 from quadid.model.rows import A_G, ALL_MOMENTS, HALF, N_ROWS, ROTOR, X_QW
 from quadid.model.simd import LANES, aligned
 from quadid.vehicle import Vehicle
@@ -21,6 +21,10 @@ PIECES = {
     "loop alone": "pass",
     "nominal step, moments shared": "step_core_shared(1e-4, table, k, s)",
     "nominal step": "step_core(1e-4, s)",
+    "step with effects on the body alone": "step_solid(1e-4, s)",
+    "step with rotor drag": "step_air(1e-4, s)",
+    "step with rotor and parasitic drag": "step_air_rare(1e-4, s)",
+    "step with rotor drag and the body": "step_air_solid(1e-4, s)",
     "full step": "step_full(1e-4, s)",
     "four rotors, held input": "rotors_step(u, k, True, False, geometry, 0.02, rot, s)",
     "four rotors, delayed input": "rotors_step(u, k, True, True, geometry, 0.02, rot, s)",
@@ -64,7 +68,7 @@ def _best(run: Callable[[], object]) -> float:
 def _loop(call: str) -> Any:
     """A compiled loop over steps that calls one piece."""
     scope: dict[str, Any] = {}
-    for module in (kernel, rotor_kernel, sensor_kernel, rollout_kernel):
+    for module in (kernel, body_kernel, rotor_kernel, sensor_kernel, rollout_kernel):
         scope |= vars(module)
     source = f"def loop(steps, {ARGUMENTS}):\n    for i in range(steps):\n        k = i % {ROWS}\n        {call}\n"
     exec(source, scope)  # one source for all, so that nothing differs but the call

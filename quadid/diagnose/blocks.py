@@ -39,19 +39,22 @@ def block_labels(lin: Linearised) -> NDArray[np.intp]:
 
 def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
     """Deviance of each block under parameters fitted to the other blocks, shape (blocks,)."""
-    blocks = int(labels.max()) + 1
-    gram = np.zeros((blocks, *lin.gram.shape[1:]))
-    grad = np.zeros((blocks, lin.gram.shape[1]))
-    cost = np.zeros(blocks)
-    np.add.at(gram, labels, lin.gram)
-    np.add.at(grad, labels, lin.grad)
-    np.add.at(cost, labels, lin.cost + lin.occam)
+    gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     if grad.shape[1] == 0:
         return cost
     h_rest = gram.sum(axis=0) - gram + np.diag(np.maximum(prior_precision, 1e-12))
     g_rest = grad.sum(axis=0) - grad
     z = -np.linalg.solve(h_rest, g_rest[..., None])[..., 0]
     return np.asarray(cost + 2.0 * np.sum(grad * z, axis=1) + np.einsum("bp,bpq,bq->b", z, gram, z))
+
+
+def sum_by_block(values: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
+    """Sums of `values` (segments, ...) over the segments of each block, shape (blocks, ...)."""
+    order = np.argsort(labels, kind="stable")
+    first = np.flatnonzero(np.diff(labels[order], prepend=-1))
+    out = np.zeros((int(labels.max()) + 1, *values.shape[1:]))
+    out[labels[order][first]] = np.add.reduceat(values[order], first, axis=0)
+    return out
 
 
 @dataclass(frozen=True)

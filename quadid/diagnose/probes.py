@@ -106,21 +106,47 @@ def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tupl
     scale = np.sqrt(np.mean(np.concatenate([np.mean(s**2, axis=(1,)) for s in stacked]), axis=0))
     stacked = [s / np.where(scale > 0.0, scale, 1.0) for s in stacked]
     labels = block_labels(model.lin)
+    prepared = [_prepare(p, s) for p, s in zip(parts, stacked, strict=True)]
     best: dict[str, Follows] = {}
     alone: list[Alone] = []
     for site in SITES:
-        found, each = _judge(site, names, parts, stacked, model, labels)
+        found, each = _judge(site, names, prepared, model, labels)
         alone += each
         if site.group not in best or found.gain.total > best[site.group].gain.total:
             best[site.group] = found
     return tuple(sorted(best.values(), key=lambda f: -f.gain.total)), tuple(alone)
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """What all sites of one window share.
+
+    Attributes:
+        part: its segments.
+        integrated: signals (segments, length, n), as they are, integrated once and twice.
+        inside: components of parameters and residual along the initial state's directions.
+        gram, grad: products of the parameters, initial states eliminated.
+    """
+
+    part: Columns
+    integrated: tuple[FloatArray, FloatArray, FloatArray]
+    inside: tuple[FloatArray, FloatArray]
+    gram: FloatArray
+    grad: FloatArray
+
+
+def _prepare(part: Columns, signal: FloatArray) -> _Prepared:
+    once = part.window.dt * np.cumsum(signal, axis=1)
+    b, r = part.parameters, part.residual.reshape(len(signal), -1, 1)
+    ab, ar = _t(part.basis) @ b, _t(part.basis) @ r
+    integrated = (signal, once, part.window.dt * np.cumsum(once, axis=1))
+    return _Prepared(part, integrated, (ab, ar), _t(b) @ b - _t(ab) @ ab, _t(b) @ r - _t(ab) @ ar)
+
+
 def _judge(
-    site: Site, names: tuple[str, ...], parts: list[Columns], stacked: list[FloatArray], model: Model,
-    labels: NDArray[np.intp],
-) -> tuple[Follows, list[Alone]]:  # fmt: skip
-    pieces = [_products(site, p, s) for p, s in zip(parts, stacked, strict=True)]
+    site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model, labels: NDArray[np.intp]
+) -> tuple[Follows, list[Alone]]:
+    pieces = [_products(site, p) for p in prepared]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
     own = model.lin.gram.shape[1]
     precision = np.concatenate([1.0 / model.prior.sigma**2, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
@@ -132,39 +158,29 @@ def _judge(
     return Follows(site, gain, names[int(np.argmax(each))]), alone
 
 
-def _products(site: Site, part: Columns, signal: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _products(site: Site, p: _Prepared) -> tuple[FloatArray, FloatArray]:
     """Products of parameters and probes of each segment, initial states eliminated: gram and gradient."""
-    count, length = signal.shape[:2]
+    part, (ab, ar) = p.part, p.inside
+    count, length, n = p.integrated[0].shape
     channels = part.residual.shape[2]
     moved = [c for c, _ in site.channels]
-    each = [part.whiten(_integrated(signal, order, part.window.dt), channel) for channel, order in site.channels]
-    x = np.stack(each, axis=2).reshape(count, -1, signal.shape[2])
+    each = [part.whiten(p.integrated[order], channel) for channel, order in site.channels]
+    x = np.stack(each, axis=2).reshape(count, -1, n)
     basis = part.basis.reshape(count, length, channels, -1)[:, :, moved].reshape(count, x.shape[1], -1)
-    b = part.parameters
-    rows = b.reshape(count, length, channels, -1)[:, :, moved].reshape(count, x.shape[1], -1)
+    rows = part.parameters.reshape(count, length, channels, -1)[:, :, moved].reshape(count, x.shape[1], -1)
     r = part.residual[:, :, moved].reshape(count, -1, 1)
-    flat_r = part.residual.reshape(count, -1, 1)
-    ab, ar = _t(part.basis) @ b, _t(part.basis) @ flat_r
     ax = _t(basis) @ x
-    own, n = b.shape[2], x.shape[2]
+    own = p.gram.shape[1]
     gram = np.empty((count, own + n, own + n))
-    gram[:, :own, :own] = _t(b) @ b - _t(ab) @ ab
+    gram[:, :own, :own] = p.gram
     gram[:, own:, own:] = _t(x) @ x - _t(ax) @ ax
     gram[:, own:, :own] = _t(x) @ rows - _t(ax) @ ab
     gram[:, :own, own:] = _t(gram[:, own:, :own])
-    grad = np.concatenate([_t(b) @ flat_r - _t(ab) @ ar, _t(x) @ r - _t(ax) @ ar], axis=1)[..., 0]
-    return gram, grad
+    return gram, np.concatenate([p.grad, _t(x) @ r - _t(ax) @ ar], axis=1)[..., 0]
 
 
 def _t(a: FloatArray) -> FloatArray:
     return a.transpose(0, 2, 1)
-
-
-def _integrated(signal: FloatArray, times: int, dt: float) -> FloatArray:
-    """Integral of the signal over the steps up to each sample of its segment, `times` times over."""
-    for _ in range(times):
-        signal = dt * np.cumsum(signal, axis=1)
-    return signal
 
 
 def _chi_squares(gram: FloatArray, grad: FloatArray, precision: FloatArray, own: int) -> FloatArray:

@@ -54,6 +54,7 @@ def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Sc
     precision = 1.0 / default_prior(shooting, model.free).sigma ** 2
     present = {c.label for c in model.causes}
     scores = []
+    h, g = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
     for candidate in listed:
         if (
             candidate.label in present
@@ -63,7 +64,7 @@ def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Sc
             continue
         mine = np.array([place[n] for n in candidate.names])
         if candidate.timed is None:
-            scores.append(_score(candidate, lin, own, mine, precision))
+            scores.append(_score(candidate, h, g, own, mine, precision))
         else:
             scores.append(_scan(candidate, lin, own, mine, precision))
     return sorted(scores, key=lambda s: -s.drop)
@@ -71,23 +72,33 @@ def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Sc
 
 def _reduced(
     h_mm: FloatArray, h_mo: FloatArray, h_oo: FloatArray, g_m: FloatArray, g_o: FloatArray
-) -> tuple[float, FloatArray]:
-    solved = np.linalg.solve(h_oo, np.column_stack([h_mo.T, g_o]))
-    s = h_mm - h_mo @ solved[:, :-1]
+) -> tuple[FloatArray, FloatArray]:
+    """Predicted fall of the deviance and step of candidates' parameters, the model's own refitted.
+
+    Args:
+        h_mm: products of the parameters with themselves, (n, m, m).
+        h_mo: and with those of the model, (n, m, o).
+        h_oo: products of the model's parameters (o, o).
+        g_m: gradient of the parameters (n, m).
+        g_o: of those of the model (o,).
+    """
+    n, m, o = h_mo.shape
+    solved = np.linalg.solve(h_oo, np.column_stack([h_mo.reshape(n * m, o).T, g_o]))
+    s = h_mm - np.matmul(h_mo, solved[:, :-1].T.reshape(n, m, o).transpose(0, 2, 1))
     g = g_m - h_mo @ solved[:, -1]
     # Directions the model's own parameters already explain carry no information; keep them finite.
-    s = s + np.diag(1e-9 * np.diag(h_mm) + 1e-2)
-    z = -np.linalg.solve(s, g)
-    return float(-g @ z), np.asarray(z, dtype=np.float64)
+    s[:, range(m), range(m)] += 1e-9 * np.einsum("nii->ni", h_mm) + 1e-2
+    z = -np.linalg.solve(s, g[..., None])[..., 0]
+    return -np.sum(g * z, axis=1), z
 
 
 def _score(
-    candidate: Candidate, lin: Linearised, own: NDArray[np.intp], mine: NDArray[np.intp], precision: FloatArray
-) -> Score:
-    h, g = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
+    candidate: Candidate, h: FloatArray, g: FloatArray, own: NDArray[np.intp], mine: NDArray[np.intp],
+    precision: FloatArray,
+) -> Score:  # fmt: skip
     h_oo = h[np.ix_(own, own)] + np.diag(precision)
-    drop, z = _reduced(h[np.ix_(mine, mine)], h[np.ix_(mine, own)], h_oo, g[mine], g[own])
-    return Score(candidate, drop, z)
+    drop, z = _reduced(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own)][None], h_oo, g[mine][None], g[own])
+    return Score(candidate, float(drop[0]), z[0])
 
 
 def _scan(
@@ -95,17 +106,17 @@ def _scan(
 ) -> Score:
     """Scans the onset over segment boundaries: sums from the end turn the whole-log column into masked ones."""
     order = np.argsort(lin.time, kind="stable")
-    gram, grad = lin.gram[order], lin.grad[order]
-    h_oo = gram[:, own[:, None], own].sum(axis=0) + np.diag(precision)
+    gram, grad = lin.gram, lin.grad[order]
+    h_oo = gram.sum(axis=0)[np.ix_(own, own)] + np.diag(precision)
     g_o = grad[:, own].sum(axis=0)
     from_end = slice(None, None, -1)
-    h_mm = np.cumsum(gram[:, mine[:, None], mine][from_end], axis=0)[from_end]
-    h_mo = np.cumsum(gram[:, mine[:, None], own][from_end], axis=0)[from_end]
+    h_mm = np.cumsum(gram[order[:, None, None], mine[:, None], mine][from_end], axis=0)[from_end]
+    h_mo = np.cumsum(gram[order[:, None, None], mine[:, None], own][from_end], axis=0)[from_end]
     g_m = np.cumsum(grad[:, mine][from_end], axis=0)[from_end]
-    best = Score(candidate, -np.inf, np.zeros(len(mine)))
     margin = max(len(order) // 40, 3)
-    for i in range(margin, len(order) - margin):
-        drop, z = _reduced(h_mm[i], h_mo[i], h_oo, g_m[i], g_o)
-        if drop > best.drop:
-            best = Score(candidate, drop, z, float(lin.time[order[i]]), len(order))
-    return best
+    tried = slice(margin, len(order) - margin)
+    drop, z = _reduced(h_mm[tried], h_mo[tried], h_oo, g_m[tried], g_o)
+    if not len(drop):
+        return Score(candidate, -np.inf, np.zeros(len(mine)))
+    best = int(np.argmax(drop))
+    return Score(candidate, float(drop[best]), z[best], float(lin.time[order[margin + best]]), len(order))

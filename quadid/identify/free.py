@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,22 +26,22 @@ class Free:
 
     entries: tuple[Entry, ...]
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Dotted names."""
         return tuple(e.name for e in self.entries)
 
-    @property
+    @cached_property
     def index(self) -> NDArray[np.intp]:
         """Places in the full vector."""
         return np.array([e.index for e in self.entries], dtype=np.intp)
 
-    @property
+    @cached_property
     def is_log(self) -> NDArray[np.bool_]:
         """True for parameters on the log scale."""
         return np.array([e.name in NOMINAL_NAMES for e in self.entries], dtype=bool)
 
-    @property
+    @cached_property
     def scale(self) -> FloatArray:
         """Size of one unit of a linear parameter."""
         return np.array([e.typical for e in self.entries])

@@ -1,179 +1,208 @@
-"""From rolled-out lanes to one small matrix a segment.
+"""From rolled-out lanes to one small quadratic form a segment, its initial state eliminated.
 
 One segment at a time, so that all of it stays in the processor's cache: finite-difference columns, whitening of each
-channel, squares.  The last two are products of small matrices, made of tiles whose sums stay in vector registers.
+channel, squares, elimination.  Whitening and squares are products of small matrices, made of tiles whose sums stay in
+vector registers; the elimination is a Cholesky factor of the initial state's own products.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from quadid.model.kernel import LANES
+from quadid.identify.reduction import VELOCITY, Reduced, StatePrior, Whitening
+
+# isort: off
+from quadid.model.simd import (
+    LANES, SOURCES, TILE_COLUMNS, TILE_ROWS, allocating, cache_aligned, cached, jit, lane_kernel, scaled_lanes,
+    tile_product,
+)  # fmt: skip
+
+# isort: on
 
 FloatArray = NDArray[np.float64]
 
-TILE_ROWS, TILE_COLUMNS = 8, 16
-"""Size of a tile of a product: sums that fit into the registers of one core."""
-_VECTOR = 8
-NEGLIGIBLE = 1e-5
-"""Entries of a whitener below this share of its largest are left out."""
 
-
-class Whitening:
-    """What weights and whitens the channels of a segment.
-
-    Attributes:
-        precision: 1 / sigma of each channel, for rows that are not whitened, shape (C,).
-        coloured: True for channels to whiten, in segments that have all their samples, shape (C,).
-        matrix: lower-triangular, rows padded with zeros to whole tiles, shape (C, padded length, length).
-        reach: first column of each tile of rows that counts, shape (C, tiles).
-    """
-
-    def __init__(self, sigma: FloatArray, coloured: NDArray[np.bool_], whitener: FloatArray) -> None:
-        """Prepares standard deviations (C,) and a whitener (C, length, length)."""
-        channels, length, _ = whitener.shape
-        tiles = -(-length // TILE_ROWS)
-        self.precision, self.coloured = 1.0 / sigma, coloured
-        self.matrix = np.zeros((channels, tiles * TILE_ROWS, length))
-        self.reach = np.zeros((channels, tiles), dtype=np.int64)
-        for c, w in enumerate(whitener):
-            matters = np.abs(w) > NEGLIGIBLE * np.max(np.abs(w))
-            reach = np.argmax(matters, axis=1)
-            self.matrix[c, :length] = np.where(np.arange(length) >= reach[:, None], np.tril(w), 0.0)
-            self.reach[c] = [reach[i : i + TILE_ROWS].min() for i in range(0, length, TILE_ROWS)]
-
-
-def segment_grams(
-    out: FloatArray, steps: FloatArray, weights: FloatArray, whitening: Whitening, grams: FloatArray
-) -> None:
-    """Weights, whitens and squares the residual and its finite-difference columns of every segment.
+def reduce_segments(
+    out: FloatArray, lane: NDArray[np.intp], steps: FloatArray, weights: FloatArray, whitening: Whitening,
+    prior: StatePrior, into: Reduced,
+) -> None:  # fmt: skip
+    """Weights, whitens and squares the columns of every segment and eliminates its initial state.
 
     Args:
-        out: rolled-out residuals (blocks, segments, length, at least C channels, LANES); lane 0 is the base.
-        steps: finite-difference step of each further lane (width,).
+        out: rolled-out residuals (blocks, segments, length, at least C channels, LANES).
+        lane: where the base, which is lane 0, and each direction are, (1 + own + P,).
+        steps: finite-difference step of each direction: those eliminated first, then the parameters, (own + P,).
         weights: row weights (segments, length, C), 0 where nothing was measured.
         whitening: of the channels.
-        grams: (segments, width + 1, width + 1), written: products of the columns, the base residual last.
+        prior: of the initial states.
+        into: written.
     """
-    inverse = np.zeros(out.shape[0] * LANES)
-    inverse[1 : len(steps) + 1] = 1.0 / steps
-    flat = out.reshape(*out.shape[:3], -1)
+    inverse = np.zeros(len(out) * LANES)
+    inverse[lane[1:]] = 1.0 / steps
     w = whitening
-    _segment_grams(flat, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, len(steps) + 1, grams)
+    _reduce_on_disk(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, lane, prior, into)
 
 
-def _tile_product(typing_context: Any, a: Any, a_first: Any, a_k: Any, a_i: Any, b: Any, b_first: Any, b_k: Any,
-               count: Any, c: Any, c_first: Any, c_i: Any) -> Any:  # fmt: skip
-    """Writes one tile of a product, c[i, j] = sum over k of a[i, k] b[k, j], to an array.
-
-    Arguments: a, its first entry, steps of k and i; b, its first entry, step of k; number of k; c, its first entry,
-    step of i.  Arrays are flat.  All sums of the tile are vectors kept in registers over the loop, which compilers do
-    not manage on their own.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.function.attributes.add("noinline")
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # the builder knows no such attribute
-        arrays: list[Any] = [
-            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-            for kind, value in zip(signature.args, values, strict=True)
-        ]
-        left, left_first, left_k, left_i, right, right_first, right_k, terms, out, out_first, out_i = arrays
-        vector = ir.VectorType(ir.DoubleType(), _VECTOR)
-        zero = ir.Constant(vector, [0.0] * _VECTOR)
-        parts = TILE_COLUMNS // _VECTOR
-        with builder.goto_entry_block():
-            sums = [[builder.alloca(vector) for _ in range(parts)] for _ in range(TILE_ROWS)]
-        for place in (p for row in sums for p in row):
-            builder.store(zero, place)
-
-        def vector_at(array: Any, index: Any) -> Any:
-            return builder.bitcast(builder.gep(array, [index]), vector.as_pointer())
-
-        with cgutils.for_range(builder, terms) as loop:
-            row = builder.add(right_first, builder.mul(loop.index, right_k))
-            entry = builder.add(left_first, builder.mul(loop.index, left_k))
-            along = [
-                builder.load(vector_at(right, builder.add(row, row.type(j * _VECTOR))), align=8) for j in range(parts)
-            ]
-            for i in range(TILE_ROWS):
-                factor = builder.load(builder.gep(left, [builder.add(entry, builder.mul(left_i, left_i.type(i)))]))
-                spread = builder.insert_element(ir.Constant(vector, ir.Undefined), factor, ir.IntType(32)(0))
-                places = ir.Constant(ir.VectorType(ir.IntType(32), _VECTOR), [0] * _VECTOR)
-                spread = builder.shuffle_vector(spread, ir.Constant(vector, ir.Undefined), places)
-                for j in range(parts):
-                    product = builder.fmul(spread, along[j], flags=("contract",))
-                    total = builder.fadd(builder.load(sums[i][j]), product, flags=("contract",))
-                    builder.store(total, sums[i][j])
-        for i in range(TILE_ROWS):
-            for j in range(parts):
-                place = builder.add(builder.add(out_first, builder.mul(out_i, out_i.type(i))), out_i.type(j * _VECTOR))
-                builder.store(builder.load(sums[i][j]), vector_at(out, place), align=8)
-        return context.get_dummy_value()
-
-    return types.none(a, a_first, a_k, a_i, b, b_first, b_k, count, c, c_first, c_i), generate
-
-
-_tile_code: Any = intrinsic(_tile_product)
-
-
-@nb.njit(cache=True, nogil=True)
+@nb.njit(**{**jit, "fastmath": False})
 def _tile(a, a_first, a_k, a_i, b, b_first, b_k, count, c, c_first, c_i):  # type: ignore[no-untyped-def]
-    """A function of its own around `_tile_code`, compiled once."""
-    _tile_code(a, a_first, a_k, a_i, b, b_first, b_k, count, c, c_first, c_i)
+    """A function of its own around `tile_product`, compiled once."""
+    tile_product(a, a_first, a_k, a_i, b, b_first, b_k, count, c, c_first, c_i)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@nb.njit(**jit)
 def _columns(
-    out: FloatArray, inverse: FloatArray, scales: FloatArray, s: int, c: int, x: FloatArray, first: int
-) -> None:
-    """Writes columns of one segment and channel times `scales` (length,) to rows of x: base residual, directions."""
-    lanes = x.shape[1]
-    for i in range(len(scales)):
-        scale, base = scales[i], out[0, s, i, c * LANES]
-        for block in range(out.shape[0]):
-            for lane in range(LANES):
-                j = block * LANES + lane
-                x[first + i, j] = (out[block, s, i, c * LANES + lane] - base) * (inverse[j] * scale)
-        x[first + i, 0] = base * scale
-        for j in range(out.shape[0] * LANES, lanes):
-            x[first + i, j] = 0.0
-
-
-@nb.njit(cache=True, nogil=True)
-def _segment_grams(
-    out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: NDArray[np.bool_],
-    matrix: FloatArray, reach: NDArray[np.int64], width: int, grams: FloatArray,
+    out: FloatArray, segments: int, channels: int, inverse: FloatArray, scales: FloatArray, s: int, c: int,
+    x: FloatArray, first: int,
 ) -> None:  # fmt: skip
-    """The loop over segments of `segment_grams`; `matrix` and `reach` as in `Whitening`."""
+    """Writes columns of one segment and channel times `scales` (length,) to rows of x: base residual, directions.
+
+    Arrays are flat; `out` has been (blocks, segments, length, channels, LANES), x rows of all blocks' lanes.
+    """
+    lane_kernel()
+    blocks = len(inverse) // LANES
+    lanes = blocks * LANES
+    for i in range(len(scales)):
+        scale, base = scales[i], out[((s * len(scales) + i) * channels + c) * LANES]
+        for block in range(blocks):
+            at = (((block * segments + s) * len(scales) + i) * channels + c) * LANES
+            scaled_lanes(out, at, base, inverse, block * LANES, scale, x, (first + i) * lanes + block * LANES)
+        x[(first + i) * lanes] = base * scale
+
+
+@nb.njit(**jit)
+def _product(g: FloatArray, i: int, j: int) -> float:
+    return float(g[i, j]) if i < j else float(g[j, i])
+
+
+@nb.njit(**jit)
+def _squares(y: FloatArray, i: int, row: FloatArray) -> None:
+    """Writes row i of y' y."""
+    lane_kernel()
+    for j in range(y.shape[1]):
+        row[j] = 0.0
+    for m in range(y.shape[0]):
+        factor = y[m, i]
+        for j in range(y.shape[1]):
+            row[j] += factor * y[m, j]
+
+
+@nb.njit(**jit)
+def _factor(g: FloatArray, lane: NDArray[np.intp], s: int, prior: StatePrior, into: Reduced, l: FloatArray) -> None:
+    """Cholesky factor L of the products of the eliminated columns with their prior; writes what it tells."""
+    own, fitted, occam = len(l), 0.0, 0.0
+    for i in range(own):
+        at = lane[1 + i]
+        for j in range(i + 1):
+            l[i, j] = _product(g, at, lane[1 + j])
+        l[i, i] += prior.ridge[i]
+        if prior.velocity > 0.0 and VELOCITY <= i < VELOCITY + 3:
+            l[i, i] += prior.velocity
+        whole = l[i, i]
+        fitted += g[at, at] / whole
+        for j in range(i):
+            for m in range(j):
+                l[i, j] -= l[i, m] * l[j, m]
+            l[i, j] /= l[j, j]
+            l[i, i] -= l[i, j] * l[i, j]
+        l[i, i] = math.sqrt(max(l[i, i], 1e-16 * whole))  # against rounding; the ridge keeps it positive
+        if i >= VELOCITY:
+            occam += 2.0 * math.log(l[i, i])
+    into.fitted[s] = fitted
+    into.occam[s] = occam - 3.0 * math.log(prior.velocity) if prior.velocity > 0.0 else 0.0
+
+
+@nb.njit(**jit)
+def _eliminate(
+    g: FloatArray, lane: NDArray[np.intp], s: int, prior: StatePrior, into: Reduced, l: FloatArray, y: FloatArray,
+    row: FloatArray,
+) -> None:  # fmt: skip
+    """Eliminates the initial state of segment s from products g of its columns, known on and above the diagonal.
+
+    Columns are where `lane` says: base, eliminated, parameters.  y = L^-1 (B, r) for parameters and residual.
+    """
+    own, p = y.shape[0], y.shape[1] - 1
+    _factor(g, lane, s, prior, into, l)
+    cost = g[0, 0]
+    for i in range(own):
+        at = lane[1 + i]
+        for j in range(p):
+            y[i, j] = _product(g, at, lane[1 + own + j])
+        y[i, p] = g[0, at]
+        if prior.velocity > 0.0 and VELOCITY <= i < VELOCITY + 3:
+            away = prior.away[s, i - VELOCITY]
+            y[i, p] += prior.velocity * away
+            cost += prior.velocity * away * away
+        for m in range(i):
+            for j in range(p + 1):
+                y[i, j] -= l[i, m] * y[m, j]
+        inverse = 1.0 / l[i, i]
+        for j in range(p + 1):
+            y[i, j] *= inverse
+        cost -= y[i, p] * y[i, p]
+    into.cost[s] = cost
+    for i in range(p):
+        at = lane[1 + own + i]
+        _squares(y, i, row)
+        for j in range(i, p):
+            into.gram[s, i, j] = into.gram[s, j, i] = _product(g, at, lane[1 + own + j]) - row[j]
+        into.grad[s, i] = g[0, at] - row[p]
+    for i in range(own - 1, -1, -1):
+        for m in range(i + 1, own):
+            for j in range(p + 1):
+                y[i, j] -= l[m, i] * y[m, j]
+        inverse = 1.0 / l[i, i]
+        for j in range(p + 1):
+            y[i, j] *= inverse
+        into.offset[s, i] = y[i, p]
+        for j in range(p):
+            into.slope[s, i, j] = y[i, j]
+
+
+@nb.njit(**jit)
+def _largest(g: FloatArray) -> float:
+    """Largest product of two columns, which is one with itself; infinite when one is not a number."""
+    out = 0.0
+    for i in range(len(g)):
+        if not g[i, i] <= out:
+            out = g[i, i] if g[i, i] > out else math.inf
+    return out
+
+
+@nb.njit(**allocating)
+def _reduce(
+    out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: NDArray[np.bool_],
+    matrix: FloatArray, reach: NDArray[np.int64], lane: NDArray[np.intp], prior: StatePrior, into: Reduced,
+) -> None:  # fmt: skip
+    """The loop over segments of `reduce_segments`; `matrix` and `reach` as in `Whitening`."""
     count, length, channels = weights.shape
     padded = matrix.shape[1]
-    lanes = -(-width // TILE_COLUMNS) * TILE_COLUMNS
-    x = np.empty((channels * length + TILE_ROWS, lanes))
-    plain = np.empty((length, lanes))
-    g = np.empty((lanes, lanes))
+    blocks = out.shape[0]
+    lanes = blocks * LANES
+    x = cache_aligned((channels * length + TILE_ROWS) * lanes)
+    plain = cache_aligned(length * lanes)
+    g = cache_aligned(lanes * lanes).reshape(lanes, lanes)
     scales = np.empty(length)
-    flat, flat_plain, flat_g, flat_matrix = x.reshape(-1), plain.reshape(-1), g.reshape(-1), matrix.reshape(-1)
+    own = into.offset.shape[1]
+    l, y, row = np.empty((own, own)), np.empty((own, len(lane) - own)), np.empty(len(lane) - own)
+    flat_out, flat_g, flat_matrix = out.reshape(-1), g.reshape(-1), matrix.reshape(-1)
     for s in range(count):
         for c in range(channels):
             whiten = coloured[c]
             for i in range(length):
                 scales[i] = weights[s, i, c]
                 whiten = whiten and scales[i] > 0.0
+                into.base[s, i, c] = out[0, s, i, c, 0]
             if not whiten:
                 for i in range(length):
                     scales[i] *= precision[c]
-                _columns(out, inverse, scales, s, c, x, c * length)
+                _columns(flat_out, count, out.shape[3], inverse, scales, s, c, x, c * length)
                 continue
-            _columns(out, inverse, scales, s, c, plain, 0)
+            _columns(flat_out, count, out.shape[3], inverse, scales, s, c, plain, 0)
             # The last tile runs over into rows of the next channel, which are written after it.
             for tile in range(padded // TILE_ROWS):
                 begin, end = reach[c, tile], min((tile + 1) * TILE_ROWS, length)
@@ -181,13 +210,21 @@ def _segment_grams(
                 to = (c * length + tile * TILE_ROWS) * lanes
                 for j in range(0, lanes, TILE_COLUMNS):
                     right = begin * lanes + j
-                    _tile(flat_matrix, at, 1, length, flat_plain, right, lanes, end - begin, flat, to + j, lanes)
+                    _tile(flat_matrix, at, 1, length, plain, right, lanes, end - begin, x, to + j, lanes)
         for i in range(0, lanes, TILE_ROWS):
             for j in range(i // TILE_COLUMNS * TILE_COLUMNS, lanes, TILE_COLUMNS):
-                _tile(flat, i, lanes, 1, flat, j, lanes, channels * length, flat_g, i * lanes + j, lanes)
-        for i in range(width):
-            to_row = width - 1 if i == 0 else i - 1
-            for j in range(i, width):
-                to_column = width - 1 if j == 0 else j - 1
-                grams[s, to_row, to_column] = g[i, j]
-                grams[s, to_column, to_row] = g[i, j]
+                _tile(x, i, lanes, 1, x, j, lanes, channels * length, flat_g, i * lanes + j, lanes)
+        into.largest[s] = _largest(g)
+        _eliminate(g, lane, s, prior, into, l, y, row)
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def reduce(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _reduce(*arguments)
+
+    return reduce
+
+
+_reduce_on_disk = _on_disk(SOURCES)

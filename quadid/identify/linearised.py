@@ -52,9 +52,3 @@ def join(parts: list[Linearised]) -> Linearised:
     fields = ("gram", "grad", "cost", "occam", "rows", "residuals", "weights", "time")
     arrays: dict[str, Any] = {f: cat(f) for f in fields}
     return replace(parts[0], back=back, window=window, **arrays)
-
-
-def log_determinant_beyond(h: FloatArray, first: int) -> FloatArray:
-    """Log-determinant of the Schur complement of the leading `first` directions in each matrix of h."""
-    whole, lead = np.linalg.slogdet(h)[1], np.linalg.slogdet(h[:, :first, :first])[1]
-    return np.asarray(whole - lead)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.chi_square import lower_mean
+from quadid.identify.reduction import Whitening
 from quadid.vehicle import Noise
 
 FloatArray = NDArray[np.float64]
@@ -69,11 +70,27 @@ class NoiseModel:
         shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
         return _whitener(tuple(self.white), tuple(self.slow), self.slow_time, shape, length, dt)
 
+    def whitening(self, length: int, dt: float) -> Whitening:
+        """What weights and whitens the channels of a segment; see `whitener`."""
+        shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
+        return _whitening(tuple(self.white), tuple(self.slow), self.slow_time, shape, length, dt)
+
     @property
     def coloured(self) -> NDArray[np.bool_]:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
+
+
+@lru_cache(maxsize=16)
+def _whitening(
+    whites: tuple[float, ...], slows: tuple[float, ...], slow_time: float, shape: tuple[tuple[int, ...], bytes] | None,
+    length: int, dt: float,
+) -> Whitening:  # fmt: skip
+    """`NoiseModel.whitening` of these numbers."""
+    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
+    noise = NoiseModel(np.array(whites), np.array(slows), slow_time, shapes)
+    return Whitening(np.sqrt(noise.variance), noise.coloured, noise.whitener(length, dt))
 
 
 @lru_cache(maxsize=16)

@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 
 from quadid.identify.columns import Columns
 from quadid.identify.free import Free as Free
-from quadid.identify.gram_kernel import Whitening, segment_grams
+from quadid.identify.gram_kernel import reduce_segments
 from quadid.identify.initial_states import first_states, retract
 from quadid.identify.linearised import Linearised as Linearised
-from quadid.identify.linearised import join, log_determinant_beyond
+from quadid.identify.linearised import join
 from quadid.identify.noise import NoiseModel
+from quadid.identify.reduction import Reduced, StatePrior
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout
+from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout, Segments
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -167,21 +169,24 @@ class Shooting:
         """Linearises all segments at `theta` and the current initial states; eliminates the initial states."""
         n_pre, k = self._shape(theta, free)
         states = self.states(n_pre)
+        both = Free((*self.free(self.local).entries, *free.entries))
         parts = []
-        for i, (rollout, segments) in enumerate(zip(self.rollouts, self.segments, strict=True)):
-            weights = _weights(rollout, segments, self.channels)
-            robust = self.robust[i]
-            if robust is not None and robust.shape == weights.shape:
-                weights = weights * robust
-            both = Free((*self.free(self.local).entries, *free.entries))
-            grams, base, moved = self._grams(rollout, segments, theta, both, states[i], weights, n_pre, k)
+        for i in range(len(self.rollouts)):
             away = states[i][:, 7:10] - self._reckoned[n_pre][i]
-            part = self._eliminate(i, grams, base, weights, away, segments, k)
-            if self.local:
-                # What the local parameters explain is no residual.
-                part.residuals[...] -= np.einsum("silj,sj->sil", moved, part.back[0][:, k:])
-            parts.append(part)
+            prior = self._state_prior(i, away, k)
+            parts.append(self._reduced(i, theta, both, states[i], prior, n_pre, k))
         return join(parts)
+
+    def _state_prior(self, i: int, away: FloatArray, k: int) -> StatePrior:
+        ridge = np.concatenate([1.0 / _RIDGE[:k] ** 2, np.full(len(self.local), LOCAL_SIGMA**-2.0)])
+        unknown = k >= 9 and not self._has_velocity(i)
+        return StatePrior(ridge, VELOCITY_PRIOR**-2.0 if unknown else 0.0, np.ascontiguousarray(away))
+
+    def _row_weights(self, i: int) -> FloatArray:
+        """Weights of the rows of a window's segments, shape (segments, length, channels)."""
+        weights = _weights(self.rollouts[i], self.segments[i], self.channels)
+        robust = self.robust[i]
+        return weights if robust is None or robust.shape != weights.shape else weights * robust
 
     def _directions(self, theta: FloatArray, free: Free, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""
@@ -206,65 +211,35 @@ class Shooting:
         thetas, dx, steps = self._directions(theta, free, k)
         return rollout.roll(segments, thetas, x0, dx, n_pre)[0], steps
 
-    def _grams(
-        self, rollout: Rollout, segments: Segments, theta: FloatArray, free: Free, x0: FloatArray, weights: FloatArray,
-        n_pre: int, k: int,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-        """Products of all weighted, whitened columns of each segment, residual last: (segments, k+P+1, k+P+1).
-
-        Also the residual itself, in channel units, and the columns of the local parameters, which come first in `free`.
-        """
+    def _reduced(
+        self, i: int, theta: FloatArray, free: Free, x0: FloatArray, prior: StatePrior, n_pre: int, k: int
+    ) -> Linearised:
+        """Linearises the segments of one window, local parameters first in `free`, and eliminates what each has own."""
+        segments, local, weights = self.segments[i], len(self.local), self._row_weights(i)
         thetas, dx, steps = self._directions(theta, free, k)
-        noise, local = self.noise, len(self.local)
-        whitening = Whitening(np.sqrt(noise.variance), noise.coloured, noise.whitener(self.length, self.dt))
-        grams = np.empty((len(x0), len(steps) + 1, len(steps) + 1))
-        base, moved = np.empty(weights.shape), np.empty((*weights.shape, local))
+        lane = packing(thetas, self.channels)
+        thetas, dx = packed(thetas, lane), packed(dx, lane)
+        whitening = self.noise.whitening(self.length, self.dt)
+        into = Reduced.room(len(x0), k + local, len(steps) - k - local, self.length, self.channels)
+        moved = np.empty((*weights.shape, local))
 
         def use(which: slice, out: FloatArray) -> None:
-            segment_grams(out, steps, weights[which], whitening, grams[which])
-            base[which] = out[0, ..., : self.channels, 0]
-            for j in range(local):
-                lane = out[(1 + k + j) // LANES, ..., : self.channels, (1 + k + j) % LANES]
-                moved[which][..., j] = (lane - base[which]) / steps[k + j]
+            reduce_segments(out, lane, steps, weights[which], whitening, prior.part(which), into.part(which))
+            for j, at in enumerate(lane[1 + k : 1 + k + local]):
+                changed = out[at // LANES, ..., : self.channels, at % LANES]
+                moved[which][..., j] = (changed - into.base[which]) / steps[k + j]
 
-        rollout.roll_parts(segments, thetas, x0, dx, n_pre, use)
-        return grams, base, moved
-
-    def _eliminate(
-        self, i: int, grams: FloatArray, base: FloatArray, weights: FloatArray, v: FloatArray, segments: Segments,
-        k: int,
-    ) -> Linearised:  # fmt: skip
-        count, width = len(grams), grams.shape[1] - 1
-        # A simulation that ran away has an infinite cost, which every search steps back from.
-        away = 0.0 if np.max(np.abs(grams), initial=0.0) < RAN_AWAY else np.inf
-        h = grams if away == 0.0 else np.zeros_like(grams)
-        own = k + len(self.local)
-        haa, hab, hbb = h[:, :own, :own].copy(), h[:, :own, own:width], h[:, own:width, own:width]
-        ga, gb, cost = h[:, :own, width].copy(), h[:, own:width, width], h[:, width, width].copy()
-        informed = np.einsum("sii->si", haa).copy()
-        haa[:, range(own), range(own)] += np.concatenate([1.0 / _RIDGE[:k] ** 2, np.full(own - k, LOCAL_SIGMA**-2.0)])
-        occam = np.zeros(count)
-        if k >= 9 and not self._has_velocity(i):
-            haa[:, range(6, 9), range(6, 9)] += 1.0 / VELOCITY_PRIOR**2
-            ga[:, 6:9] += v / VELOCITY_PRIOR**2
-            cost += np.sum(v * v, axis=1) / VELOCITY_PRIOR**2
-            occam = log_determinant_beyond(haa, 6) + 6.0 * np.log(VELOCITY_PRIOR)
-        solved = np.linalg.solve(haa, np.concatenate([hab, ga[..., None]], axis=2))
-        slope, offset = solved[..., :-1], solved[..., -1]
-        hab_t = hab.transpose(0, 2, 1)
-        fitted = np.sum(informed / np.einsum("sii->si", haa), axis=1)
+        self.rollouts[i].roll_parts(segments, thetas, x0, dx, n_pre, use)
+        if not np.max(into.largest, initial=0.0) < RAN_AWAY:
+            into.run_away(prior)
+        if local:
+            # What the local parameters explain is no residual.
+            into.base[...] -= np.einsum("silj,sj->sil", moved, into.offset[:, k:])
         return Linearised(
-            gram=hbb - hab_t @ slope,
-            grad=gb - np.einsum("skp,sk->sp", hab, offset),
-            cost=cost - np.sum(ga * offset, axis=1) + away,
-            occam=occam,
-            rows=np.count_nonzero(weights, axis=(1, 2)) - fitted,
-            residuals=base,
-            weights=weights,
-            back=(offset, slope),
-            window=np.full(count, i, dtype=np.intp),
-            time=self.rollouts[i].window.t[segments.starts],
-        )
+            into.gram, into.grad, into.cost, into.occam, np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
+            into.base, weights, (into.offset, into.slope), np.full(len(x0), i, dtype=np.intp),
+            self.rollouts[i].window.t[segments.starts],
+        )  # fmt: skip
 
     def columns(self, theta: FloatArray, free: Free, parameters: bool = True) -> Iterator[Columns]:
         """For each window the whitened residual at `theta`, and what initial states and `free` can do to it.

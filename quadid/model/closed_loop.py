@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
 from quadid.model.closed_loop_kernel import OUTPUTS, fly_closed_loop
+from quadid.model.needs_kernel import needs_of
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
-from quadid.model.rollout_kernel import Flight, needs_of
+from quadid.model.rollout_kernel import Flight
 from quadid.model.simd import LANES, aligned
 from quadid.stabiliser import mixer_matrix, pack_gains
 from quadid.vehicle import GRAVITY, Vehicle

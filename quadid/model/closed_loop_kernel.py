@@ -12,8 +12,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.model.kernel import body_constants, flight_factors, step_core, step_full
-from quadid.model.rollout_kernel import Flight, Needs
+from quadid.model.body_kernel import step_full
+from quadid.model.kernel import body_constants, flight_factors, step_core
+from quadid.model.needs_kernel import Needs
+from quadid.model.rollout_kernel import Flight
 from quadid.model.rotor_kernel import rotor_constants, turn_delayed
 
 # isort: off

@@ -5,8 +5,8 @@ trigonometry in the loops, no allocation, no branch that depends on a lane.  Whe
 
 Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
 (`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
-Velocity matters only to some effects, so the full right-hand side is used only when asked for; both are the same
-equations, listed in `quadid.model.equations`.
+Here is the nominal step; effects on the body are in `quadid.model.body_kernel`.  Both are the same equations, listed in
+`quadid.model.equations`.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from quadid.model import layout as ix
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP,
+    A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP,
     C_DROP_TIME, C_GROUND, C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX,
     C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY,
     C_RZ, C_SAG, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY,
-    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
-    X_R, X_VD, X_VE, X_VN,
+    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
+    X_R,
 )  # fmt: skip
 
 # isort: on
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
 
-__all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared", "step_full"]
+__all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared"]
 
 FloatArray = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def flight_factors(t: float, span0: float, span1: float, dt: float, s: FloatArra
 
 
 @nb.njit(**inlined)
-def _rotation_rate(qw, qx, qy, qz, p, q, r):  # type: ignore[no-untyped-def]
+def rotation_rate(qw, qx, qy, qz, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 1 as a quaternion: d/dt q = q (0, p, q, r) / 2."""
     return (
         0.5 * (-qx * p - qy * q - qz * r),
@@ -106,7 +106,7 @@ def _rotation_rate(qw, qx, qy, qz, p, q, r):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**inlined)
-def _put_force(ax, ay, az, bx, by, bz, lane, s):  # type: ignore[no-untyped-def]
+def put_force(ax, ay, az, bx, by, bz, lane, s):  # type: ignore[no-untyped-def]
     """Stores the mean specific force of both half steps, and over one sample centred on the start of the step."""
     s[S_FX + lane] = 0.5 * (s[F0_X + lane] + ax)
     s[S_FY + lane] = 0.5 * (s[F0_Y + lane] + ay)
@@ -127,7 +127,7 @@ def _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s):  # typ
     tz1, tz2 = d * z2a, d * z2b
     o1, o2 = jr * o1a, jr * o1b
     lift = -b * s[C_INVM + lane]
-    _put_force(0.0, 0.0, lift * s2a, 0.0, 0.0, lift * s2b, lane, s)
+    put_force(0.0, 0.0, lift * s2a, 0.0, 0.0, lift * s2b, lane, s)
     qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
     p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
     s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
@@ -136,22 +136,22 @@ def _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s):  # typ
     # stage 1
     tx, ty, tz, o = 1.5 * tx1 - 0.5 * tx2, 1.5 * ty1 - 0.5 * ty2, 1.5 * tz1 - 0.5 * tz2, 1.5 * o1 - 0.5 * o2
     a1x, a1y, a1z = cx * q * r + (tx + o * q) * ixx, cy * p * r + (ty - o * p) * iyy, cz * p * q + tz * izz
-    k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
+    k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
     # stage 2
     h = 0.5 * dt
     tx, ty, tz, o = 0.5 * (tx1 + tx2), 0.5 * (ty1 + ty2), 0.5 * (tz1 + tz2), 0.5 * (o1 + o2)
     p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
     a2x, a2y, a2z = cx * q2 * r2 + (tx + o * q2) * ixx, cy * p2 * r2 + (ty - o * p2) * iyy, cz * p2 * q2 + tz * izz
-    k2w, k2x, k2y, k2z = _rotation_rate(qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z, p2, q2, r2)
+    k2w, k2x, k2y, k2z = rotation_rate(qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z, p2, q2, r2)
     # stage 3
     p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
     a3x, a3y, a3z = cx * q3 * r3 + (tx + o * q3) * ixx, cy * p3 * r3 + (ty - o * p3) * iyy, cz * p3 * q3 + tz * izz
-    k3w, k3x, k3y, k3z = _rotation_rate(qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z, p3, q3, r3)
+    k3w, k3x, k3y, k3z = rotation_rate(qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z, p3, q3, r3)
     # stage 4
     tx, ty, tz, o = 1.5 * tx2 - 0.5 * tx1, 1.5 * ty2 - 0.5 * ty1, 1.5 * tz2 - 0.5 * tz1, 1.5 * o2 - 0.5 * o1
     p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
     a4x, a4y, a4z = cx * q4 * r4 + (tx + o * q4) * ixx, cy * p4 * r4 + (ty - o * p4) * iyy, cz * p4 * q4 + tz * izz
-    k4w, k4x, k4y, k4z = _rotation_rate(qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z, p4, q4, r4)
+    k4w, k4x, k4y, k4z = rotation_rate(qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z, p4, q4, r4)
     sixth = dt / 6.0
     qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
     qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
@@ -193,135 +193,3 @@ def step_core_shared(dt: float, table: FloatArray, k: int, s: FloatArray) -> Non
     z2b, o1b = table[k, ALL_MOMENTS + 3], table[k, ALL_MOMENTS + 4]
     for lane in range(LANES):
         _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s)
-
-
-@nb.njit(**inlined)
-def _body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, s1, o1, do, g, im, lift, lane, s):  # type: ignore[no-untyped-def]
-    """Right-hand side with every effect: angular acceleration, specific force at the CG, acceleration in NED."""
-    # Velocity relative to the air, in body axes.
-    rn, re, rd = vn - s[C_WN + lane], ve - s[C_WE + lane], vd
-    # This form of the rotation matrix keeps the heading of the world's axes out of the motion even at the inner stages,
-    # where the quaternion is not of unit length.
-    ww, xx, yy, zz = qw * qw, qx * qx, qy * qy, qz * qz
-    r00, r01, r02 = ww + xx - yy - zz, 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2.0 * (qx * qy + qw * qz), ww - xx + yy - zz, 2.0 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), ww - xx - yy + zz
-    u = r00 * rn + r10 * re + r20 * rd
-    v = r01 * rn + r11 * re + r21 * rd
-    w = r02 * rn + r12 * re + r22 * rd
-    share = s1 * s[C_HOVER + lane]
-    speed = s[C_CPAR + lane] * math.sqrt(u * u + v * v + w * w)
-    b, m = s[C_B + lane] * g * lift, s[C_MASS + lane]
-    # Specific force of the unloaded mass; im scales all of it when mass is taken up.
-    thrust = b * s2 + m * s[C_KZ + lane] * w * share
-    hx, hy = -s[C_KX + lane] * u * share, -s[C_KY + lane] * v * share
-    sx, sy, sz = (hx - speed * u) * im, (hy - speed * v) * im, (-thrust * s[C_INVM + lane] - speed * w) * im
-    jr = s[C_JR + lane] * o1
-    tx = -b * y2 + s[C_CGY + lane] * thrust + m * s[C_HY + lane] * hy + jr * q
-    ty = b * x2 - s[C_CGX + lane] * thrust - m * s[C_HX + lane] * hx - jr * p
-    tz = s[C_D + lane] * g * z2 + s[C_JSPIN + lane] * do
-    jxx, jyy, jzz = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane]
-    jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
-    lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
-    tx -= q * lz - r * ly
-    ty -= r * lx - p * lz
-    tz -= p * ly - q * lx
-    ap = s[C_IXX + lane] * tx + s[C_IXY + lane] * ty + s[C_IXZ + lane] * tz - s[C_LP + lane] * p
-    aq = s[C_IXY + lane] * tx + s[C_IYY + lane] * ty + s[C_IYZ + lane] * tz - s[C_MQ + lane] * q
-    ar = s[C_IXZ + lane] * tx + s[C_IYZ + lane] * ty + s[C_IZZ + lane] * tz
-    an = r00 * sx + r01 * sy + r02 * sz
-    ae = r10 * sx + r11 * sy + r12 * sz
-    ad = r20 * sx + r21 * sy + r22 * sz + GRAVITY
-    # Specific force where the IMU sits: rigid-body acceleration of a point at (rx, ry, rz) from the CG.
-    rx, ry, rz = s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane]
-    dot = p * rx + q * ry + r * rz
-    sq = p * p + q * q + r * r
-    fx = sx + aq * rz - ar * ry + p * dot - rx * sq
-    fy = sy + ar * rx - ap * rz + q * dot - ry * sq
-    fz = sz + ap * ry - aq * rx + r * dot - rz * sq
-    return ap, aq, ar, an, ae, ad, fx, fy, fz
-
-
-@nb.njit(**jit)
-def step_full(dt: float, s: FloatArray) -> None:
-    """One step of attitude, rate, velocity and position with every effect; arguments as `step_core`."""
-    lane_kernel()
-    h = 0.5 * dt
-    for lane in range(LANES):
-        s2a, s2b = s[A_S2 + lane], s[A_S2 + HALF + lane]
-        x2a, x2b = s[A_X2 + lane], s[A_X2 + HALF + lane]
-        y2a, y2b = s[A_Y2 + lane], s[A_Y2 + HALF + lane]
-        z2a, z2b = s[A_Z2 + lane], s[A_Z2 + HALF + lane]
-        s1a, s1b = s[A_S1 + lane], s[A_S1 + HALF + lane]
-        o1a, o1b = s[A_O1 + lane], s[A_O1 + HALF + lane]
-        doa, dob = s[A_DO + lane], s[A_DO + HALF + lane]
-        ga, gb = s[A_G + lane], s[A_G + HALF + lane]
-        ma, mb = s[A_M + lane], s[A_M + HALF + lane]
-        qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
-        p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
-        s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
-        s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
-        vn, ve, vd = s[X_VN + lane], s[X_VE + lane], s[X_VD + lane]
-        # Ground effect at the middle of the step; a tiny number keeps 0 / 0 away where there is none.
-        height = max(-s[X_D + lane] - h * vd, s[C_LOWEST + lane]) + 1e-12
-        lift = height * height / (height * height - s[C_GROUND + lane])
-        # stage 1
-        a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = _body(
-            qw, qx, qy, qz, p, q, r, vn, ve, vd, 1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b,
-            1.5 * z2a - 0.5 * z2b, 1.5 * s1a - 0.5 * s1b, 1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob,
-            1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift, lane, s,
-        )  # fmt: skip
-        k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
-        # stage 2
-        s2, x2, y2, z2 = 0.5 * (s2a + s2b), 0.5 * (x2a + x2b), 0.5 * (y2a + y2b), 0.5 * (z2a + z2b)
-        s1, o1, do, g, im = 0.5 * (s1a + s1b), 0.5 * (o1a + o1b), 0.5 * (doa + dob), 0.5 * (ga + gb), 0.5 * (ma + mb)
-        p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
-        a, b, c, d = qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z
-        a2x, a2y, a2z, n2, e2, d2, f2x, f2y, f2z = _body(
-            a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1, s2, x2, y2, z2, s1, o1, do, g, im,
-            lift, lane, s,
-        )  # fmt: skip
-        k2w, k2x, k2y, k2z = _rotation_rate(a, b, c, d, p2, q2, r2)
-        # stage 3
-        p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
-        a, b, c, d = qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z
-        a3x, a3y, a3z, n3, e3, d3, f3x, f3y, f3z = _body(
-            a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2, s2, x2, y2, z2, s1, o1, do, g, im,
-            lift, lane, s,
-        )  # fmt: skip
-        k3w, k3x, k3y, k3z = _rotation_rate(a, b, c, d, p3, q3, r3)
-        # stage 4
-        p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
-        a, b, c, d = qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z
-        a4x, a4y, a4z, n4, e4, d4, f4x, f4y, f4z = _body(
-            a, b, c, d, p4, q4, r4, vn + dt * n3, ve + dt * e3, vd + dt * d3,
-            1.5 * s2b - 0.5 * s2a, 1.5 * x2b - 0.5 * x2a, 1.5 * y2b - 0.5 * y2a, 1.5 * z2b - 0.5 * z2a,
-            1.5 * s1b - 0.5 * s1a, 1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga,
-            1.5 * mb - 0.5 * ma, lift, lane, s,
-        )  # fmt: skip
-        k4w, k4x, k4y, k4z = _rotation_rate(a, b, c, d, p4, q4, r4)
-        sixth = dt / 6.0
-        qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
-        qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
-        qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
-        qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
-        scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)
-        s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane] = qw * scale, qx * scale, qy * scale, qz * scale
-        s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
-        s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
-        s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
-        s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
-        s[S_BENDZ + lane] = h * (a4z - a1z)
-        s[X_VN + lane] = vn + sixth * (n1 + 2.0 * (n2 + n3) + n4)
-        s[X_VE + lane] = ve + sixth * (e1 + 2.0 * (e2 + e3) + e4)
-        s[X_VD + lane] = vd + sixth * (d1 + 2.0 * (d2 + d3) + d4)
-        s[X_N + lane] += dt * vn + dt * sixth * (n1 + n2 + n3)
-        s[X_E + lane] += dt * ve + dt * sixth * (e1 + e2 + e3)
-        s[X_D + lane] += dt * vd + dt * sixth * (d1 + d2 + d3)
-        # Means over the halves from a parabola through the stages.
-        fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
-        _put_force(
-            TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
-            TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
-            lane, s,
-        )  # fmt: skip

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
-from quadid.model.rollout_kernel import N_TANGENT, Flight, Needs, needs_of, roll_segments
+from quadid.model.needs_kernel import Needs, needs_of
+from quadid.model.rollout_kernel import N_TANGENT, Flight, roll_segments
 from quadid.model.rotor_kernel import rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
 from quadid.model.simd import LANES, aligned
@@ -31,8 +32,8 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
 _TABLES_KEPT = 4
-_PART_ROWS = 1600
-"""Rows simulated before their residuals are used: they stay in cache."""
+_PART_ROWS = 800
+"""Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
 _FORGOTTEN = 40.0
 """Time constants after which nothing is left in double precision: exp(-40) = 4e-18."""
 
@@ -78,12 +79,16 @@ _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.emp
 
 
 class _Lanes(NamedTuple):
-    """One block: parameter vectors (LANES, size), tangent offsets (12, LANES), needs, and shared rotor moments."""
+    """One block: parameter vectors (LANES, size), tangent offsets (12, LANES), needs, shared rotor moments.
+
+    And the number of rows after which rotors have forgotten how they began, to the last digit of their speed.
+    """
 
     theta: FloatArray
     dx: FloatArray
     need: Needs
     table: FloatArray
+    memory: int
 
 
 class Rollout:
@@ -173,8 +178,8 @@ class Rollout:
                 are overwritten afterwards; called from several threads.
         """
         count, width = len(segments.starts), segments.length * self.channels * LANES
-        step = max(_PART_ROWS // segments.length, 1)
         lanes = self._prepared(segments, n_pre, theta, dx, self.channels)
+        step = max(_PART_ROWS // (segments.length * len(lanes)), 1)
         room: SimpleQueue[FloatArray] = SimpleQueue()
 
         def part(first: int) -> None:
@@ -262,7 +267,10 @@ class Rollout:
 
     def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
         need = needs_of(theta, channels)
-        return _Lanes(theta, np.ascontiguousarray(dx.T), need, self._table(theta, need) if need.shared else _NO_TABLE)
+        table = self._table(theta, need) if need.shared else _NO_TABLE
+        lag, late = float(theta[:, ix.TAU].max()), float(theta[:, ix.DELAY].max())
+        memory = math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
+        return _Lanes(theta, np.ascontiguousarray(dx.T), need, table, memory)
 
     def _table(self, theta: FloatArray, need: Needs) -> FloatArray:
         """Rotor moments of every step for lanes with the same rotors; kept for the next calls."""
@@ -282,17 +290,11 @@ class Rollout:
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
         w = self.window
-        begin = max(int(segments.starts[0]) - n_pre - self._memory(lanes.theta), 0)
         roll_segments(
             w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, scale,
-            begin, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length,
-            basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
+            lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1],
+            segments.length, basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
-
-    def _memory(self, theta: FloatArray) -> int:
-        """Rows after which rotors have forgotten how they began, to the last digit of their speed."""
-        lag, late = float(theta[:, ix.TAU].max()), float(theta[:, ix.DELAY].max())
-        return math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:
         """First guess of the states `n_pre` rows before each segment from the measurements, shape (segments, 13).

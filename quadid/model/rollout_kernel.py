@@ -12,8 +12,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.model import layout as ix
-from quadid.model.kernel import body_constants, flight_factors, step_core, step_core_shared, step_full
+from quadid.model.body_kernel import step_air, step_air_rare, step_air_solid, step_full, step_solid
+from quadid.model.kernel import body_constants, flight_factors, step_core, step_core_shared
+from quadid.model.needs_kernel import Needs
 from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step, spread_moments
 
 # isort: off
@@ -32,58 +33,6 @@ from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached,
 FloatArray = NDArray[np.float64]
 
 N_TANGENT = MAX_TANGENTS
-
-
-class Needs(NamedTuple):
-    """Which parts of the model any lane of a block uses.
-
-    Attributes:
-        full: velocity and all effects on the body; else attitude and rate alone.
-        shared: lag, delay, dead speed and losses are the same in all lanes, and their moments are tabled.
-        delayed: commands are delayed.
-        factors: thrust or mass change in flight.
-        imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
-    """
-
-    full: bool
-    shared: bool
-    delayed: bool
-    factors: bool
-    imu_lag: bool
-    att_delay: bool
-    imu_static: bool
-    ahrs: bool
-
-
-_BODY_ENTRIES = (
-    ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.HX, ix.HY, ix.GROUND, ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ,
-    ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ,
-)  # fmt: skip
-_FACTOR_ENTRIES = (ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION)
-_ROTOR_ENTRIES = (ix.TAU, ix.DELAY, ix.DEAD_SPEED)
-
-
-@nb.njit(**jit)
-def _needs_of(theta: FloatArray, channels: int) -> Needs:
-    """Returns what a block of parameter vectors (LANES, size) needs of the model."""
-    full, factors, varied, imu_static = channels > 9, False, False, False
-    delayed, imu_lag, att_delay, ahrs = False, False, False, False
-    for lane in range(len(theta)):
-        for i in _BODY_ENTRIES:
-            full |= theta[lane, i] != 0.0
-        for i in _FACTOR_ENTRIES:
-            factors |= theta[lane, i] != 0.0
-        for i in _ROTOR_ENTRIES:
-            varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS, theta.shape[1]):
-            varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.GBX, ix.LAX):
-            imu_static |= theta[lane, i] != 0.0
-        delayed |= theta[lane, ix.DELAY] > 0.0
-        imu_lag |= theta[lane, ix.IMU_PERIOD] > 0.0
-        att_delay |= theta[lane, ix.ATT_DELAY] > 0.0
-        ahrs |= theta[lane, ix.AHRS_K] != 0.0
-    return Needs(full or factors, not varied, delayed, factors, imu_lag, att_delay, imu_static, ahrs)
 
 
 class Flight(NamedTuple):
@@ -198,20 +147,24 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 @nb.njit(**jit)
 def _march(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, begin: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
+    scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
     channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
     s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray, total: FloatArray, inside: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
     steps = n_pre + n_seg
-    turned = begin  # rotor steps already taken
+    turned = max(starts[0] - n_pre - memory, 0)  # rotor steps already taken
+    rotors_start(u, turned, rot)
     for seg in range(len(starts)):
         first = starts[seg] - n_pre
         following = starts[seg + 1] - n_pre if seg + 1 < len(starts) else -1
         if not need.shared:
             if turned > first:
                 _copy(ahead, rot)
+            elif first - turned > memory:  # what they did before is forgotten
+                turned = first - memory
+                rotors_start(u, turned, rot)
             for k in range(turned, first):  # rows no segment covers: rotors still turn
                 rotors_step(u, k, held, need.delayed, geometry, dt, rot, s)
             turned = first + steps
@@ -234,8 +187,16 @@ def _march(
             if scored and channels > 9:
                 compare_motion(at, row, k, measured, scale, s, out)
             # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
-            if need.full:
+            if need.rare and need.solid:
                 step_full(dt, s)
+            elif need.rare:
+                step_air_rare(dt, s)
+            elif need.air and need.solid:
+                step_air_solid(dt, s)
+            elif need.air:
+                step_air(dt, s)
+            elif need.solid:
+                step_solid(dt, s)
             elif need.shared:
                 step_core_shared(dt, table, k, s)
             else:
@@ -271,7 +232,7 @@ def _march(
 @nb.njit(**allocating)
 def _roll_segments(
     u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, begin: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray,
+    scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray,
     dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
     ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip
@@ -279,7 +240,7 @@ def _roll_segments(
 
     Each segment starts from its own initial state, `n_pre` steps before its first scored sample, and ends one step
     after the last, because a logged acceleration is the mean over one sample centred on its time.  Rotor speeds do not
-    depend on the vehicle's state; they run through from row `begin`.
+    depend on the vehicle's state; they run through, or begin `memory` rows before a segment that comes later than that.
 
     Args:
         u: rotor input (n, rotors) [rad/s].
@@ -289,7 +250,7 @@ def _roll_segments(
         table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
         measured: (n, 16), see `compare`.
         scale: (n, channels), factor on residuals: 1 where measured, else 0; or weights.
-        begin: row from which rotors run, early enough before the first segment that they forget how they began.
+        memory: rows after which rotors have forgotten how they began.
         starts: first scored row of each segment, rising; rows start - n_pre to start + n_seg must exist.
         n_pre: steps rolled before the first scored row, at least 1.
         x0: initial state at start - n_pre, (segments, 13).
@@ -320,9 +281,8 @@ def _roll_segments(
     body_constants(theta, flight.mass, rotors, flight.reach, s)
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
-    rotors_start(u, begin, rot)
     _march(
-        u, held, geometry, flight, table, measured, scale, begin, starts, n_pre, x0, dx, need, channels, n_seg, sums,
+        u, held, geometry, flight, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg, sums,
         basis, out, ends, cost, s, rot, ahead, past, total, inside,
     )  # fmt: skip
 
@@ -333,12 +293,7 @@ def _on_disk(sources: int) -> Any:
         _ = sources
         _roll_segments(*arguments)
 
-    @nb.njit(**cached)
-    def needs_of(*arguments):  # type: ignore[no-untyped-def]
-        _ = sources
-        return _needs_of(*arguments)
-
-    return roll_segments, needs_of
+    return roll_segments
 
 
-roll_segments, needs_of = _on_disk(SOURCES)
+roll_segments = _on_disk(SOURCES)

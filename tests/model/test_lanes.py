@@ -61,14 +61,14 @@ NOMINAL = vector(VEHICLE, values_of(VEHICLE))
 
 @pytest.mark.parametrize("sampling", ["held", "instant"])
 @pytest.mark.parametrize("entry", EFFECTS, ids=lambda e: e.name)
-def test_neutral_is_exactly_neutral_beside_lanes_that_have_the_effect(entry: Entry, sampling: Sampling) -> None:
-    """A neutral lane, computed by the kernel with that effect, gives the same bits as by the kernel without."""
+def test_neutral_is_neutral_beside_lanes_that_have_the_effect(entry: Entry, sampling: Sampling) -> None:
+    """A neutral lane, computed by the kernel with that effect, gives to rounding what the kernel without it gives."""
     window = noisy_window(sampling=sampling)
     alone = rolled(window, NOMINAL[None])[0]
     beside = rolled(window, np.stack([NOMINAL, moved(times_within(NOMINAL), entry, 1.0)]))
     assert np.any(beside[1] != beside[0]) or entry.name.startswith(("rotor_drag_moment", "wind"))
-    # A delay splits a step at its start into nothing and the whole; their sum may round differently.
-    allowed = 1e-11 if entry.name == "command_delay.delay" else 0.0
+    # Groups of effects are compiled apart, with other fused pairs.  A delay splits a step into nothing and the whole.
+    allowed = 1e-11 if entry.name == "command_delay.delay" else 1e-13
     assert np.abs(beside[0] - alone).max() <= allowed
 
 
