@@ -31,6 +31,13 @@ FLEW, CRASHED = 0, 1
 
 
 @kernel
+def copy_into(values: FloatArray, out: FloatArray) -> None:
+    """Copies numbers one by one: assigning a slice would compile a message about shapes for seconds."""
+    for i in range(values.shape[0]):
+        out[i] = values[i]
+
+
+@kernel
 def march(
     plan: Plan,
     body: Body,
@@ -117,7 +124,9 @@ def march(
                         force[i] += on_board.accel_matrix[i, j] * raw
                 pull_attitude(error, ahrs, force, on_board.pull * dt)
         else:
-            ahrs[:] = truth
+            for i in range(3):
+                for j in range(3):
+                    ahrs[i, j] = truth[i, j]
         quaternion_of(ahrs, track.attitude[n])
 
         # --- pilot and stabiliser
@@ -128,9 +137,9 @@ def march(
             if tilted:
                 return CRASHED, now
         if row < plan.rows and n == plan.first_log + row * plan.log_every:
-            track.state[row] = y
-            track.reference[row] = reference
-            track.rotor[row] = omega
+            copy_into(y, track.state[row])
+            copy_into(reference, track.reference[row])
+            copy_into(omega, track.rotor[row])
             row += 1
         if n % plan.control_every == 0:
             c = n // plan.control_every
