@@ -51,7 +51,7 @@ class Command(_Strict):
     Attributes:
         kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1] or ``pwm`` [us].
         sampling: ``held``: a row acts until the next; ``instant``: a reading, linear in between.
-        max_speed: rotor speed at full command [rad/s], for normalized and pwm.
+        max_speed: rotor speed at full command [rad/s]; normalized and pwm need it, exports of hover thrust use it.
         range: pulse widths of zero and full command [us], for pwm.
     """
 

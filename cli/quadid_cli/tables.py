@@ -107,7 +107,9 @@ def print_horizons(console: Console, result: JsonDict) -> None:
     for entry in [*(result["files"] if many else []), result]:
         label = Text(entry.get("log", "all" if many else result["files"][0]["log"]))
         for horizon, errors in entry["horizons"].items():
-            table.add_row(label, f"{horizon} samples", *(number(errors[n]) for n in QUANTITIES))
+            table.add_row(
+                label, f"{horizon} sample{'s' * (int(horizon) != 1)}", *(number(errors[n]) for n in QUANTITIES)
+            )
             label = Text("")
         total = entry["sum"]
         table.add_row("", f"sum 1..{total['to']}", *(number(total[n]) for n in QUANTITIES), end_section=True)

@@ -99,7 +99,8 @@ def table(found: Mapping[str, Any]) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    out = Table(title=f"{len(found['vehicles'])} vehicles", show_lines=True)
+    count = len(found["vehicles"])
+    out = Table(title=f"{count} vehicle{'s' * (count != 1)}", show_lines=True)
     for heading in ("vehicle", "state", "set", "parameters", "finding", "data"):
         out.add_column(heading, overflow="fold")
     for name, kinds in found["vehicles"].items():

@@ -287,7 +287,7 @@ class IdentifyNode(LifecycleNode):
 
     def _answer(self, response: Any, command: Callable[[Service], Answer]) -> Any:
         if self._service is None or not self._active:
-            response.success, response.message = False, "the node is not active"
+            response.success, response.message = False, "the node is not active; fix: activate it (ros2 lifecycle set)"
             return response
         answer = command(self._service)
         response.success, response.message = answer.done, answer.text

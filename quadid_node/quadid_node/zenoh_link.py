@@ -257,7 +257,7 @@ class Fleet:
                 answer = _parse(reply.ok.payload)
                 if answer is not None:
                     return bool(answer.get("done")), str(answer.get("text"))
-        return False, f"no answer from '{vehicle}': it is not there, or access control refuses the command"
+        return False, f"no answer from '{vehicle}': it is not there, too busy, or access control refuses the command"
 
     def close(self) -> None:
         """Leaves."""
