@@ -22,6 +22,7 @@ from typing import Any
 
 import rclpy
 from quadid_msgs.msg import ParameterSet
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -141,7 +142,7 @@ def main() -> None:
                 )
                 print(f"attitude tracking error: {before:.4f} rad with the first guess, {after:.4f} rad with the set")
                 break
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         controller.destroy_node()

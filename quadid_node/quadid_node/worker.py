@@ -21,10 +21,9 @@ from quadid.online.changes import ChangeReply
 from quadid.online.fitting import FitReply
 from quadid.online.study import StudyReply
 from quadid.vehicle import Vehicle
+from quadid_node.warm_up import WarmUp
 from quadid_node.worker_main import READY, THREADS, frame, unframe
 
-START_LIMIT = 180.0
-"""A worker that is not ready by then [s] is replaced; a first start may have to compile the kernels."""
 FIT_LIMIT = 30.0
 """A fit that takes longer [s] counts as hung,"""
 STUDY_LIMIT = 600.0
@@ -186,6 +185,7 @@ class ProcessWorker:
         self._in.clear()
         self._out = bytearray(frame(self._vehicle))
         self.state, self._since = "starting", self._clock()
+        self._warm_up = WarmUp(self._child.pid, self._clock)
 
     def _give(self) -> None:
         assert self._request is not None
@@ -227,8 +227,8 @@ class ProcessWorker:
         waited = self._clock() - self._since
         if code is not None:
             why = f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
-        elif self.state == "starting" and waited > START_LIMIT:
-            why = f"not ready after {START_LIMIT:g} s"
+        elif self.state == "starting" and (given_up := self._warm_up.given_up()):
+            why = given_up
         elif self.state == "busy" and waited > self._limit:
             why = f"hung for {self._limit:g} s"
         else:

@@ -1,0 +1,65 @@
+"""A child that starts is given up when it stands still, not when a slow machine makes it compile for long."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from quadid_node.warm_up import STILL, WORK, WarmUp, processor_seconds
+
+from quadid_node import warm_up
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> dict[str, float | None]:
+    """Time on the clock, and processor time that the watched child has used so far."""
+    told: dict[str, float | None] = {"now": 0.0, "used": 0.0}
+    monkeypatch.setattr(warm_up, "processor_seconds", lambda pid: told["used"])
+    return told
+
+
+def watch(work: dict[str, float | None]) -> WarmUp:
+    return WarmUp(1, lambda: work["now"] or 0.0)
+
+
+def test_a_child_that_works_may_take_its_time(work: dict[str, float | None]) -> None:
+    child = watch(work)
+    for step in range(1, 100):  # a busy machine: two per cent of a core
+        work.update(now=100.0 * step, used=2.0 * step)
+        assert child.given_up() == ""
+
+
+def test_a_child_that_stands_still_or_never_ends_is_given_up(work: dict[str, float | None]) -> None:
+    child = watch(work)
+    work.update(now=10.0, used=3.0)
+    assert child.given_up() == ""
+    work["now"] = 10.5 + STILL
+    assert "idle" in child.given_up()
+    work["used"] = WORK + 1.0
+    assert "of work" in child.given_up()
+
+
+def test_where_the_system_tells_nothing_the_clock_decides(work: dict[str, float | None]) -> None:
+    work["used"] = None
+    child = watch(work)
+    work["now"] = STILL - 1.0
+    assert child.given_up() == ""
+    work["now"] = STILL + 1.0
+    assert "not ready" in child.given_up()
+
+
+def test_processor_time_is_that_of_the_process() -> None:
+    if not sys.platform.startswith("linux"):
+        pytest.skip("/proc is Linux's")
+    own = processor_seconds(os.getpid())
+    assert own == pytest.approx(time.process_time(), abs=0.5)
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        assert processor_seconds(child.pid) is not None
+    finally:
+        child.kill()
+        child.wait()
+    assert processor_seconds(child.pid) is None
