@@ -37,6 +37,7 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
         "peers": lambda: peers.swarms(few),
         "optimum": lambda: peers.time_to_optimum(rounds),
         "identification": lambda: whole.identification(rounds),
+        "diagnoses": lambda: whole.diagnoses(few),
         "refits": lambda: whole.refits(3 * rounds),
         "help": lambda: whole.sayings(rounds),
         "commands": lambda: whole.commands(few, folder),

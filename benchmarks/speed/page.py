@@ -109,8 +109,11 @@ def _pieces(r: Result) -> list[str]:
         f"{_STEP_OPERATIONS / ns['nominal step'] / peak:.0%} of it busy. A rollout takes longer than its pieces; that "
         "its data (moments, measurements, weights, projections) come from the second cache is the likely reason.", "",
         "Kept, because it won: attitudes looked up for all lanes at once where they look back alike; shared rotor "
-        "moments read inside the nominal step. Dropped: whitening one column as a product of two matrices (no gain). "
-        "Not tried: float32, two vectors of lanes interleaved by hand, kernels compiled for each set of effects.",
+        "moments read inside the nominal step; steps compiled for groups of effects (the body alone, rotor drag, each "
+        "with what is rare), with parameter vectors that need the same put into one block of lanes; rotors that begin "
+        "anew before a late segment. Dropped: whitening one column as a product of two matrices (no gain). Not tried: "
+        "float32, two vectors of lanes interleaved by hand, a kernel for every single set of effects (each costs "
+        "seconds to compile).",
     ]  # fmt: skip
 
 
@@ -156,6 +159,11 @@ def _optimum(r: Result) -> list[str]:
 
 def _identification(r: Result) -> list[str]:
     return ["500 s at 50 Hz, warm.", "", *_times(r, lambda n, t: f" {r['evaluations'][n]} |", " evaluations |")]
+
+
+def _diagnoses(r: Result) -> list[str]:
+    found = {n: ", ".join(names) or "nothing" for n, names in r["found"].items()}
+    return ["Warm, in one process, the whole catalogue.", "", *_times(r, lambda n, t: f" {found[n]} |", " found |")]
 
 
 def _starts(r: Result) -> list[str]:
@@ -206,6 +214,7 @@ PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
     "peers": ("Particle swarms", _peers),
     "optimum": ("Time to the optimum", _optimum),
     "identification": ("Identification of a 500 s set", _identification),
+    "diagnoses": ("Diagnosis of 120 s", _diagnoses),
     "refits": ("Refit of a 10 s window", _times),
     "help": ("Commands that say something at once", _times),
     "commands": ("Commands", _times),

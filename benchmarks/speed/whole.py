@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.speed.flights import flight, logged
+from benchmarks.speed.flights import SEED, flight, logged
 from benchmarks.speed.timing import child, command, interleaved
+from quadid.diagnose import diagnose
+from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.swarm import SwarmOptions
 from quadid.model.layout import Layout
@@ -100,6 +102,23 @@ def commands(rounds: int, folder: Path) -> dict[str, Any]:
         "quadid diagnose, 120 s MCAP": ("diagnose", str(short), *model),
     }
     return {"times": interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)}  # type: ignore[misc]
+
+
+HIDDEN: dict[str, dict[str, dict[str, float]]] = {
+    "nothing hidden": {},
+    "motor lag": {"motor_lag": {"tau": 0.03}},
+    "rotor drag and motor lag": {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "motor_lag": {"tau": 0.03}},
+}
+
+
+def diagnoses(rounds: int) -> dict[str, Any]:
+    """Diagnosis of 120 s over the whole catalogue in a process whose kernels are warm."""
+    vehicle = Vehicle.shipped("pelican")
+    flights = {n: fly(vehicle, draw_truth(vehicle, SEED), 120.0, SEED, effects=e).window for n, e in HIDDEN.items()}
+    found = {n: diagnose([w], vehicle)[0] for n, w in flights.items()}
+    cases: dict[str, Any] = {n: lambda w=w: diagnose([w], vehicle) for n, w in flights.items()}
+    named = {n: [f.effect for f in d.findings] for n, d in found.items()}
+    return {"times": interleaved(cases, rounds), "found": named}
 
 
 def sayings(rounds: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
+from quadid.identify.bounded import least_within
 from quadid.identify.shooting import Free, Linearised, Shooting
 
 FloatArray = NDArray[np.float64]
@@ -29,10 +30,6 @@ class Convergence(StrEnum):
 
 LONGEST_STEP = 3.0
 """No scaled parameter moves farther than this in one step."""
-_FLAT = 1e-14
-"""Curvature, relative to the largest, below which a direction is flat: no step is made along it."""
-_ROOM = 1e-13
-"""A parameter on both of its bounds still has this much room, which the solver asks for."""
 _STEADY_WEIGHT = 0.01
 """Robust weights are renewed while any of them changes by more than this."""
 
@@ -199,20 +196,10 @@ def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) ->
     if not len(g):
         return np.zeros(0)
     low, high = _step_limits(free, theta)
-    # h = F F': parameters are scaled first, so that only a true lack of information makes a direction vanish.
+    # Parameters are scaled first, so that only a true lack of information makes a direction vanish.
     scale = np.sqrt(np.where(np.diag(h) > 0.0, np.diag(h), 1.0))
-    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
-    seen = values > _FLAT * values[-1]
-    root, axes = np.sqrt(values[seen]), vectors[:, seen]
-    target = -(axes.T @ (g / scale)) / root
-    z = np.asarray(axes @ (target / root) / scale)
-    if np.all((z >= low) & (z <= high)):
-        return z
-    from scipy.optimize import lsq_linear  # slow to import, and most steps end inside the bounds
-
-    box = (low * scale - _ROOM, high * scale + _ROOM)
-    solved = lsq_linear(root[:, None] * axes.T, target, box, method="bvls", tol=1e-12, max_iter=20 * len(g))
-    return np.clip(solved.x / scale, low, high)
+    z = least_within(h / np.outer(scale, scale), g / scale, low * scale, high * scale)
+    return np.clip(z / scale, low, high)
 
 
 def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
