@@ -122,6 +122,7 @@ test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install
 
 .PHONY: faults
 faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/results/faults.md
+	rm -f docs/results/faults.json
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser" --faults-page docs/results/faults.md tests
 
 .PHONY: fuzz
