@@ -157,7 +157,8 @@ mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line
 	$(STUDY) studies.mutation --out docs/results
 
 audit: $(QUALITY) ## known holes in what the container installs; fails where the advisories cannot be reached
-	$(BIN)/pip-audit --requirement docker/requirements.txt --require-hashes --disable-pip --progress-spinner off --timeout 20
+	$(BIN)/pip-audit --requirement docker/requirements.txt --strict --require-hashes --disable-pip \
+		--progress-spinner off --timeout 20
 
 pins: $(QUALITY) ## exact versions with hashes of what the container installs, into docker/requirements.txt
 	$(BIN)/uv pip compile --quiet --no-config --upgrade --generate-hashes --python-version 3.12 \

@@ -45,6 +45,27 @@ def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
     assert not ledger.roll_back(31.0, "bob").done, "a stale set is nothing to return to"
 
 
+def test_losses_to_the_predecessor_add_up_and_gains_do_not() -> None:
+    ledger = Ledger("auto")
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    assert not ledger.watch(29.5, 39.5, 5.0), "a window that the set has seen"
+    assert ledger.watched == 0.0
+    assert ledger.watch(30.0, 40.0, 5.0)
+    assert not ledger.watch(35.0, 45.0, 5.0), "half of it was counted"
+    assert ledger.watch(40.0, 50.0, 7.0)
+    assert ledger.watched == 12.0
+    assert ledger.watch(50.0, 60.0, -100.0)
+    assert ledger.watched == 0.0
+
+
+def test_a_set_that_waits_can_be_dropped() -> None:
+    ledger = Ledger("manual")
+    ledger.hold(online_set(TRUE), 30.0)
+    ledger.drop_pending()
+    assert ledger.pending is None
+    assert not ledger.approve(31.0, "ann").done
+
+
 class Machine(RuleBasedStateMachine):
     """Any order of commands."""
 
