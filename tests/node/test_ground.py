@@ -198,8 +198,8 @@ def test_through_mutual_tls_only_the_ground_machine_fits(net: Net, request_: Fit
     try:
         assert until(lambda: ground.there)
         for _ in range(3):
-            ground.ask(request_, answers, 30.0)
-            number, data = answers.get(timeout=60.0)
+            ground.ask(request_, answers, 100.0)
+            number, data = answers.get(timeout=150.0)
             assert isinstance(data, bytes)
             far = unpack(data)
             assert isinstance(far, FitReply)

@@ -322,5 +322,6 @@ def test_no_published_set_was_unapproved_out_of_bounds_or_without_a_journal_row(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_same_with_many_more_histories(happened: Happened) -> None:
     check(150, happened)
