@@ -65,8 +65,9 @@ def _kernel(r: Result) -> list[str]:
         )
     rows += [f"| {name} | {t['least']:.0f} | {t['low']:.0f} … {t['high']:.0f} | |" for name, t in r["numpy"].items()]
     return [
-        "Time by the clock of short runs, spread over the whole measurement. Other programs only ever add to a run, so "
-        "the best is what the kernel takes, and quartiles say how busy the machine was.", "",
+        "Short runs, spread over the whole measurement: processor time on one core, time by the clock on both. Other "
+        "programs only ever add to a run, so the best is what the kernel takes, and quartiles say how busy the machine "
+        "was.", "",
         *rows, "",
         f"Measured peak of one core: {r['fma_per_ns']:.1f} fused multiply-adds of float64 per ns. The nominal rollout "
         f"does {r['operations']} operations a step, which is {r['share_of_peak']:.0%} of that peak. The same step in "
