@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import pytest
 
+from studies.judged import judged
 from tests.faults.rows import FAULTS
 
 Happened = Callable[[int, str], None]
@@ -85,7 +86,8 @@ class Collector:
         told = sorted([*(e for e in known if e.test not in ran), *self.evidence], key=lambda e: (e.row, e.test))
         self.page.parent.mkdir(parents=True, exist_ok=True)
         account.write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        self.page.write_text(page(told, self.failed, self.skipped, self.command), encoding="utf-8")
+        text = page(told, self.failed, self.skipped, self.command) + judged(self.page)
+        self.page.write_text(text, encoding="utf-8")
 
 
 def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[str], command: str) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from quadid.online.ledger import Ledger
-from quadid.online.records import Publish, SetState
+from quadid.online.ledger import Answer, Ledger
+from quadid.online.records import Event, Publish, SetState
 from tests.online.test_gate import TRUE, online_set
 
 
@@ -56,6 +58,40 @@ def test_losses_to_the_predecessor_add_up_and_gains_do_not() -> None:
     assert ledger.watched == 12.0
     assert ledger.watch(50.0, 60.0, -100.0)
     assert ledger.watched == 0.0
+
+
+def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
+    """With words and stamps: they are what the history keeps."""
+    ledger = Ledger("manual")
+    assert ledger.approve(1.0, "ann") == Answer(False, "nothing waits for approval")
+    assert ledger.roll_back(1.0, "ann") == Answer(False, "there is no earlier set to return to")
+    waits = ledger.hold(replace(online_set(TRUE), reason="3 windows agree"), 30.0)
+    assert ledger.approve(1.0, "ann", 7) == Answer(False, "set 7 is not the one that waits (1)")
+    told = ledger.approve(31.0, "ann")
+    first = ledger.in_force
+    assert first is not None
+    assert (first.reason, first.approved_by, ledger.seen) == ("approved by ann: 3 windows agree", "ann", 30.0)
+    assert told.done is True
+    assert told.text == f"set {waits.sequence} approved, in force as set 2"
+    event = Event(31.0, "info", "accepted", f"set 2 in force: {first.reason}")
+    assert told.actions == (Publish("parameters", first), event)
+    ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
+    back = ledger.roll_back(61.0, "bob")
+    reason = "set 2 again, in place of set 3: asked for by bob"
+    assert ledger.in_force is not None
+    assert (ledger.in_force.reason, ledger.in_force.approved_by) == (reason, "bob")
+    event = Event(61.0, "warning", "rollback", reason)
+    assert back == Answer(True, reason, (Publish("parameters", ledger.in_force), event))
+
+
+def test_a_rollback_by_itself_keeps_the_approval_and_the_baseline() -> None:
+    ledger = Ledger("auto")
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
+    baseline = ledger.baseline
+    assert ledger.roll_back(61.0, "auto", "it predicts worse").text.endswith("set 2: it predicts worse")
+    assert ledger.approval == "auto"
+    assert ledger.baseline is baseline
 
 
 def test_a_set_that_waits_can_be_dropped() -> None:
