@@ -20,6 +20,8 @@ import yaml
 from mutmut.mutation.diff_apply import get_diff_for_mutant
 from mutmut.stats import status_by_exit_code
 
+from studies.judged import judged as by_hand
+
 MUTATED = ("gate", "ledger", "session")
 """Modules of quadid/online that are spoilt (`[tool.mutmut]` in pyproject.toml)."""
 UNNOTICED = ("survived", "no tests")
@@ -45,14 +47,18 @@ def main() -> None:
         verdicts = outcome(module)
         counts[module] = Counter(verdicts.values())
         left[module] = [survivor(module, name, judged) for name, verdict in verdicts.items() if verdict in UNNOTICED]
-    (given.out / "mutation.md").write_text(page(counts, left), encoding="utf-8")
+    where = given.out / "mutation.md"
+    where.write_text(page(counts, left) + by_hand(where), encoding="utf-8")
     open_ = sum(not s.judgement for found in left.values() for s in found)
     print(f"{sum(len(found) for found in left.values())} unnoticed, {open_} of them not judged yet")
 
 
 def outcome(module: str) -> dict[str, str]:
-    """Verdict of every mutant of a module of quadid/online."""
-    told = json.loads(Path(f"mutants/quadid/online/{module}.py.meta").read_text(encoding="utf-8"))
+    """Verdict of every mutant of a module of quadid/online; none where it was not spoilt."""
+    file = Path(f"mutants/quadid/online/{module}.py.meta")
+    if not file.exists():
+        return {}
+    told = json.loads(file.read_text(encoding="utf-8"))
     return {name: status_by_exit_code[code] for name, code in told["exit_code_by_key"].items()}
 
 
@@ -75,6 +81,9 @@ def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivo
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for module, c in counts.items():
+        if not c:
+            lines.append(f"| `online/{module}.py` | – | – | – | – | **not spoilt yet** | – |")
+            continue
         unnoticed, waiting = sum(c[v] for v in UNNOTICED), c["not checked"]
         noticed = c.total() - unnoticed - waiting
         share = 100.0 * noticed / max(noticed + unnoticed, 1)
