@@ -13,8 +13,9 @@ _STEP_OPERATIONS = 190
 
 INTRODUCTION = (
     "Cases of a table run in turn, round by round; medians, quartiles in brackets. Other programs share the machine, "
-    "so ratios within a table mean more than its seconds; processor time is that of all threads and child processes. "
-    "Every number is in `speed.json`."
+    "so ratios within a table mean more than its seconds; processor time, in the first table in brackets, is that of "
+    "all threads and child processes, and grows too where programs share caches. Below every table stands when it was "
+    "measured and how busy the machine was. Every number is in `speed.json`."
 )
 
 

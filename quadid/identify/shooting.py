@@ -26,7 +26,7 @@ from quadid.model import layout as ix
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout
 from quadid.model.packing import packed, packing
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout, Segments, shared_rollout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -71,7 +71,7 @@ class Shooting:
         self.dt = dt
         length, lead = max(round(seconds / dt), 4), max(round(LEAD_SECONDS / dt), 1)
         fits = [w for w in windows if len(w) > length + lead]
-        self.rollouts = [Rollout(w, vehicle) for w in fits]
+        self.rollouts = [shared_rollout(w, vehicle) for w in fits]
         self.channels = min((r.channels for r in self.rollouts), default=9)
         self.segments = [Segments.cut(len(r), length, lead) for r in self.rollouts]
         self.length, self.lead = length, lead

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from queue import SimpleQueue
 from typing import NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +96,7 @@ class Rollout:
     """The simulation of one window: residuals of many parameter vectors against its measurements.
 
     Attributes:
-        window: the data.
+        window: the data; vehicle: its rotors and mass.
         channels: 9, 12 with velocity, 15 with position.
         valid: shape (n, channels), True where there is a measurement.
     """
@@ -109,7 +110,7 @@ class Rollout:
                 f"{rotors}, as vehicle '{vehicle.name}' has",
                 "choose the vehicle that flew, or map the columns",
             )
-        self.window = window
+        self.window, self.vehicle = window, vehicle
         self.mass = vehicle.mass
         positions = vehicle.rotor_positions
         self.geometry = np.column_stack([positions[:, :2], vehicle.spins])
@@ -311,6 +312,22 @@ class Rollout:
                 nearest = good[np.argmin(np.abs(rows[:, None] - good[None, :]), axis=1)] if len(good) < len(w) else rows
                 x0[:, place : place + values.shape[1]] = values[nearest]
         return x0
+
+
+_SHARED: WeakValueDictionary[tuple[int, int], Rollout] = WeakValueDictionary()
+
+
+def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
+    """The `Rollout` of this very window and vehicle that somebody still uses, or a new one.
+
+    Problems with segments of several lengths look at the same data; of a long log each copy would be a large part of
+    all memory.
+    """
+    key = (id(window), id(vehicle))  # of objects that the one found keeps alive
+    found = _SHARED.get(key)
+    if found is None:
+        found = _SHARED[key] = Rollout(window, vehicle)
+    return found
 
 
 def _measured(window: Window, channels: int) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from quadid.errors import WindowError
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments, shared_rollout
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -161,3 +161,11 @@ def test_a_second_start_compiles_nothing() -> None:
     )
     test_results_can_be_written_into_earlier_ones()
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+def test_a_rollout_is_shared_while_somebody_uses_it() -> None:
+    window = noisy_window()
+    one = shared_rollout(window, VEHICLE)
+    assert shared_rollout(window, VEHICLE) is one
+    assert shared_rollout(window, VEHICLE.model_copy()) is not one
+    assert shared_rollout(noisy_window(), VEHICLE) is not one
