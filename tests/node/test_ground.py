@@ -176,7 +176,7 @@ def secure_ground(net: Net) -> Iterator[None]:
     stop, told = threading.Event(), list[str]()
     thread = threading.Thread(target=work, args=(net.client("ground"), stop.is_set, told.append))
     thread.start()
-    assert until(lambda: any("ready" in text for text in told)), told
+    assert until(lambda: any("ready" in text for text in told), START), told
     yield
     stop.set()
     thread.join(20)
@@ -196,7 +196,7 @@ def test_through_mutual_tls_only_the_ground_machine_fits(net: Net, request_: Fit
     ]
     ground, answers = Ground(net.client("quad1"), "quad1"), queue.Queue[tuple[int, object]]()
     try:
-        assert until(lambda: ground.there)
+        assert until(lambda: ground.there, START)
         for _ in range(3):
             ground.ask(request_, answers, 100.0)
             number, data = answers.get(timeout=150.0)
@@ -223,7 +223,7 @@ def test_the_ground_machine_sees_and_sends_windows_and_fits_only(net: Net) -> No
     spy = ground.declare_subscriber("quadid/**", lambda sample: heard.append(sample.payload.to_bytes()))
     link, fleet = ZenohLink(net.client("quad1"), "quad1", service()), Fleet(net.client("watch"))
     try:
-        assert until(lambda: fleet.alive.get("quad1", False))
+        assert until(lambda: fleet.alive.get("quad1", False), START)
         time.sleep(0.3)
         ground.put("quadid/quad1/health", b'{"sequence": 666}')
         link.publish(accepted(1))
