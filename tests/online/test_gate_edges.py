@@ -112,8 +112,9 @@ def test_a_sharper_set_waits_for_its_pause(age: float, news: bool) -> None:
 
 
 def test_a_parameter_that_is_new_hides_no_step_of_those_after_it() -> None:
-    case = good(parameters=led_by(parameter_set(TRUE), 0.3), in_force=online_set(scaled(b=2.0)))
-    assert decide(case, GateSettings()).check == "step_limit"
+    force = online_set(scaled(**dict.fromkeys(ALL, 2.0)))
+    decision = decide(good(parameters=led_by(parameter_set(TRUE), 0.3), in_force=force), GateSettings())
+    assert decision.reason.startswith("b would change by -50%")
 
 
 @pytest.mark.parametrize("value", [-0.3, 0.1, 3.0])

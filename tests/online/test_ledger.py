@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from hypothesis import settings
@@ -92,6 +93,46 @@ def test_a_rollback_by_itself_keeps_the_approval_and_the_baseline() -> None:
     assert ledger.roll_back(61.0, "auto", "it predicts worse").text.endswith("set 2: it predicts worse")
     assert ledger.approval == "auto"
     assert ledger.baseline is baseline
+
+
+def test_a_restored_set_says_where_it_is_from_and_is_the_baseline() -> None:
+    ledger = Ledger("auto", restored=replace(online_set(TRUE), reason="3 windows agree"))
+    assert ledger.in_force is not None
+    assert ledger.in_force.reason == "from an earlier run (3 windows agree): not yet confirmed by this flight"
+    assert ledger.baseline is ledger.in_force
+    assert (ledger.seen, ledger.watched) == (-math.inf, 0.0)
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    assert ledger.in_force.sequence == 2, "one more than the restored set's"
+    approved = replace(online_set(TRUE), sequence=5)
+    assert Ledger("auto", restored=online_set(TRUE), baseline=approved).baseline is approved
+
+
+def test_creeping_is_measured_from_the_first_set_or_the_last_one_a_person_approved() -> None:
+    ledger = Ledger("auto")
+    ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
+    first = ledger.in_force
+    assert ledger.baseline is first
+    ledger.accept(online_set(TRUE), "auto", 60.0, 60.0)
+    assert ledger.baseline is first
+    ledger.accept(online_set(TRUE), "ann", 90.0, 90.0)
+    assert ledger.baseline is ledger.in_force
+
+
+def test_a_newer_set_that_waits_takes_the_number_of_the_older_one() -> None:
+    ledger = Ledger("manual")
+    older, newer = (ledger.hold(online_set({**TRUE, "b": b}), 30.0) for b in (2.3e-5, 2.4e-5))
+    assert (older.sequence, newer.sequence) == (1, 1)
+    assert ledger.pending is newer
+    assert newer.state is SetState.PENDING
+    ledger.accept(online_set(TRUE), "auto", 31.0, 31.0)
+    assert ledger.hold(online_set(TRUE), 32.0).sequence == 3
+
+
+def test_twenty_sets_can_be_taken_back() -> None:
+    ledger = Ledger("auto")
+    for k in range(25):
+        ledger.accept(online_set(TRUE), "auto", float(k), float(k))
+    assert [ledger.roll_back(30.0, "auto").done for _ in range(21)] == [True] * 20 + [False]
 
 
 def test_a_set_that_waits_can_be_dropped() -> None:
