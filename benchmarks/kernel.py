@@ -218,7 +218,7 @@ def all_model_cases(vehicle: Vehicle, m: int) -> list[tuple[Case, Case]]:
         ("nominal", nominal, 9),
         ("motor lag, one a particle", free(nominal, LAG), 9),
         ("motor lag and delay", free(nominal, LAG, DELAY), 9),
-        ("rotor drag (full equations)", free(nominal, *DRAG), 9),
+        ("rotor drag", free(nominal, *DRAG), 9),
         ("rotor drag, lag, delay, sag", free(nominal, *DRAG, LAG, DELAY, SAG), 9),
         ("every effect", every_effect(vehicle, nominal), 9),
         ("every effect, velocity and position", every_effect(vehicle, nominal), 15),

@@ -72,7 +72,7 @@ def _kernel(r: Result) -> list[str]:
         *rows, "",
         f"Measured peak of one core: {r['fma_per_ns']:.1f} fused multiply-adds of float64 per ns. The nominal rollout "
         f"does {r['operations']} operations a step, which is {r['share_of_peak']:.0%} of that peak. The same step in "
-        f"NumPy at its best takes {r['gain_over_numpy']:.0f} times as long; the full equations take "
+        f"NumPy at its best takes {r['gain_over_numpy']:.0f} times as long; rotor drag takes "
         f"{r['extended_over_nominal']:.1f} times the nominal, every effect {r['every_over_nominal']:.1f} times. All in "
         "float64: there is no float32 kernel.",
     ]  # fmt: skip
@@ -204,7 +204,8 @@ def _scaling(r: Result) -> list[str]:
         *rows, "",
         f"Processor time grows with the {e['fit_processor']:.2f}th power of the length, memory with the "
         f"{e['peak_mb']:.2f}th: the swarm, the first polish and the noise use a bounded number of segments, the last "
-        "polish all.", "", "![](speed-scaling.png)",
+        "polish all, whose residuals and weights are held whole, so that memory grows with the log.", "",
+        "![](speed-scaling.png)",
     ]  # fmt: skip
 
 
