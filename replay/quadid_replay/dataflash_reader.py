@@ -135,7 +135,7 @@ def _vectors(
                 sample = index.column(name, "SampleUS")[source.rows] * 1e-6
                 t = (
                     t + (sample - sample[:1]) - (t - t[:1])
-                    if np.abs((sample - sample[:1]) - (t - t[:1])).max() < 0.1
+                    if np.abs((sample - sample[:1]) - (t - t[:1])).max(initial=0.0) < 0.1
                     else t
                 )
             out.append(RawChannel(channel, t, _stack(index, source, columns), f"{name} instance 0", source.refused))

@@ -84,3 +84,13 @@ def test_attitudes_that_are_no_numbers_pass_without_a_warning() -> None:
         warnings.simplefilter("error")
         assert not np.isfinite(to_euler(bad)[0]).all()
         assert not np.isfinite(from_euler(bad[:1, :3])).all()
+
+
+def test_a_log_of_a_second_imu_only_has_no_gyro(tmp_path: Path) -> None:
+    log = Dataflash()
+    log.describe(2, "GYR", "QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ")
+    log.describe(4, "ATT", "Qcccccc", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw")
+    for k in range(100):
+        log.add("GYR", 10_000 * k, 1, 10_000 * k, 0.1, 0.2, 0.3)
+        log.add("ATT", 10_000 * k, 100, 1000, -100, -500, 9000, 27000)
+    assert "gyro" not in open_log(opened(tmp_path, bytes(log.data))).channels
