@@ -19,6 +19,8 @@ from quadid.identify.reduction import Whitening
 from quadid.vehicle import Noise
 
 FloatArray = NDArray[np.float64]
+_Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None]
+"""A noise model as a key: white, slow, slow time, and the spectrum's shape and bytes."""
 
 SLOW_TIME = 0.66
 """Correlation time of the slow AHRS error [s]: a pole of 0.97 at 50 Hz, safe also when the noise is white."""
@@ -67,13 +69,16 @@ class NoiseModel:
 
         Rows look back only (inverse of a Cholesky factor), so a whitened residual keeps its order in time.  Read-only.
         """
-        shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
-        return _whitener(tuple(self.white), tuple(self.slow), self.slow_time, shape, length, dt)
+        return _whitener(self._numbers, length, dt)
 
     def whitening(self, length: int, dt: float) -> Whitening:
         """What weights and whitens the channels of a segment; see `whitener`."""
+        return _whitening(self._numbers, length, dt)
+
+    @property
+    def _numbers(self) -> _Numbers:
         shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
-        return _whitening(tuple(self.white), tuple(self.slow), self.slow_time, shape, length, dt)
+        return tuple(self.white), tuple(self.slow), self.slow_time, shape
 
     @property
     def coloured(self) -> NDArray[np.bool_]:
@@ -82,30 +87,29 @@ class NoiseModel:
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
 
 
+def _model_of(numbers: _Numbers) -> NoiseModel:
+    whites, slows, slow_time, shape = numbers
+    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
+    return NoiseModel(np.array(whites), np.array(slows), slow_time, shapes)
+
+
 @lru_cache(maxsize=16)
-def _whitening(
-    whites: tuple[float, ...], slows: tuple[float, ...], slow_time: float, shape: tuple[tuple[int, ...], bytes] | None,
-    length: int, dt: float,
-) -> Whitening:  # fmt: skip
+def _whitening(numbers: _Numbers, length: int, dt: float) -> Whitening:
     """`NoiseModel.whitening` of these numbers."""
-    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
-    noise = NoiseModel(np.array(whites), np.array(slows), slow_time, shapes)
-    return Whitening(np.sqrt(noise.variance), noise.coloured, noise.whitener(length, dt))
+    noise = _model_of(numbers)
+    return Whitening(np.sqrt(noise.variance), noise.coloured, _whitener(numbers, length, dt))
 
 
 @lru_cache(maxsize=16)
-def _whitener(
-    whites: tuple[float, ...], slows: tuple[float, ...], slow_time: float, shape: tuple[tuple[int, ...], bytes] | None,
-    length: int, dt: float,
-) -> FloatArray:  # fmt: skip
+def _whitener(numbers: _Numbers, length: int, dt: float) -> FloatArray:
     """`NoiseModel.whitener` of these numbers, read-only; the same one is asked for again and again."""
-    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
-    out = np.zeros((len(whites), length, length))
-    for c, (white, slow) in enumerate(zip(whites, slows, strict=True)):
+    noise = _model_of(numbers)
+    out = np.zeros((len(noise.white), length, length))
+    for c, (white, slow) in enumerate(zip(noise.white, noise.slow, strict=True)):
         if slow > 0.0:
-            covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / slow_time)
-        elif shapes is not None and np.ptp(shapes[c]) > 0.0:
-            covariance = white**2 * _stationary(shapes[c], length)
+            covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / noise.slow_time)
+        elif noise.shape is not None and np.ptp(noise.shape[c]) > 0.0:
+            covariance = white**2 * _stationary(noise.shape[c], length)
         else:
             out[c] = np.eye(length) / white
             continue

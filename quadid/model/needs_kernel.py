@@ -39,13 +39,13 @@ class Needs(NamedTuple):
     ahrs: bool
 
 
-_AIR_ENTRIES = (ix.KX, ix.KY, ix.KZ)
-_RARE_ENTRIES = (ix.CPAR, ix.GROUND)
-_SOLID_ENTRIES = (
+AIR_ENTRIES = (ix.KX, ix.KY, ix.KZ)
+RARE_ENTRIES = (ix.CPAR, ix.GROUND)
+SOLID_ENTRIES = (
     ix.HX, ix.HY, ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ, ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ,
 )  # fmt: skip
-_FACTOR_ENTRIES = (ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION)
-_ROTOR_ENTRIES = (ix.TAU, ix.DELAY, ix.DEAD_SPEED)
+FACTOR_ENTRIES = (ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION)
+ROTOR_ENTRIES = (ix.TAU, ix.DELAY, ix.DEAD_SPEED)
 
 
 @nb.njit(**jit)
@@ -54,15 +54,15 @@ def _needs_of(theta: FloatArray, channels: int) -> Needs:
     air, solid, rare, factors, varied, imu_static = channels > 9, False, False, False, False, False
     delayed, imu_lag, att_delay, ahrs = False, False, False, False
     for lane in range(len(theta)):
-        for i in _AIR_ENTRIES:
+        for i in AIR_ENTRIES:
             air |= theta[lane, i] != 0.0
-        for i in _RARE_ENTRIES:
+        for i in RARE_ENTRIES:
             rare |= theta[lane, i] != 0.0
-        for i in _SOLID_ENTRIES:
+        for i in SOLID_ENTRIES:
             solid |= theta[lane, i] != 0.0
-        for i in _FACTOR_ENTRIES:
+        for i in FACTOR_ENTRIES:
             factors |= theta[lane, i] != 0.0
-        for i in _ROTOR_ENTRIES:
+        for i in ROTOR_ENTRIES:
             varied |= theta[lane, i] != theta[0, i]
         for i in range(ix.LOSS, theta.shape[1]):
             varied |= theta[lane, i] != theta[0, i]

@@ -10,19 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
+from quadid.model.needs_kernel import AIR_ENTRIES, FACTOR_ENTRIES, RARE_ENTRIES, ROTOR_ENTRIES, SOLID_ENTRIES
 from quadid.model.simd import LANES
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _AIR, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(8)
-_AIR_ENTRIES = [ix.KX, ix.KY, ix.KZ, ix.CPAR, ix.GROUND]
-_RARE_ENTRIES = [ix.CPAR, ix.GROUND]
-_SOLID_ENTRIES = [
-    ix.HX, ix.HY, ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ, ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ, ix.SAG,
-    ix.DROP_FRACTION, ix.MASS_FRACTION,
-]  # fmt: skip
-_ROTOR_ENTRIES = [ix.TAU, ix.DELAY, ix.DEAD_SPEED]
 _PLAIN, _AIR_COST, _SOLID_COST, _RARE_COST = 10.0, 10.0, 10.0, 7.0
 _ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7.0, 14.0, 10.0
 """Nanoseconds a particle and step, beside the plain ones; `python -m benchmarks.speed --parts pieces` measures them."""
@@ -37,10 +31,11 @@ def packing(thetas: FloatArray, channels: int) -> NDArray[np.intp]:
     if len(thetas) <= LANES:
         return np.arange(len(thetas))
     features = np.zeros((len(thetas), 8), dtype=bool)
-    for feature, entries in ((_AIR, _AIR_ENTRIES), (_SOLID, _SOLID_ENTRIES), (_RARE, _RARE_ENTRIES)):
-        features[:, feature] = (thetas[:, entries] != 0.0).any(axis=1)
+    groups = ((_AIR, AIR_ENTRIES + RARE_ENTRIES), (_SOLID, SOLID_ENTRIES + FACTOR_ENTRIES), (_RARE, RARE_ENTRIES))
+    for feature, entries in groups:
+        features[:, feature] = (thetas[:, list(entries)] != 0.0).any(axis=1)
     features[:, _AIR] |= channels > 9
-    own = np.concatenate([thetas[:, _ROTOR_ENTRIES], thetas[:, ix.LOSS :]], axis=1)
+    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS :]], axis=1)
     features[:, _ROTORS] = (own != own[0]).any(axis=1)
     for feature, entry in ((_DELAYED, ix.DELAY), (_FILTER, ix.IMU_PERIOD), (_LATE, ix.ATT_DELAY), (_AHRS, ix.AHRS_K)):
         features[:, feature] = thetas[:, entry] != 0.0
