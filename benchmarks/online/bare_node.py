@@ -6,45 +6,38 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable
 
 import rclpy
 from quadid_node.convert import message_class
 from quadid_node.node import SENSOR_QOS, STEP_SECONDS
+from quadid_node.polling import PollingNode
 from quadid_node.presets import source
 from quadid_node.stopping import Stop
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 
-class BareNode(Node):
+class BareNode(PollingNode):
     """Listens to what `identify` listens to."""
 
     def __init__(self, polled: bool) -> None:
         super().__init__("bare")
-        self._polled: list[Subscription[Any]] = []
+        self._takes: list[Callable[[], bytes | None]] = []
         for entry in source("canonical").inputs:
             kind = message_class(entry.type)
-            one = self.create_subscription(kind, entry.topic, lambda data: None, SENSOR_QOS, raw=True)
             if polled:
-                self._polled.append(one)
+                self._takes.append(self.poll(kind, entry.topic, SENSOR_QOS))
+            else:
+                self.create_subscription(kind, entry.topic, lambda data: None, SENSOR_QOS, raw=True)
         if polled:
             self.create_timer(STEP_SECONDS, self._empty)
 
-    @property
-    def subscriptions(self) -> Iterator[Subscription[Any]]:
-        """What the executor waits for."""
-        return (s for s in super().subscriptions if s not in self._polled)
-
     def _empty(self) -> None:
-        for one in self._polled:
-            with one.handle:
-                while one.handle.take_message(one.msg_type, True) is not None:
-                    pass
+        for take in self._takes:
+            while take() is not None:
+                pass
 
 
 def main() -> int:

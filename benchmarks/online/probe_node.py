@@ -14,8 +14,6 @@ from typing import Any
 
 import quadid_node.node
 from quadid_node.identify import main
-from quadid_node.presets import Input
-from rclpy.subscription import Subscription
 
 OUT = "QUADID_PROBE_OUT"
 _LAST_DOUBLE = struct.Struct("<d")
@@ -28,9 +26,10 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.idle, self.fitting, self.steps = array("d"), array("d"), array("d")
 
-    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
-        take = super()._taker(entry, subscription)
-        if entry.topic != "imu":
+    def poll(self, kind: Any, topic: str, qos: Any, **options: Any) -> Callable[[], bytes | None]:
+        """As the node's, with a note of each IMU message."""
+        take = super().poll(kind, topic, qos, **options)
+        if topic != "imu":
             return take
 
         def noted() -> bytes | None:

@@ -6,7 +6,7 @@ Callbacks convert, call and publish; everything else is in `service` and in the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
@@ -29,7 +28,8 @@ from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
 from quadid_node.intake import DEPTH, Intake
 from quadid_node.neighbours import Neighbours
 from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
-from quadid_node.presets import Input, Source, source
+from quadid_node.polling import PollingNode
+from quadid_node.presets import Source, source
 from quadid_node.recorder import Beginning, Recorder
 from quadid_node.service import Output, Service
 from quadid_node.speaker import Speaker
@@ -46,7 +46,7 @@ SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliabilit
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class IdentifyNode(LifecycleNode):
+class IdentifyNode(PollingNode, LifecycleNode):
     """Identifies one vehicle from its topics and publishes the parameter sets that passed the gate."""
 
     def __init__(self, stopping: Callable[[], bool] = lambda: False) -> None:
@@ -55,7 +55,6 @@ class IdentifyNode(LifecycleNode):
         Args:
             stopping: says that the process is asked to end, so that nothing is waited for any more.
         """
-        self._polled: list[Subscription[Any]] = []
         super().__init__("quadid")
         self._stopping = stopping
         for p in PARAMETERS:
@@ -147,27 +146,8 @@ class IdentifyNode(LifecycleNode):
                 incompatible_qos=lambda event, t=topic: self._neighbours.note(t, "its publisher's QoS does not match"),
                 matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
             )
-            subscription = self.create_subscription(
-                message_class(entry.type), entry.topic, _never, SENSOR_QOS, event_callbacks=events, raw=True
-            )
-            self._polled.append(subscription)
-            self._intake.open(entry, topic, decoder, self._taker(entry, subscription))
-
-    @property
-    def subscriptions(self) -> Iterator[Subscription[Any]]:
-        """What the executor waits for: not the topics of the vehicle, whose messages are taken at each step."""
-        return (s for s in super().subscriptions if s not in self._polled)
-
-    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
-        """What takes the next message that waits from the middleware."""
-        handle, kind = subscription.handle, subscription.msg_type
-
-        def take() -> bytes | None:
-            with handle:
-                taken = handle.take_message(kind, True)
-            return None if taken is None else taken[0]
-
-        return take
+            take = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS, event_callbacks=events)
+            self._intake.open(entry, topic, decoder, take)
 
     def _types_on(self, topic: str) -> list[str]:
         return [info.topic_type for info in self.get_publishers_info_by_topic(topic)]
@@ -184,9 +164,7 @@ class IdentifyNode(LifecycleNode):
     def _tear_down(self) -> None:
         self._active = False
         self._intake.clear()
-        for subscription in self._polled:
-            self.destroy_subscription(subscription)
-        self._polled.clear()
+        self.destroy_polled()
         for destroy, item in reversed(self._open):
             destroy(item)
         self._open.clear()
@@ -293,7 +271,3 @@ class IdentifyNode(LifecycleNode):
         response.success, response.message = answer.done, answer.text
         self._step()
         return response
-
-
-def _never(message: bytes) -> None:
-    """Stands where rclpy wants a callback; messages are taken by `Intake`."""

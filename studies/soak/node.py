@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 import quadid_node.node
 from quadid_node.identify import main
-from quadid_node.presets import Input
-from rclpy.subscription import Subscription
 
 from studies.soak import memory
 
@@ -32,14 +30,15 @@ class CountingNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
 
-    def _taker(self, entry: Input, subscription: Subscription[Any]) -> Callable[[], bytes | None]:
-        take = super()._taker(entry, subscription)
+    def poll(self, kind: Any, topic: str, qos: Any, **options: Any) -> Callable[[], bytes | None]:
+        """As the node's, with a count."""
+        take = super().poll(kind, topic, qos, **options)
 
         def counted() -> bytes | None:
             data = take()
             if data is not None:
-                self.counted[entry.topic] += 1
-                if entry.topic == "imu":
+                self.counted[topic] += 1
+                if topic == "imu":
                     self.late.append(time.time() - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
             return data
 
