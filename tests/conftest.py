@@ -31,6 +31,16 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(collector, "faults")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One process runs a file from beginning to end: what its tests share is flown, fitted or compiled once.
+
+    Those of `tests/node` are one group over all files (their own conftest).
+    """
+    for item in items:
+        if item.path.parent.name != "node":
+            item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(REPOSITORY))))
+
+
 def in_ci() -> bool:
     """True where nothing may be skipped for being absent (environment variable CI)."""
     return os.environ.get("CI", "").lower() in ("1", "true", "yes")

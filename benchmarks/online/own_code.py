@@ -48,7 +48,7 @@ def own_code(seconds: float) -> dict[str, Any]:
     for k, (topic, data) in enumerate(messages):
         arrived[topic].append(data)
         if k % STEP_EVERY == 0:
-            for item in intake.take():
+            for item in intake.read(intake.take()):
                 if isinstance(item, Block):
                     service.push_block(item)
                 else:

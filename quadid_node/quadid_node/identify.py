@@ -67,9 +67,9 @@ def main(args: list[str] | None = None) -> int:
         pass
     finally:
         stop.ignore_more()
+        executor.shutdown()  # first: it must not watch what the node takes down
         with contextlib.suppress(Exception):
             node.trigger_shutdown()
-        executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
     return code

@@ -31,6 +31,13 @@ class _Topic(NamedTuple):
     take: Callable[[], bytes | None]
 
 
+class Waiting(NamedTuple):
+    """Messages that were taken and not read yet: of each topic, and in how many slices of time they came."""
+
+    slices: int
+    messages: list[list[bytes]]
+
+
 class Intake:
     """The messages of all topics of one vehicle.
 
@@ -58,32 +65,28 @@ class Intake:
         # The gyro sets the pace of the grid: what came with it has been taken in before it.
         self._topics.sort(key=lambda item: any(channel == "gyro" for channel, _ in item.entry.channels))
 
-    def take(self, record: Record | None = None) -> Iterator[Sample | Block]:
-        """Takes all messages that wait.
+    def take(self) -> Waiting:
+        """Takes all messages that wait; those that are not read are forgotten."""
+        before, self._looked = self._looked, self._clock()
+        messages = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
+        return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
+
+    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[Sample | Block]:
+        """Reads what was taken.
 
         Args:
-            record: writes a message down (topic, type, bytes), in the order in which they are taken in.
+            waiting: what `take` gave.
+            record: writes a message down (topic, type, bytes), in the order in which they are read.
         """
-        slices, waiting = self._emptied()
-        for k in range(slices):
-            for (entry, decoder, _), messages in zip(self._topics, waiting, strict=True):
-                piece = messages[k * len(messages) // slices : (k + 1) * len(messages) // slices]
+        for k in range(waiting.slices):
+            for (entry, decoder, _), messages in zip(self._topics, waiting.messages, strict=True):
+                piece = messages[k * len(messages) // waiting.slices : (k + 1) * len(messages) // waiting.slices]
                 if record is not None:
                     for data in piece:
                         record(entry.topic, entry.type.replace("/", "/msg/"), data)
                 yield from decoder.take(piece)
 
-    def drop(self) -> None:
-        """Forgets what waits."""
-        self._emptied()
-
     def clear(self) -> None:
-        """Forgets the topics as well."""
+        """Forgets the topics."""
         self._topics.clear()
         self.decoders.clear()
-
-    def _emptied(self) -> tuple[int, list[list[bytes]]]:
-        """How many slices of time passed since the last look, and the messages of each topic."""
-        before, self._looked = self._looked, self._clock()
-        waiting = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
-        return max(1, math.ceil((self._looked - before) / SLICE)), waiting

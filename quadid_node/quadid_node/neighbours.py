@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from quadid.plain import plain
 
-REMEMBERED = 30.0
-"""A subscriber that cannot hear us is told of for so long [s] after it came."""
-_CROWDED = "publishers on one topic: paused until there is one"
-_STRANGE = "a publisher of another type"
+
+class Offer(NamedTuple):
+    """One publisher of a topic: the type of its messages, and whether its QoS lets us hear them."""
+
+    kind: str
+    heard: bool
 
 
 class Neighbours:
@@ -22,19 +24,16 @@ class Neighbours:
     """
 
     def __init__(
-        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[str]], tell: Callable[[str], None],
-        clock: Callable[[], float] = time.monotonic,
+        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[Offer]], tell: Callable[[str], None],
     ) -> None:  # fmt: skip
         """Watches the topics `inputs`.
 
         Args:
             inputs: type of messages by full name.
-            offered: types of a topic's publishers, one entry each.
+            offered: a topic's publishers.
             tell: takes a line for people.
-            clock: seconds, monotonic.
         """
-        self._inputs, self._offered, self._tell, self._clock = dict(inputs), offered, tell, clock
-        self._until: dict[str, float] = {}
+        self._inputs, self._offered, self._tell = dict(inputs), offered, tell
         self.notes: dict[str, str] = {}
         self.paused = False
 
@@ -46,36 +45,30 @@ class Neighbours:
             self._tell(f"{topic}: {text}")
             self.notes[topic] = text
 
-    def deaf(self, topic: str) -> None:
-        """A subscriber asks for more than we offer and will hear nothing."""
-        who = f"{topic}, its subscriber"
-        self._until[who] = self._clock() + REMEMBERED
-        self.note(who, "asks for a QoS that is not offered here, and receives nothing")
-
-    def matched(self, topic: str, publishers: int) -> None:
-        """The number of publishers of an input has changed: at once, before the new one's first message."""
+    def count(self, topic: str, publishers: int) -> None:
+        """So many publishers send to an input: two pause it at once, until `look` finds one."""
         if publishers > 1:
             self.paused = True
-            self.note(topic, f"{publishers} {_CROWDED}")
+            self.note(topic, f"{publishers} publishers on one topic: paused until there is one")
 
-    def look(self) -> None:
-        """Counts publishers, and forgets what is over; once a second.
+    def look(self, deaf: Mapping[str, bool]) -> None:
+        """Looks at every topic, once a second.
 
-        DDS tells some of it by events, but no type that differs: what nobody can receive has to be looked for.
+        Args:
+            deaf: for each topic of ours, whether somebody subscribes with a QoS that is not offered.
         """
-        most = 0
+        self.paused = False
         for topic, kind in self._inputs.items():
-            types = self._offered(topic)
-            strange = sorted({*types} - {kind})
-            most = max(most, types.count(kind))
-            if types.count(kind) > 1:
-                self.matched(topic, types.count(kind))
+            offers = self._offered(topic)
+            ours = [offer for offer in offers if offer.kind == kind]
+            strange = sorted({offer.kind for offer in offers} - {kind})
+            if len(ours) > 1:
+                self.count(topic, len(ours))
             elif strange:
-                self.note(topic, f"{_STRANGE} ({plain(strange[0], 80)} for {kind}), which is not listened to")
-            elif not types or any(told in self.notes.get(topic, "") for told in (_CROWDED, _STRANGE)):
-                self.note(topic, "")
-        self.paused = most > 1
-        for topic, until in list(self._until.items()):
-            if self._clock() > until:
-                del self._until[topic]
-                self.note(topic, "")
+                told = f"a publisher of another type ({plain(strange[0], 80)} for {kind}), which is not listened to"
+                self.note(topic, told)
+            else:
+                self.note(topic, "" if all(offer.heard for offer in ours) else "its publisher's QoS does not match")
+        for topic, found in deaf.items():
+            why = "asks for a QoS that is not offered here, and receives nothing" if found else ""
+            self.note(f"{topic}, its subscriber", why)

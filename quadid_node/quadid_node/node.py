@@ -13,9 +13,8 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
@@ -26,7 +25,7 @@ from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
 from quadid_node.intake import DEPTH, Intake
-from quadid_node.neighbours import Neighbours
+from quadid_node.neighbours import Neighbours, Offer
 from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
 from quadid_node.polling import PollingNode
 from quadid_node.presets import Source, source
@@ -63,6 +62,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._service: Service | None = None
         self._recorder: Recorder | None = None
         self._intake = Intake()
+        self._publishers_of: dict[str, Callable[[], int]] = {}
         self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -121,7 +121,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._observer = bool(values["observer"])
         self._stamps = messages.Clock()
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
-        self._neighbours = Neighbours(inputs, self._types_on, lambda text: self._log("error", text))
+        self._neighbours = Neighbours(inputs, self._offers_on, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
@@ -142,18 +142,17 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for entry in preset.inputs:
             decoder = Decoder(entry, self._stamps, chooser, rotors, deserializer(entry.type))
             topic = self.resolve_topic_name(entry.topic)
-            events = SubscriptionEventCallbacks(
-                incompatible_qos=lambda event, t=topic: self._neighbours.note(t, "its publisher's QoS does not match"),
-                matched=lambda event, t=topic: self._neighbours.matched(t, event.current_count),
-            )
-            take = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS, event_callbacks=events)
-            self._intake.open(entry, topic, decoder, take)
+            polled = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS)
+            self._publishers_of[topic] = polled.publishers
+            self._intake.open(entry, topic, decoder, polled.take)
 
-    def _types_on(self, topic: str) -> list[str]:
-        return [info.topic_type for info in self.get_publishers_info_by_topic(topic)]
+    def _offers_on(self, topic: str) -> list[Offer]:
+        found = self.get_publishers_info_by_topic(topic)
+        fits = [qos_check_compatible(info.qos_profile, SENSOR_QOS)[0] != QoSCompatibility.ERROR for info in found]
+        return [Offer(info.topic_type, heard) for info, heard in zip(found, fits, strict=True)]
 
     def _offer(self) -> None:
-        self._speaker = Speaker(self, self._observer, self._neighbours.deaf)
+        self._speaker = Speaker(self, self._observer)
         for name, answer in (("fit_now", self._fit_now), ("approve", self._approve), ("rollback", self._roll_back)):
             service = self.create_service(Trigger, f"quadid/{name}", answer)
             self._open.append((self.destroy_service, service))
@@ -164,6 +163,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _tear_down(self) -> None:
         self._active = False
         self._intake.clear()
+        self._publishers_of.clear()
         self.destroy_polled()
         for destroy, item in reversed(self._open):
             destroy(item)
@@ -190,10 +190,12 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _take_in(self, service: Service) -> None:
         """Gives the service what has arrived since the last step."""
+        waiting = self._intake.take()
+        for topic, publishers in self._publishers_of.items():
+            self._neighbours.count(topic, publishers())
         if not self._active or self._neighbours.paused:
-            self._intake.drop()
             return
-        for item in self._intake.take(self._recorder.take if self._recorder is not None else None):
+        for item in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
             if isinstance(item, Block):
                 service.push_block(item)
             else:
@@ -238,7 +240,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _look_around(self, service: Service, speaker: Speaker) -> None:
         """Who else publishes inputs, or the parameter sets of our vehicle."""
-        self._neighbours.look()
+        self._neighbours.look(speaker.deaf())
         force = service.session.ledger.in_force
         if speaker.step(self._active) and force is not None:
             self._put(Publish("parameters", force))

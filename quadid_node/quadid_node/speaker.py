@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.duration import Infinite
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 
 from quadid_node import messages
 from quadid_node.claim import Claim
 from quadid_node.convert import message_class, to_message
+from quadid_node.polling import NO_PUBLISHER_EVENTS
 
 LATCHED_QOS = QoSProfile(
     depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
@@ -30,15 +37,14 @@ class Speaker:
         ours: full name of the topic of parameter sets.
     """
 
-    def __init__(self, node: LifecycleNode, observer: bool, deaf: Callable[[str], None]) -> None:
+    def __init__(self, node: LifecycleNode, observer: bool) -> None:
         """Makes the publishers.
 
         Args:
             node: whose they are.
             observer: publish status and health only.
-            deaf: takes the topic of a subscriber that asks for a QoS that is not offered.
         """
-        self._node, self._deaf = node, deaf
+        self._node = node
         self.ours = node.resolve_topic_name(_NAMES["parameters"])
         self._publishers = {topic: self._create(topic, 10) for topic in KINDS if topic != "parameters"}
         self._claim: Claim | None = None
@@ -69,6 +75,22 @@ class Speaker:
         if publisher is not None:
             publisher.publish(to_message(KINDS[topic], fields))
 
+    def deaf(self) -> dict[str, bool]:
+        """For each topic of ours: whether somebody subscribes with a QoS that is not offered, and hears nothing."""
+        published = dict(self._publishers)
+        if self._claim is not None and self._claim.publisher is not None:
+            published["parameters"] = self._claim.publisher
+        return {p.topic_name: self._unheard(p) for p in published.values()}
+
+    def _unheard(self, publisher: Any) -> bool:
+        asked = [info.qos_profile for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        qos = publisher.qos_profile
+        offered = QoSProfile(
+            depth=qos.depth, reliability=qos.reliability, durability=qos.durability, deadline=Infinite,
+            liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Infinite,
+        )  # fmt: skip
+        return any(qos_check_compatible(offered, wish)[0] == QoSCompatibility.ERROR for wish in asked)
+
     def close(self) -> None:
         """Takes all publishers away."""
         if self._claim is not None:
@@ -78,10 +100,8 @@ class Speaker:
         self._publishers.clear()
 
     def _create(self, topic: str, qos: Any) -> Any:
-        full = self._node.resolve_topic_name(_NAMES[topic])
-        events = PublisherEventCallbacks(incompatible_qos=lambda event: self._deaf(full))
         return self._node.create_lifecycle_publisher(
-            message_class(KINDS[topic]), _NAMES[topic], qos, event_callbacks=events
+            message_class(KINDS[topic]), _NAMES[topic], qos, event_callbacks=NO_PUBLISHER_EVENTS
         )
 
     def _kin(self) -> int:

@@ -173,6 +173,25 @@ def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
         assert second.end()[0] == 0
 
 
+def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
+    """One that it watches outlives its topic, and the node ends by SIGSEGV now and then (ros2/rclpy issue 1644)."""
+    import rclpy
+    from quadid_node.node import IdentifyNode
+
+    rclpy.init(args=["--ros-args", "-p", "history:=none"])
+    try:
+        configured = IdentifyNode(lambda: True)
+        rclpys_own = {*configured.waitables}
+        configured.trigger_configure()
+        assert configured.count_publishers("/diagnostics") == 1
+        assert configured.count_subscribers("/imu") == 1
+        assert {*configured.waitables} == rclpys_own
+        configured.trigger_shutdown()
+        configured.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
 @pytest.mark.parametrize(
     ("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["int", "term", "int int"]
 )

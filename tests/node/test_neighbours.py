@@ -1,0 +1,68 @@
+"""What others do on the topics is told, and taken back when it is over."""
+
+from __future__ import annotations
+
+import pytest
+from quadid_node.neighbours import Neighbours, Offer
+
+IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
+GOOD = Offer(IMU, True)
+
+
+class Topic:
+    """One input, whose publishers are as set."""
+
+    def __init__(self) -> None:
+        self.offers: list[Offer] = [GOOD]
+        self.lines: list[str] = []
+        self.neighbours = Neighbours({"/imu": IMU}, lambda topic: self.offers, self.lines.append)
+
+    def look(self, *offers: Offer, deaf: bool = False) -> dict[str, str]:
+        self.offers = [*offers]
+        self.neighbours.look({"/candidate": deaf})
+        return self.neighbours.notes
+
+
+@pytest.fixture
+def topic() -> Topic:
+    return Topic()
+
+
+@pytest.mark.parametrize(
+    ("offers", "told"),
+    [
+        ([GOOD, GOOD], "2 publishers on one topic: paused until there is one"),
+        ([Offer(IMU, False)], "its publisher's QoS does not match"),
+        ([GOOD, Offer(JOINTS, True)], f"a publisher of another type ({JOINTS} for {IMU}), which is not listened to"),
+    ],
+)
+def test_what_is_wrong_is_told_once_and_taken_back(topic: Topic, offers: list[Offer], told: str) -> None:
+    assert topic.look(*offers) == {"/imu": told}
+    topic.look(*offers)
+    assert topic.lines == [f"/imu: {told}"]
+    assert topic.look(GOOD) == {}
+    assert topic.look(*offers) == {"/imu": told}
+    assert topic.look() == {}, "nobody there any more"
+
+
+def test_two_publishers_pause_at_once_and_one_goes_on(topic: Topic) -> None:
+    topic.neighbours.count("/imu", 1)
+    assert not topic.neighbours.paused
+    topic.neighbours.count("/imu", 2)
+    assert topic.neighbours.paused
+    topic.look(GOOD, GOOD)
+    assert topic.neighbours.paused
+    topic.look(GOOD)
+    assert not topic.neighbours.paused
+
+
+def test_two_types_on_a_topic_do_not_pause(topic: Topic) -> None:
+    topic.look(GOOD, Offer(JOINTS, True))
+    assert not topic.neighbours.paused
+
+
+def test_a_subscriber_that_hears_nothing_is_named_while_it_is_there(topic: Topic) -> None:
+    assert topic.look(GOOD, deaf=True) == {
+        "/candidate, its subscriber": "asks for a QoS that is not offered here, and receives nothing"
+    }
+    assert topic.look(GOOD) == {}
