@@ -6,7 +6,7 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from quadid_node.stopping import Stop
+from quadid_node.stopping import Stop, end_middleware
 
 if TYPE_CHECKING:
     from quadid_node.node import IdentifyNode
@@ -42,7 +42,12 @@ class Starter:
 
 def main(args: list[str] | None = None) -> int:
     """Runs the node; returns the exit code: 0 done, 2 bad parameters."""
-    stop = Stop(nothing_open=True)
+    code = _run(args, Stop(nothing_open=True))
+    end_middleware()
+    return code
+
+
+def _run(args: list[str] | None, stop: Stop) -> int:
     import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.experimental.events_executor import EventsExecutor

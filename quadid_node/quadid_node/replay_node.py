@@ -21,7 +21,7 @@ from quadid.errors import QuadidError
 from quadid.window import Recording
 from quadid_node.convert import message_class
 from quadid_node.playback import base_seconds
-from quadid_node.stopping import Stop
+from quadid_node.stopping import Stop, end_middleware
 
 QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CHECK_EVERY = 0.1
@@ -111,6 +111,12 @@ def main(args: list[str] | None = None) -> int:
     except QuadidError as error:
         print(f"replay: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
+    _play(recording, given, args, stop)
+    end_middleware()
+    return 0
+
+
+def _play(recording: Recording, given: argparse.Namespace, args: list[str] | None, stop: Stop) -> None:
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = Node("quadid_replay")
     player = TopicPlayer(node, given.speed, stop)
@@ -125,7 +131,6 @@ def main(args: list[str] | None = None) -> int:
         stop.ignore_more()
         node.destroy_node()
         rclpy.try_shutdown()
-    return 0
 
 
 if __name__ == "__main__":

@@ -173,6 +173,35 @@ def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
         assert second.end()[0] == 0
 
 
+ENDING = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from quadid_node.identify import main
+
+def threads():
+    return [p.read_text().strip() for p in Path("/proc/self/task").glob("*/comm")]
+
+def end():
+    while not any(name.startswith("dds.ev") for name in threads()):
+        time.sleep(0.1)
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=end, daemon=True).start()
+main(["--ros-args", "-p", "history:=none", "-p", "autostart:=false"])
+print("threads left:", *threads())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
+def test_no_thread_of_the_middleware_outlives_the_node() -> None:
+    """Such a thread races with the interpreter's end, which then is a SIGSEGV now and then."""
+    with Process(sys.executable, "-c", ENDING) as ended:
+        left = ended.wait_for("threads left", 60.0)
+        assert ended.child.wait(20) == 0
+    assert "dds.udp" not in left
+    assert "dds.ev" not in left
+
+
 def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
     """One that it watches outlives its topic, and the node ends by SIGSEGV now and then (ros2/rclpy issue 1644)."""
     import rclpy
