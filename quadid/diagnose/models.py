@@ -77,6 +77,11 @@ class Model:
         return float(z @ np.linalg.solve(covariance[np.ix_(place, place)], z))
 
     @property
+    def finds_velocity(self) -> bool:
+        """Whether airspeed matters and is not measured, so that the segments' initial velocities are fitted."""
+        return bool(np.any(self.lin.occam))
+
+    @property
     def effects(self) -> set[str]:
         """Names of the effects it contains."""
         return {c.effect for c in self.causes}

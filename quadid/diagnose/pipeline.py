@@ -32,8 +32,9 @@ from quadid.window import Window
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-DECIDE_SECONDS = (1.0, 0.5)
-"""Lengths of segments that may decide, longest first; below them only the short ones of the first fit."""
+DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
+"""Lengths of segments that may decide (`search.USUAL_SECONDS` says when the longest may), longest first; below them
+only the short ones of the first fit."""
 FEWEST_SEGMENTS = 5
 FAR = 4.0
 """Deviance per row of the nominal fit, under typical noise, above which it tells neither noise nor parameters."""

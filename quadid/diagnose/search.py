@@ -20,6 +20,9 @@ FloatArray = NDArray[np.float64]
 
 LINEAR_MISFIT = 4.0
 """Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
+USUAL_SECONDS = 1.0
+"""Longer segments decide only where airspeed matters and is not measured: every segment has a velocity of its own to
+find, short ones hardly find it, and then drag comes out too large and one kind of it passes for another."""
 MOST_SKETCHES = 10
 """Most linear candidates whose gain is predicted while the misfit is large."""
 FAR_SEGMENTS = 60
@@ -85,9 +88,9 @@ def select(
     compared: set[str] = set()
     tests = len(listed)
     if known is None:
-        climb.place(climb.nominal_on)
+        climb.place(climb.nominal_on, climb.nominal_on(len(ladder) - 1))
     else:
-        climb.place(lambda rung: climb.refitted(rung, known))
+        climb.place(lambda rung: climb.refitted(rung, known), known)
         climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
     while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
@@ -142,9 +145,9 @@ class _Climb:
         fitted = fit_model(self._ladder[rung], model.theta, model.causes, iterations=10)
         return replace(fitted, worth=model.worth)
 
-    def place(self, fit: Callable[[int], Model]) -> None:
-        """Goes to the longest segments that the model follows, or the shortest."""
-        for rung in range(len(self._ladder)):
+    def place(self, fit: Callable[[int], Model], like: Model) -> None:
+        """Goes to the longest segments that a model follows, or the shortest; `like`: one with the same causes."""
+        for rung in range(self._longest(like), len(self._ladder)):
             model = fit(rung)
             if model.misfit < LINEAR_MISFIT or rung == len(self._ladder) - 1:
                 self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
@@ -152,12 +155,17 @@ class _Climb:
 
     def up(self) -> bool:
         """Goes to longer segments if the model follows them now."""
-        for rung in range(self._rung):
+        for rung in range(self._longest(self.model), self._rung):
             model = self.refitted(rung, self.model)
             if model.misfit < LINEAR_MISFIT:
                 self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
                 return True
         return False
+
+    def _longest(self, model: Model) -> int:
+        """Rung of the longest segments that may decide about a model."""
+        usual = [r for r, s in enumerate(self._ladder) if s.seconds < 1.5 * USUAL_SECONDS]
+        return 0 if model.finds_velocity else usual[0]
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def flexible_fit(
     for theta in starts:
         start = theta.copy()
         start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
-        few = thinned(windows, short, short.length * short.dt, noise, SHORT_SEGMENTS)
+        few = thinned(windows, short, short.seconds, noise, SHORT_SEGMENTS)
         tried.append((polish(few, start, few.free(names), iterations=iterations), few))
     first, few = min(tried, key=lambda t: t[0].cost)
     wide = few.free(names)

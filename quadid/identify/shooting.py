@@ -114,6 +114,11 @@ class Shooting:
         """True when velocity or position is measured in every window."""
         return self.channels > 9
 
+    @property
+    def seconds(self) -> float:
+        """Length of a segment [s]."""
+        return self.length * self.dt
+
     def snapshot(self) -> dict[int, list[FloatArray]]:
         """Copy of the current initial states, for `restore`."""
         return dict(self._x0)
