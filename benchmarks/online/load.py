@@ -18,7 +18,7 @@ TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
 START_LIMIT = 240.0
 WAYS = ("woken", "polled")
-"""How a node gets its messages: a callback for each, or all that wait every 50 ms."""
+"""How a node gets its messages: a callback for each, or all that wait, every now and then."""
 SETTLE = 2.0
 """Time after the first message before anything counts [s]."""
 
@@ -75,7 +75,7 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
             node.communicate(timeout=30)
         noted = json.loads(out.read_text())
     return {**result, "seconds": seconds, "profile": profile, "record": record, "exit_code": node.returncode,
-            **{k: _latency(noted[k]) for k in ("idle", "fitting", "step")},
+            **{k: _latency(noted[k]) for k in ("idle", "fitting", "step", "step_cpu")},
             "imu_received": (len(noted["idle"]) + len(noted["fitting"])) / (seconds * 1000.0)}  # fmt: skip
 
 

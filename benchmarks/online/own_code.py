@@ -12,6 +12,7 @@ from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer
 from quadid_node.intake import Intake
 from quadid_node.messages import Clock
+from quadid_node.node import WORK_SECONDS
 from quadid_node.presets import source
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
@@ -23,8 +24,8 @@ from benchmarks.online.feeder import recording
 from quadid.online import SessionSettings
 from quadid.window import Block
 
-STEP_EVERY = 80
-"""Messages between two looks at the session: 50 ms of them."""
+STEP_EVERY = 64
+"""Messages between two looks at the session: 40 ms of them."""
 
 
 def own_code(seconds: float) -> dict[str, Any]:
@@ -53,6 +54,6 @@ def own_code(seconds: float) -> dict[str, Any]:
                     service.push_block(item)
                 else:
                     service.push(item)
-            service.step(2)
+            service.step(WORK_SECONDS)
     spent = time.process_time() - begin
     return {"messages": len(messages), "us_per_message": spent / len(messages) * 1e6, "share": spent / seconds}

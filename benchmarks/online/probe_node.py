@@ -1,4 +1,7 @@
-"""The node itself, watched: how late each IMU message was taken and whether a fit ran, how long each step took."""
+"""The node itself, watched: how late each IMU message was taken and whether a fit ran, how long each step took.
+
+By the clock, and of this thread's processor time, which other programs on the machine do not lengthen much.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,12 @@ import struct
 import sys
 import time
 from array import array
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import quadid_node.node
 from quadid_node.identify import main
+from quadid_node.polling import Polled
 
 OUT = "QUADID_PROBE_OUT"
 _LAST_DOUBLE = struct.Struct("<d")
@@ -24,32 +27,34 @@ class ProbeNode(quadid_node.node.IdentifyNode):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.idle, self.fitting, self.steps = array("d"), array("d"), array("d")
+        self.idle, self.fitting, self.steps, self.cpu = array("d"), array("d"), array("d"), array("d")
 
-    def poll(self, kind: Any, topic: str, qos: Any, **options: Any) -> Callable[[], bytes | None]:
+    def poll(self, kind: Any, topic: str, qos: Any) -> Polled:
         """As the node's, with a note of each IMU message."""
-        take = super().poll(kind, topic, qos, **options)
+        polled = super().poll(kind, topic, qos)
         if topic != "imu":
-            return take
+            return polled
 
         def noted() -> bytes | None:
-            data = take()
+            data = polled.take()
             if data is not None:
                 (published,) = _LAST_DOUBLE.unpack_from(data, len(data) - 8)
                 busy = self._service is not None and self._service.session.running is not None
                 (self.fitting if busy else self.idle).append(time.time() - published)
             return data
 
-        return noted
+        return polled._replace(take=noted)
 
     def _step(self) -> None:
-        begin = time.time()
+        begin, cpu = time.monotonic(), time.thread_time()
         super()._step()
-        self.steps.append(time.time() - begin)
+        self.cpu.append(time.thread_time() - cpu)
+        self.steps.append(time.monotonic() - begin)
 
     def destroy_node(self) -> None:
         """Writes what was noted."""
-        noted = {"idle": self.idle.tolist(), "fitting": self.fitting.tolist(), "step": self.steps.tolist()}
+        arrays = {"idle": self.idle, "fitting": self.fitting, "step": self.steps, "step_cpu": self.cpu}
+        noted = {name: array.tolist() for name, array in arrays.items()}
         Path(os.environ[OUT]).write_text(json.dumps(noted))
         super().destroy_node()
 

@@ -10,18 +10,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
+from quadid.online.gridding import columns_on_grid
 from quadid.online.lines import Line
 from quadid.online.steering import Steering
 from quadid.online.timebase import TimeBase
-from quadid.resample import HALF_WIDTH, split_stretches
+from quadid.resample import HALF_WIDTH
 from quadid.rotor_signal import RotorSignal, rotor_signal
-from quadid.tracks import GAP, OPTIONAL, REQUIRED, Track, make_plan, on_grid
+from quadid.tracks import make_plan
 from quadid.vehicle import Vehicle
 from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
 
@@ -33,8 +35,6 @@ BLOCK = 10
 """Rows that leave at once."""
 HISTORY = 2.0
 """Past samples kept [s]: rates and gaps are judged from them."""
-LOST = 2.05
-"""Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
 _LARGE = 1e150
 MOST_SAMPLES = 400_000
 """A channel holds no more samples than this; a flood beyond is dropped and counted."""
@@ -98,6 +98,7 @@ class Buffer:
         self._lines = {name: Line(count) for name, count in self._columns.items()}
         self._steering = Steering(vehicle)
         self._due: deque[_Due] = deque()
+        self._making: Iterator[Rows | None] | None = None
         self._first = math.inf
         self._next = math.nan
         self._row = 0
@@ -173,22 +174,49 @@ class Buffer:
 
     def next_rows(self) -> Rows | None:
         """The next block of rows, or None until enough has arrived."""
-        while self._due:
+        while self.busy:
+            rows = self.work()
+            if rows is not None:
+                return rows
+        return None
+
+    @property
+    def busy(self) -> bool:
+        """Whether there is a piece of `work`."""
+        return self._making is not None or bool(self._due)
+
+    def work(self) -> Rows | None:
+        """Does one piece of the work on the next block of rows, a millisecond or two; the last one gives the block.
+
+        What arrives between two pieces changes nothing in the block.
+        """
+        if self._making is None:
             due = self._due.popleft()
             if due.row < 0:
-                self._fresh = True
-                self._steering.restart()
-                for line, arrived in zip(self._lines.values(), due.arrived, strict=True):
-                    line.restart(arrived)
-                continue
-            at: FloatArray = due.first + self._step * np.arange(due.row, due.row + BLOCK, dtype=np.float64)
-            self._settle(float(at[0]), due.arrived)
-            rows = self._grid(at)
-            self._fresh = False
-            for line in self._lines.values():
-                line.forget(float(at[0]) - HISTORY)
-            return rows
-        return None
+                self._restart(due.arrived)
+                return None
+            self._making = self._make(due)
+        rows = next(self._making)
+        if rows is not None:
+            self._making = None
+        return rows
+
+    def _restart(self, arrived: tuple[int, ...]) -> None:
+        self._fresh = True
+        self._steering.restart()
+        for line, count in zip(self._lines.values(), arrived, strict=True):
+            line.restart(count)
+
+    def _make(self, due: _Due) -> Iterator[Rows | None]:
+        """Makes a block of rows piece by piece: None after each piece but the last."""
+        at: FloatArray = due.first + self._step * np.arange(due.row, due.row + BLOCK, dtype=np.float64)
+        self._settle(float(at[0]), due.arrived)
+        yield None
+        rows = yield from self._grid(at, dict(zip(self._lines, due.arrived, strict=True)))
+        self._fresh = False
+        for line in self._lines.values():
+            line.forget(float(at[0]) - HISTORY)
+        yield rows
 
     def _advance(self, name: str, t: float) -> None:
         """Begins anew after a step of the clock; finds the first gyro sample, on which the first grid point is put.
@@ -230,7 +258,7 @@ class Buffer:
             if doubles:
                 self.faults[f"{name}: duplicate"] += doubles
 
-    def _grid(self, at: FloatArray) -> Rows:
+    def _grid(self, at: FloatArray, arrived: Mapping[str, int]) -> Generator[None, None, Rows]:
         channels = {}
         for name, line in self._lines.items():
             channel = line.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
@@ -238,34 +266,22 @@ class Buffer:
                 channels[name] = channel
         recording = Recording("live", "stream", channels)
         try:
-            rotor = self._rotor_signal(recording, at)
+            rotor = self._rotor_signal(recording, at, arrived)
         except QuadidError as error:
             empty = np.full((len(at), len(self._vehicle.rotors)), np.nan)
             return Rows(at, {"rotor_speed": empty}, "held", "", self._fresh, str(error))
         plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, 1.0 / self._step)
-        columns = {}
-        for name in (*REQUIRED, *OPTIONAL):
-            if name in plan.tracks:
-                values = on_grid(name, self._mended(plan.tracks[name]), at, plan)
-                if name in REQUIRED or not np.isnan(values).all():
-                    columns[name] = values
+        columns = yield from columns_on_grid(plan, at)
         return Rows(at, columns, plan.sampling, rotor.source, self._fresh)
 
-    def _rotor_signal(self, recording: Recording, at: FloatArray) -> RotorSignal:
+    def _rotor_signal(self, recording: Recording, at: FloatArray, arrived: Mapping[str, int]) -> RotorSignal:
         """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
-        told = self.counts["rotor_speed"] or self.counts["motor_command"]
-        if told or not self._steering.known or not self.counts["attitude_reference"]:
+        told = arrived["rotor_speed"] or arrived["motor_command"]
+        if told or not self._steering.known or not arrived["attitude_reference"]:
             return rotor_signal(recording, self._vehicle)
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
         self._steering.advance(self._lines, until, float(at[0]) - HISTORY)
         return self._steering.signal(until)
-
-    def _mended(self, track: Track) -> Track:
-        """The track with stretches joined where only a few packets of a fast stream were lost."""
-        longest = LOST * self._step
-        if len(track.stretches) < 2 or GAP * track.period >= longest:
-            return track
-        return replace(track, stretches=tuple(split_stretches(track.t, longest)))
 
 
 def _unit(q: tuple[float, ...]) -> tuple[float, ...]:

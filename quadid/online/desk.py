@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from quadid.online.changes import ChangeReply, ChangeRequest
 from quadid.online.fitting import FitReply, FitRequest
@@ -55,8 +56,8 @@ class Desk:
         voice.say(request.stop, "warning", "finding", text)
         self.relearn(request.start + 0.1, "the vehicle has changed")
 
-    def fitted(self, request: FitRequest, reply: FitReply) -> None:
-        """Takes in the fit of a window."""
+    def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
+        """Takes in the fit of a window, piece by piece."""
         if reply.problem:
             self._voice.note(request.stop, Phase.FAILED, reply.problem)
             return
@@ -75,6 +76,7 @@ class Desk:
             return
         self._odd_since = None
         self._learner.take(reply, trusted=True)
+        yield
         if not self._taken_back(reply):
             self._judge(request, reply)
 

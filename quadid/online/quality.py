@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.resample import median
 from quadid.saturation import at_limit
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -101,7 +102,7 @@ def _rate_ratio(window: Window) -> float | None:
     rate = 2.0 * np.arccos(np.clip(step, 0.0, 1.0)) / window.dt
     size = np.linalg.norm(window.gyro[:-1], axis=1)
     good = np.isfinite(rate) & np.isfinite(size)
-    if np.count_nonzero(good) < 50 or np.median(rate[good]) < 0.05:
+    if np.count_nonzero(good) < 50 or median(rate[good]) < 0.05:
         return None
     return float(np.sqrt(np.mean(size[good] ** 2)) / max(np.sqrt(np.mean(rate[good] ** 2)), 1e-9))
 

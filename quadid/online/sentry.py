@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,17 +49,20 @@ class Sentry:
         self._monitor.restart()
         self.seen = None
 
-    def look(self, tick: float, length: float, learner: Learner) -> Seen | None:
-        """Takes in the last `length` [s] of rows before `tick` [s]; returns a change seen for the first time."""
+    def look(self, tick: float, length: float, learner: Learner) -> Generator[None, None, Seen | None]:
+        """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
         for i in reversed(range(round(length / CHUNK))):
             self._monitor.add(self._store.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
         if self.seen is not None:
             return None
+        yield
         recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
+        yield
         b = learner.value("b")
         if recent.reason or judge(recent.windows, self._vehicle, b, learner.learned) != Quality():
             self._monitor.restart()
             return None
+        yield
         change = self._monitor.look(b, np.array([learner.value(n) for n in ("J_xx", "J_yy", "J_zz")]))
         if change is None:
             return None

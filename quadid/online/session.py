@@ -14,6 +14,7 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from quadid.online.buffer import Buffer, Rows
 from quadid.online.changes import ChangeReply, ChangeRequest
@@ -37,6 +38,7 @@ LEAD = 0.22
 SHORT_WINDOW = 4.0
 """Least data for a fit that a person asked for [s]."""
 _EPS = 1e-6
+_DONE = object()
 
 
 class Session:
@@ -77,7 +79,7 @@ class Session:
         self._reply: FitReply | ChangeReply | None = None
         self._outdated = 0
         self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
-        self._fit_at: float | None = None
+        self._work: Iterator[None] | None = None
         self._asked_now = False
         self._number = 0
         if self.ledger.in_force is not None:
@@ -111,7 +113,7 @@ class Session:
         """A person takes the set in force back; from then on sets wait for approval."""
         answer = self.ledger.roll_back(self._voice.stamp(self._now), by)
         if answer.done:
-            self._outdated = self._number
+            self._outdated, self._work = self._number, None
             self._sentry.restart()
             self._desk.relearn(self._now, f"rolled back by {by}")
             self._voice.act(*answer.actions)
@@ -134,29 +136,23 @@ class Session:
         """Data that have arrived and were not worked through yet [s]."""
         return max(self.buffer.time.newest - self._now, 0.0) if math.isfinite(self._now) else 0.0
 
+    @property
+    def busy(self) -> bool:
+        """Whether there is a piece of work that waits for nothing."""
+        if self._work is None and self._waiting is not None:
+            return self._reply is not None
+        return self._work is not None or self._tick_due or self.buffer.busy
+
     def poll(self, most: int | None = None) -> list[Action]:
         """Works through what has arrived and returns what to do, in order.
 
         Args:
-            most: pieces of work (a block of rows, a tick, an answer) at most, so that a caller with other duties gets
-                control back.
+            most: pieces of work at most, of a millisecond or two each, so that a caller with other duties gets control
+                back.
         """
         done = 0
-        while most is None or done < most:
-            if self._waiting is not None:
-                if self._reply is None:
-                    break
-                self._apply()
-            elif self._fit_at is not None:
-                tick, self._fit_at = self._fit_at, None
-                self._fit(tick)
-            elif not math.isnan(self._tick_at) and self._now >= self._tick_at - _EPS:
-                tick, self._tick_at = self._tick_at, self._tick_at + self._tick
-                self._at(tick)
-            elif (rows := self.buffer.next_rows()) is not None:
-                self._take(rows)
-            else:
-                break
+        while self.busy and (most is None or done < most):
+            self._piece()
             done += 1
         return self._voice.take()
 
@@ -190,6 +186,25 @@ class Session:
     def _tick(self) -> float:
         return min(self.settings.refit, 1.0)
 
+    @property
+    def _tick_due(self) -> bool:
+        return not math.isnan(self._tick_at) and self._now >= self._tick_at - _EPS
+
+    def _piece(self) -> None:
+        """The next piece of work: of an answer, a tick, or a block of rows."""
+        if self._work is None:
+            if self._waiting is not None:
+                self._work = self._apply()
+            elif self._tick_due:
+                tick, self._tick_at = self._tick_at, self._tick_at + self._tick
+                self._work = self._at(tick)
+        if self._work is None:
+            rows = self.buffer.work()
+            if rows is not None:
+                self._take(rows)
+        elif next(self._work, _DONE) is _DONE:
+            self._work = None
+
     def _take(self, rows: Rows) -> None:
         if rows.fresh:
             first = float(rows.t[0])
@@ -200,18 +215,19 @@ class Session:
         self._store.add(rows)
         self._now = float(rows.t[-1]) + 1.0 / self.settings.rate
 
-    def _at(self, tick: float) -> None:
-        """One tick: first look for sudden changes; a fit is the next piece of work."""
-        seen = self._sentry.look(tick, self._tick, self._learner)
+    def _at(self, tick: float) -> Iterator[None]:
+        """One tick, piece by piece: first look for sudden changes; then a fit."""
+        seen = yield from self._sentry.look(tick, self._tick, self._learner)
         if seen is not None:
             self._voice.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._voice.stamp(seen.at):.2f} s"
             self._voice.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
         self._study(tick)
+        yield
         if self._sentry.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
-            self._fit_at = tick
+            yield from self._fit(tick)
 
     def _study(self, tick: float) -> None:
         """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
@@ -236,7 +252,7 @@ class Session:
         if self._reply is None:
             self._voice.act(request)
 
-    def _fit(self, tick: float) -> None:
+    def _fit(self, tick: float) -> Iterator[None]:
         self._last_fit, wanted = tick, self.settings.window
         if self._asked_now:
             self._asked_now, wanted = False, min(SHORT_WINDOW, wanted)
@@ -245,12 +261,14 @@ class Session:
         if self._cut.reason or tick - start < wanted - 0.5:
             self._incomplete(tick, start)
             return
+        yield
         quality = judge(self._cut.windows, self._vehicle, self._learner.value("b"), self._learner.learned)
         self._desk.quality = quality
         if quality != Quality():
             phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
             self._voice.note(tick, phase, quality.fault or quality.grounded)
             return
+        yield
         self._number += 1
         start = max(start, tick - self.settings.window)
         self._waiting = self._learner.request(self._number, self._cut.windows, start, tick)
@@ -263,7 +281,7 @@ class Session:
         have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
         self._voice.state(Phase.COLLECTING, f"{have}; {self._cut.reason or 'no gaps'}")
 
-    def _apply(self) -> None:
+    def _apply(self) -> Iterator[None]:
         request, reply = self._waiting, self._reply
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated:
@@ -272,4 +290,4 @@ class Session:
             self._sentry.restart()
             self._desk.changed(request, reply)
         elif isinstance(request, FitRequest) and isinstance(reply, FitReply):
-            self._desk.fitted(request, reply)
+            yield from self._desk.fitted(request, reply)

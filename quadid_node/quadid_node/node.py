@@ -5,6 +5,7 @@ Callbacks convert, call and publish; everything else is in `service` and in the 
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,10 +36,14 @@ from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker, with_ground
 
-STEP_SECONDS = 0.05
-"""Messages are taken from the middleware this often [s]: waking for each would cost twice the processor time."""
-AT_ONCE, CATCHING_UP, BACKLOG = 1, 4, 2.0
-"""Pieces of the session's work in one step, and when there is a backlog, which is this much data [s]."""
+STEP_SECONDS = 0.02
+"""A step is taken this often [s]: messages are taken from the middleware in one, worked on in the next.
+
+Waking for each message would cost twice the processor time; services and timers wait for a step at most.
+"""
+WORK_SECONDS, CATCHING_UP, BACKLOG = 0.0015, 10.0, 2.0
+"""No piece of the session's work begins later than this in a step [s]; later in proportion, up to so many times, when
+there is a backlog of more than this much data [s]."""
 WARM_UP_SECONDS = 8.0
 """How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
 SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -66,7 +71,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
-        self._active = False
+        self._active = self._taking = False
 
     @property
     def warm(self) -> bool:
@@ -83,6 +88,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
             self.get_logger().error(str(error))
             self._tear_down()
             return FAILURE
+        gc.collect()
+        gc.freeze()  # what there is now need not be looked through in flight, which takes as long as three steps
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -162,6 +169,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _tear_down(self) -> None:
         self._active = False
+        gc.unfreeze()
         self._intake.clear()
         self._publishers_of.clear()
         self.destroy_polled()
@@ -181,11 +189,21 @@ class IdentifyNode(PollingNode, LifecycleNode):
     # --- callbacks
 
     def _step(self) -> None:
+        """Takes what has arrived, or works on it: in turns, so that nobody has to wait for both."""
+        self._taking = not self._taking
         if self._service is None:
             return
-        self._take_in(self._service)
-        most = CATCHING_UP if self._service.session.backlog > BACKLOG else AT_ONCE
-        for output in self._service.step(most) if self._active else self._service.idle():
+        if self._taking:
+            self._take_in(self._service)
+        else:
+            self._work(self._service)
+
+    def _work(self, service: Service) -> None:
+        """Writes what is recorded; does some of the session's work."""
+        end = time.monotonic() + WORK_SECONDS * min(max(service.session.backlog / BACKLOG, 1.0), CATCHING_UP)
+        if self._recorder is not None:
+            self._recorder.write()
+        for output in service.step(end - time.monotonic()) if self._active else service.idle():
             self._put(output)
 
     def _take_in(self, service: Service) -> None:
@@ -271,5 +289,5 @@ class IdentifyNode(PollingNode, LifecycleNode):
             return response
         answer = command(self._service)
         response.success, response.message = answer.done, answer.text
-        self._step()
+        self._work(self._service)
         return response

@@ -25,6 +25,8 @@ from quadid_node.presets import Input
 from quadid_node.store import Restored
 
 RECORD = "quadid.session"
+CHUNK_BYTES = 1 << 16
+"""A small chunk is compressed in half a millisecond; a usual one would hold up the node for ten."""
 
 
 @dataclass(frozen=True)
@@ -42,20 +44,28 @@ class Recorder:
 
     def __init__(self, path: Path, beginning: Beginning, inputs: Sequence[Input]) -> None:
         """Begins a recording of `inputs`; raises LogError when it cannot be written or a type has no definition."""
-        self._writer = TopicWriter(path, {RECORD: _to_strings(beginning)})
+        self._writer = TopicWriter(path, {RECORD: _to_strings(beginning)}, CHUNK_BYTES)
         self._last = 0
+        self._waiting: list[tuple[str, str, bytes, int]] = []
         for entry in inputs:
             kind = entry.type.replace("/", "/msg/")
             if not has_definition(kind):
                 self._writer.define(kind, whole_text(kind, installed_definition))
 
     def take(self, topic: str, kind: str, data: bytes) -> None:
-        """Writes a message; its log time never runs back, so that every reader keeps the order of arrival."""
+        """Takes a message; its log time never runs back, so that every reader keeps the order of arrival."""
         self._last = max(time.time_ns(), self._last + 1)
-        self._writer.write_cdr(topic, kind, data, self._last)
+        self._waiting.append((topic, kind, data, self._last))
+
+    def write(self) -> None:
+        """Writes what was taken since the last call."""
+        waiting, self._waiting = self._waiting, []
+        for message in waiting:
+            self._writer.write_cdr(*message)
 
     def close(self) -> None:
-        """Writes the end of the file."""
+        """Writes what waits and the end of the file."""
+        self.write()
         self._writer.close()
 
 

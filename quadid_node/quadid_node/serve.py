@@ -11,7 +11,8 @@ from quadid_node.service import Health, Output, Service
 
 IDLE = 0.005
 """Pause when nothing arrives [s]."""
-BLOCKS_A_STEP = 5
+WORK_SECONDS = 0.02
+"""No piece of the session's work begins later than this in a step [s]."""
 
 
 class Outlet(Protocol):
@@ -46,7 +47,7 @@ def run(
         for sample in link.receive():
             busy = True
             service.push(sample)
-        for output in service.step(BLOCKS_A_STEP):
+        for output in service.step(WORK_SECONDS):
             link.publish(output)
             for outlet in outlets:
                 outlet.publish(output)

@@ -16,6 +16,7 @@ from quadid.online.ledger import Answer
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.online.status import SessionStatus
 from quadid.online.study import StudyReply, StudyRequest
+from quadid.online.voice import Action
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 from quadid_node.store import Restored, Store
@@ -106,17 +107,25 @@ class Service:
             self._arrived[name] = now
         self.session.push_block(block)
 
-    def step(self, most: int | None = None) -> list[Output]:
+    def step(self, seconds: float = math.inf) -> list[Output]:
         """Moves everything on by what there is to do; never waits.
 
         Args:
-            most: pieces of the session's work at most.
+            seconds: no piece of the session's work begins later than this [s]; one always does.
 
         Returns:
             What to publish and tell, already in the history.
         """
-        outputs = self._tidy()
-        for action in self.session.poll(most):
+        outputs, begin = self._tidy(), self._clock()
+        while True:
+            outputs += self._carried_out(self.session.poll(1))
+            if not self.session.busy or self._clock() - begin >= seconds:
+                return self._journalled(outputs)
+
+    def _carried_out(self, actions: list[Action]) -> list[Output]:
+        """Gives requests to the workers; returns the rest."""
+        outputs: list[Output] = []
+        for action in actions:
             if isinstance(action, FitRequest | ChangeRequest):
                 self._fit_began = self._clock()
                 self._worker.submit(action)
@@ -125,7 +134,7 @@ class Service:
                 self._studying.submit(action)
             else:
                 outputs.append(action)
-        return self._journalled(outputs)
+        return outputs
 
     def idle(self) -> list[Output]:
         """Looks after worker and history only, while nobody could hear what the session says."""

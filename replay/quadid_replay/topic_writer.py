@@ -15,7 +15,7 @@ from quadid_replay.cdr_blocks import BlockWriter
 from quadid_replay.schemas import has_definition, schema_text
 from quadid_replay.writing import open_for_writing
 
-_CHUNK_BYTES = 1 << 20
+CHUNK_BYTES = 1 << 20
 
 
 class TopicWriter:
@@ -24,16 +24,20 @@ class TopicWriter:
     Args:
         file: path, or a binary stream that stays open.
         metadata: records by name, for `quadid_replay.mcap_metadata`; they stand at the beginning.
+        chunk_bytes: messages that are compressed and written at once; the caller waits while that is done.
 
     Raises:
         LogError: the file cannot be written.
     """
 
-    def __init__(self, file: str | Path | BinaryIO, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
+    def __init__(
+        self, file: str | Path | BinaryIO, metadata: Mapping[str, Mapping[str, str]] | None = None,
+        chunk_bytes: int = CHUNK_BYTES,
+    ) -> None:  # fmt: skip
         self._owned = open_for_writing(file) if isinstance(file, str | Path) else None
         self._writer = Writer(
             self._owned or file,  # type: ignore[arg-type]
-            chunk_size=_CHUNK_BYTES,
+            chunk_size=chunk_bytes,
             compression=CompressionType.ZSTD,
             enable_crcs=True,
         )

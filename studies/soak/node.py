@@ -9,13 +9,13 @@ import sys
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import quadid_node.node
 from quadid_node.identify import main
+from quadid_node.polling import Polled
 
 from studies.soak import memory
 
@@ -30,19 +30,19 @@ class CountingNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
 
-    def poll(self, kind: Any, topic: str, qos: Any, **options: Any) -> Callable[[], bytes | None]:
+    def poll(self, kind: Any, topic: str, qos: Any) -> Polled:
         """As the node's, with a count."""
-        take = super().poll(kind, topic, qos, **options)
+        polled = super().poll(kind, topic, qos)
 
         def counted() -> bytes | None:
-            data = take()
+            data = polled.take()
             if data is not None:
                 self.counted[topic] += 1
                 if topic == "imu":
                     self.late.append(time.time() - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
             return data
 
-        return counted
+        return polled._replace(take=counted)
 
     def _report(self) -> None:
         super()._report()

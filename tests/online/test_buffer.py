@@ -101,6 +101,22 @@ def test_when_rows_are_asked_for_changes_nothing_not_even_for_late_samples_and_a
     assert any(r.fresh for r in rows[1:])
 
 
+def test_what_arrives_between_two_pieces_of_work_changes_nothing() -> None:
+    stream = sorted(
+        samples(flight(4.0).recording), key=lambda s: s.t + {"gyro": 0.1, "rotor_speed": 0.3}.get(s.channel, 0.0)
+    )
+    rows, buffer, pieces = [], Buffer(PELICAN), 0
+    for sample in stream:
+        buffer.push(sample)
+        if buffer.busy:
+            pieces += 1
+            rows += [block for block in [buffer.work()] if block is not None]
+    while buffer.busy:
+        rows += [block for block in [buffer.work()] if block is not None]
+    assert pieces > 2 * len(rows)
+    assert same(rows, run(stream)[0])
+
+
 def taken(buffer: Buffer) -> list[Rows]:
     return list(iter(buffer.next_rows, None))
 

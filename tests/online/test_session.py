@@ -155,6 +155,31 @@ def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> Non
         happened(19, "rollback while a fit runs: the earlier set is in force again, the fit's answer is ignored")
 
 
+def test_a_rollback_drops_the_work_that_was_begun() -> None:
+    stream = samples(flight(24.0, 9).recording)
+    session = Session(PELICAN, QUICK)
+    drive(session, [s for s in stream if s.t < 20.0])
+    force = session.ledger.in_force
+    assert force is not None
+    session.ledger.accept(replace(force, reason="a second one"), "test", 20.0, 20.0)
+    for sample in stream:
+        if sample.t >= 20.0:
+            session.push(sample)
+    pieces = 0
+    while session.running is None:  # stop at every piece of a tick in turn
+        session.poll(1)
+        pieces += 1
+    request = session.running
+    assert isinstance(request, FitRequest)
+    assert pieces > 10
+    session.deliver(fit_window(request))
+    session.poll(1)  # the estimate is fused, the gate is not asked yet
+    assert session.roll_back("bob").done
+    later = answer(session)
+    assert not published(later, "candidate"), "what was begun before the rollback is not published after it"
+    assert session.status().phase is Phase.COLLECTING
+
+
 def test_a_set_that_turns_out_worse_is_taken_back() -> None:
     stream = samples(flight(40.0, 10).recording)
     session = Session(PELICAN, QUICK)

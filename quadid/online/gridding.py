@@ -1,0 +1,46 @@
+"""Channels of a live stream read on a few rows of the grid, piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.resample import split_stretches
+from quadid.tracks import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
+
+FloatArray = NDArray[np.float64]
+
+CHANNELS_A_PIECE = 2
+"""Channels that are read in one piece of work."""
+LOST = 2.05
+"""Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
+
+
+def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
+    """Reads the channels of a plan; returns values by channel, NaN where nothing was measured.
+
+    Optional channels that say nothing in these rows are left out.
+
+    Args:
+        plan: tracks around the rows.
+        at: times of the rows [s], shape (n,).
+    """
+    columns = {}
+    for k, name in enumerate(name for name in (*REQUIRED, *OPTIONAL) if name in plan.tracks):
+        if k % CHANNELS_A_PIECE == 0:
+            yield
+        values = on_grid(name, _mended(plan.tracks[name], plan.step), at, plan)
+        if name in REQUIRED or not np.isnan(values).all():
+            columns[name] = values
+    return columns
+
+
+def _mended(track: Track, step: float) -> Track:
+    """The track with stretches joined where only a few packets of a fast stream were lost."""
+    longest = LOST * step
+    if len(track.stretches) < 2 or GAP * track.period >= longest:
+        return track
+    return replace(track, stretches=tuple(split_stretches(track.t, longest)))
