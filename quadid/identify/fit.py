@@ -35,6 +35,9 @@ SWARM_SEGMENTS = 100
 """Most segments the swarm simulates, spread evenly: it has to find the valley, whose bottom the polish finds."""
 SHORT_SEGMENTS = 1000
 """Most short segments of the first polish, whose result only starts the last one."""
+MOST_SEGMENTS = 10_000
+"""Most segments of the last polish, spread evenly: three hours of flight tell every parameter to a hundredth of a per
+cent, and beyond them memory would grow with the log."""
 SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
 """Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
 MOMENT_MISFIT = 1.5
@@ -160,7 +163,9 @@ def fit(
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
-        final = Shooting(windows, vehicle, options.seconds, noise, layout)
+        whole = Shooting(windows, vehicle, options.seconds, noise, layout)
+        final = whole.at_most(MOST_SEGMENTS)
+        aside = _thinned(whole, final)
         result = polish(final, first.theta, final.free(free_names), robust=options.robust)
     if not np.isfinite(result.cost):
         result = first
@@ -168,6 +173,17 @@ def fit(
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
     found = _finish(final, result.theta, free_names, result.outcome, evaluations, result)
     return replace(found, warnings=(*aside, *found.warnings))
+
+
+def _thinned(whole: Shooting, used: Shooting) -> tuple[str, ...]:
+    """Says that not all of a long log was used."""
+    if used.count == whole.count:
+        return ()
+    hours, every = whole.count * whole.seconds / 3600.0, round(whole.count / used.count)
+    return (
+        f"{hours:.1f} h of flight are more than the parameters need: they come from every {every}. stretch of "
+        f"{whole.seconds:.3g} s, spread evenly",
+    )
 
 
 def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> Polished | None:
