@@ -22,7 +22,9 @@ LINEAR_MISFIT = 4.0
 """Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
 USUAL_SECONDS = 1.0
 """Longer segments decide only where airspeed matters and is not measured: every segment has a velocity of its own to
-find, short ones hardly find it, and then drag comes out too large and one kind of it passes for another."""
+find, short ones hardly find it, and then drag comes out too large and one kind of it passes for another …"""
+CLEAN_MISFIT = 1.2
+"""… and where the model leaves hardly more than noise in them: a cause not found yet grows with their length."""
 MOST_SKETCHES = 10
 """Most linear candidates whose gain is predicted while the misfit is large."""
 FAR_SEGMENTS = 60
@@ -149,7 +151,7 @@ class _Climb:
         """Goes to the longest segments that a model follows, or the shortest; `like`: one with the same causes."""
         for rung in range(self._longest(like), len(self._ladder)):
             model = fit(rung)
-            if model.misfit < LINEAR_MISFIT or rung == len(self._ladder) - 1:
+            if self._follows(rung, model) or rung == len(self._ladder) - 1:
                 self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
                 return
 
@@ -157,15 +159,20 @@ class _Climb:
         """Goes to longer segments if the model follows them now."""
         for rung in range(self._longest(self.model), self._rung):
             model = self.refitted(rung, self.model)
-            if model.misfit < LINEAR_MISFIT:
+            if self._follows(rung, model):
                 self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
                 return True
         return False
 
     def _longest(self, model: Model) -> int:
         """Rung of the longest segments that may decide about a model."""
-        usual = [r for r, s in enumerate(self._ladder) if s.seconds < 1.5 * USUAL_SECONDS]
-        return 0 if model.finds_velocity else usual[0]
+        return 0 if model.finds_velocity else next(r for r in range(len(self._ladder)) if not self._long(r))
+
+    def _long(self, rung: int) -> bool:
+        return self._ladder[rung].seconds > 1.5 * USUAL_SECONDS
+
+    def _follows(self, rung: int, model: Model) -> bool:
+        return model.misfit < (CLEAN_MISFIT if self._long(rung) else LINEAR_MISFIT)
 
 
 @dataclass(frozen=True)
