@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.online", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"), help="folder of online.json and online.md")
     parser.add_argument("--only", nargs="*", default=[], help="parts to measure; default: all")
-    parser.add_argument("--flights", type=int, default=20, help="flights of the accuracy parts")
+    parser.add_argument("--flights", type=int, default=40, help="flights of the accuracy parts")
     parser.add_argument("--hours", type=float, default=24.0, help="flight time of the memory part [h]")
     parser.add_argument("--refit", type=float, default=10.0, help="time between refits of the memory part [s]")
     parser.add_argument("--load-seconds", type=float, default=60.0, help="length of each flight of the load part [s]")

@@ -35,15 +35,19 @@ def _estimate(r: Result) -> list[str]:
     lines = [
         f"{len(flights)} excited flights of {r['seconds']:.0f} s. First set published after {_median(first):.0f} s "
         f"(median; {len(first)} of {len(flights)} flights published). Goal: within 1 % of the offline batch.", "",
-        "| parameter | online to batch, RMS % | worst % | within 1 % | online to truth, RMS % | batch to truth, RMS % "
-        "| stated sigma % |", "|---|---|---|---|---|---|---|",
+        "The batch cuts its flight once, into segments of 1 s, and what happens across their borders is lost. Begun "
+        "half a second later, the same flight gives it other values; the last column says how far off, so that not all "
+        "of a difference is the online estimate's. The windows of the online fit overlap and are cut at many places.",
+        "",
+        "| parameter | online to batch, RMS % | worst % | within 1 % | online to truth, RMS % | stated sigma % "
+        "| batch to truth, RMS % | batch to itself, cut 0.5 s later, RMS % |", "|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for n in NOMINAL_NAMES:
         batch = _column(flights, "to_batch", n)
         lines.append(
             f"| {n} | {_rms(batch):.3f} | {np.abs(batch).max():.3f} | {np.sum(np.abs(batch) <= 1.0)} of {len(batch)} | "
-            f"{_rms(_column(flights, 'to_truth', n)):.3f} | {_rms(_column(flights, 'batch_to_truth', n)):.3f} | "
-            f"{np.median(_column(flights, 'sigma', n)):.3f} |"
+            f"{_rms(_column(flights, 'to_truth', n)):.3f} | {np.median(_column(flights, 'sigma', n)):.3f} | "
+            f"{_rms(_column(flights, 'batch_to_truth', n)):.3f} | {_rms(_column(flights, 'batch_cut_later', n)):.3f} |"
         )
     return lines
 

@@ -21,8 +21,12 @@ from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
 
-FIT_SECONDS = 1.0
-"""Length of the shooting segments [s]."""
+FIT_SECONDS = 1.66
+"""Length of the shooting segments [s]: six of them fill a window, one a short stretch.
+
+What happens across their borders is lost with the free states there.  The time between refits is no multiple of it, so
+windows that overlap have their borders at different places, and fused they see nearly all.
+"""
 SEARCH = FitOptions(particles=48, iterations=40)
 """Swarm of the first fit: six parameters, a factor of 4 each way."""
 EXCITED = 0.02

@@ -1,0 +1,38 @@
+"""How the fit cuts its windows: into segments that fill them, at borders that differ from window to window."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadid.identify.shooting import Shooting
+from quadid.online import SessionSettings
+from quadid.online.fitting import FIT_SECONDS
+from quadid.online.rows import SHORTEST
+from quadid.online.session import LEAD
+from quadid.vehicle import Vehicle
+from tests.online.driving import flight
+
+PELICAN = Vehicle.shipped("pelican")
+SETTINGS = SessionSettings()
+STEP = 1.0 / SETTINGS.rate
+
+
+def cut(seconds: float) -> Shooting:
+    rows = round(seconds / STEP)
+    return Shooting([flight(24.0).window.slice(0, rows)], PELICAN, FIT_SECONDS)
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(SHORTEST, 1), (SETTINGS.window + LEAD + STEP, 6)])
+def test_segments_fill_a_window_and_a_short_stretch_holds_one(seconds: float, count: int) -> None:
+    shooting = cut(seconds)
+    assert shooting.count == count
+    assert count * shooting.length * STEP > 0.8 * seconds
+
+
+def test_windows_that_overlap_have_their_borders_at_different_places() -> None:
+    length = cut(SETTINGS.window).length
+    overlapping = round(SETTINGS.window / SETTINGS.refit)
+    phases = np.sort([round(k * SETTINGS.refit / STEP) % length for k in range(overlapping)])
+    widest = np.max(np.diff(np.append(phases, phases[0] + length)))
+    assert widest < 0.25 * length, "in between all of the flight is near the middle of a segment of some window"
