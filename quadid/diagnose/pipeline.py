@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.backward import eliminate
 from quadid.diagnose.candidates import Candidate, candidates
+from quadid.diagnose.climb import LINEAR_MISFIT, is_long
 from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
 from quadid.diagnose.foresight import POOR, refit_to_predict
@@ -17,7 +18,7 @@ from quadid.diagnose.form import inconstant
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
-from quadid.diagnose.search import LINEAR_MISFIT, Search, select
+from quadid.diagnose.search import Search, select
 from quadid.diagnose.validation import validate
 from quadid.diagnose.vehicle_file import extended_vehicle
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
@@ -33,7 +34,7 @@ FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
-"""Lengths of segments that may decide (`search.USUAL_SECONDS` says when the longest may), longest first; below them
+"""Lengths of segments that may decide (`climb.USUAL_SECONDS` says when the longest may), longest first; below them
 only the short ones of the first fit."""
 FEWEST_SEGMENTS = 5
 FAR = 4.0
@@ -101,7 +102,7 @@ def diagnose(
     report("validation", 0.0)
     outcome, per_finding = validate(decisive, search, validation, begun.listed)
     beyond, doubts = _beyond_belief(begun.short, search.model), dict(inconstant(search.model, left))
-    verdict = judge(search.nominal, search.model, left)
+    verdict = judge(_usual_nominal(begun, search), search.model, left)
     saturated = any(f.kind == "saturated" for f in faults)
     if search.model.causes and (outcome.contradicted or beyond or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
@@ -206,6 +207,13 @@ def _with_noise(noise: NoiseModel, ladder: Sequence[Shooting], search: Search) -
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
     return replace(search, model=replace(model, worth=search.model.worth), nominal=nominal)
+
+
+def _usual_nominal(begun: _Begun, search: Search) -> Model:
+    """Nominal model on segments of usual length, from which the verdict counts what is explained."""
+    if not is_long(search.shooting):
+        return search.nominal
+    return fit_model(next(s for s in begun.ladder if not is_long(s)), search.nominal.theta, ())
 
 
 def _beyond_belief(shooting: Shooting, model: Model) -> list[str]:

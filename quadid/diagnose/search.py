@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from quadid.chi_square import exceeded, survival
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.climb import LINEAR_MISFIT, Climb
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
 from quadid.diagnose.models import Model, extend, fit_model, sketch, thinned
 from quadid.diagnose.screen import Score, screen
@@ -18,13 +19,6 @@ from quadid.identify.shooting import Shooting
 
 FloatArray = NDArray[np.float64]
 
-LINEAR_MISFIT = 4.0
-"""Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
-USUAL_SECONDS = 1.0
-"""Longer segments decide only where airspeed matters and is not measured: every segment has a velocity of its own to
-find, short ones hardly find it, and then drag comes out too large and one kind of it passes for another …"""
-CLEAN_MISFIT = 1.2
-"""… and where the model leaves hardly more than noise in them: a cause not found yet grows with their length."""
 MOST_SKETCHES = 10
 """Most linear candidates whose gain is predicted while the misfit is large."""
 FAR_SEGMENTS = 60
@@ -85,7 +79,7 @@ def select(
         elsewhere: nominal parameters, shape (6,), to start from too while the misfit is large.
         known: selection made with a poorer noise model, to go on from.
     """
-    climb = _Climb(ladder, theta)
+    climb = Climb(ladder, theta)
     rounds: list[Round] = []
     compared: set[str] = set()
     tests = len(listed)
@@ -114,65 +108,7 @@ def select(
     if compared != {c.label for c in climb.model.causes}:
         climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
         rounds += swaps
-    return Search(climb.shooting, climb.base, climb.model, tuple(rounds), tests)
-
-
-class _Climb:
-    """Where on the ladder of segment lengths the search stands.
-
-    Attributes:
-        shooting: the rung; base: nominal model there; model: the selected one there.
-    """
-
-    def __init__(self, ladder: Sequence[Shooting], theta: FloatArray) -> None:
-        """Starts nowhere; call `place`."""
-        self._ladder, self._theta = ladder, theta
-        self._rung = len(ladder) - 1
-        self._nominal: dict[int, Model] = {}
-        self.model = self.base = self.nominal_on(self._rung)
-
-    @property
-    def shooting(self) -> Shooting:
-        """The problem of this rung."""
-        return self._ladder[self._rung]
-
-    def nominal_on(self, rung: int) -> Model:
-        """Nominal model on a rung."""
-        if rung not in self._nominal:
-            self._nominal[rung] = fit_model(self._ladder[rung], self._theta, ())
-        return self._nominal[rung]
-
-    def refitted(self, rung: int, model: Model) -> Model:
-        """A model fitted on another rung."""
-        fitted = fit_model(self._ladder[rung], model.theta, model.causes, iterations=10)
-        return replace(fitted, worth=model.worth)
-
-    def place(self, fit: Callable[[int], Model], like: Model) -> None:
-        """Goes to the longest segments that a model follows, or the shortest; `like`: one with the same causes."""
-        for rung in range(self._longest(like), len(self._ladder)):
-            model = fit(rung)
-            if self._follows(rung, model) or rung == len(self._ladder) - 1:
-                self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
-                return
-
-    def up(self) -> bool:
-        """Goes to longer segments if the model follows them now."""
-        for rung in range(self._longest(self.model), self._rung):
-            model = self.refitted(rung, self.model)
-            if self._follows(rung, model):
-                self._rung, self.model, self.base = rung, model, self.nominal_on(rung)
-                return True
-        return False
-
-    def _longest(self, model: Model) -> int:
-        """Rung of the longest segments that may decide about a model."""
-        return 0 if model.finds_velocity else next(r for r in range(len(self._ladder)) if not self._long(r))
-
-    def _long(self, rung: int) -> bool:
-        return self._ladder[rung].seconds > 1.5 * USUAL_SECONDS
-
-    def _follows(self, rung: int, model: Model) -> bool:
-        return model.misfit < (CLEAN_MISFIT if self._long(rung) else LINEAR_MISFIT)
+    return Search(climb.shooting, climb.nominal, climb.model, tuple(rounds), tests)
 
 
 @dataclass(frozen=True)
