@@ -21,7 +21,7 @@ from quadid.online.gridding import columns_on_grid
 from quadid.online.lines import Line
 from quadid.online.steering import Steering
 from quadid.online.timebase import TimeBase
-from quadid.resample import HALF_WIDTH
+from quadid.resample import HALF_WIDTH, lowpass
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import make_plan
 from quadid.vehicle import Vehicle
@@ -104,6 +104,8 @@ class Buffer:
         self._row = 0
         self._steps_seen = 0
         self._fresh = True
+        # The low-pass makes its table when first used: now, not in flight.
+        lowpass(np.arange(20.0), np.zeros((20, 1)), np.full(1, 10.0), 1.0, held=False)
 
     def push(self, sample: Sample) -> None:
         """Takes one sample; what cannot be used is dropped and counted in `faults`."""
