@@ -17,7 +17,7 @@ CHUNK = 16384
 WRITER = f"""
 import sys
 import quadid_replay.topic_writer as topic_writer
-topic_writer._CHUNK_BYTES = {CHUNK}
+topic_writer.CHUNK_BYTES = {CHUNK}
 writer = topic_writer.TopicWriter(sys.argv[1])
 for k in range(10**9):
     stamp = {{"sec": k // 100, "nanosec": k % 100 * 10**7}}

@@ -30,7 +30,7 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     if kind == "ulog":
         return (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()[:400_000]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quadid_replay.topic_writer, "_CHUNK_BYTES", 8192)
+        patch.setattr(quadid_replay.topic_writer, "CHUNK_BYTES", 8192)
         {"csv": write_csv, "mcap": write_mcap, "tlog": write_tlog}[kind](path, full_recording(2.0, 50.0))
     return path.read_bytes()
 

@@ -55,7 +55,7 @@ def test_chunks_that_lie_about_their_size_inflate_no_further(
 
 @pytest.fixture
 def small_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(quadid_replay.topic_writer, "_CHUNK_BYTES", 16384)
+    monkeypatch.setattr(quadid_replay.topic_writer, "CHUNK_BYTES", 16384)
     path = tmp_path / "small.mcap"
     write_mcap(path, full_recording())
     return path
