@@ -28,7 +28,7 @@ class BareNode(PollingNode):
         for entry in source("canonical").inputs:
             kind = message_class(entry.type)
             if polled:
-                self._takes.append(self.poll(kind, entry.topic, SENSOR_QOS).take)
+                self._takes.append(self.poll(kind, entry.topic, SENSOR_QOS))
             else:
                 self.create_subscription(kind, entry.topic, lambda data: None, SENSOR_QOS, raw=True)
         if polled:

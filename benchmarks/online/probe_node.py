@@ -11,12 +11,12 @@ import struct
 import sys
 import time
 from array import array
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import quadid_node.node
 from quadid_node.identify import main
-from quadid_node.polling import Polled
 
 OUT = "QUADID_PROBE_OUT"
 _LAST_DOUBLE = struct.Struct("<d")
@@ -29,21 +29,21 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.idle, self.fitting, self.steps, self.cpu = array("d"), array("d"), array("d"), array("d")
 
-    def poll(self, kind: Any, topic: str, qos: Any) -> Polled:
+    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
         """As the node's, with a note of each IMU message."""
-        polled = super().poll(kind, topic, qos)
+        take = super().poll(kind, topic, qos)
         if topic != "imu":
-            return polled
+            return take
 
         def noted() -> bytes | None:
-            data = polled.take()
+            data = take()
             if data is not None:
                 (published,) = _LAST_DOUBLE.unpack_from(data, len(data) - 8)
                 busy = self._service is not None and self._service.session.running is not None
                 (self.fitting if busy else self.idle).append(time.time() - published)
             return data
 
-        return polled._replace(take=noted)
+        return noted
 
     def _step(self) -> None:
         begin, cpu = time.monotonic(), time.thread_time()

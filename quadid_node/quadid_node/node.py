@@ -67,7 +67,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._service: Service | None = None
         self._recorder: Recorder | None = None
         self._intake = Intake()
-        self._publishers_of: dict[str, Callable[[], int]] = {}
         self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -149,9 +148,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for entry in preset.inputs:
             decoder = Decoder(entry, self._stamps, chooser, rotors, deserializer(entry.type))
             topic = self.resolve_topic_name(entry.topic)
-            polled = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS)
-            self._publishers_of[topic] = polled.publishers
-            self._intake.open(entry, topic, decoder, polled.take)
+            take = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS)
+            self._intake.open(entry, topic, decoder, take)
 
     def _offers_on(self, topic: str) -> list[Offer]:
         found = self.get_publishers_info_by_topic(topic)
@@ -171,7 +169,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._active = False
         gc.unfreeze()
         self._intake.clear()
-        self._publishers_of.clear()
         self.destroy_polled()
         for destroy, item in reversed(self._open):
             destroy(item)
@@ -209,8 +206,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _take_in(self, service: Service) -> None:
         """Gives the service what has arrived since the last step."""
         waiting = self._intake.take()
-        for topic, publishers in self._publishers_of.items():
-            self._neighbours.count(topic, publishers())
+        for topic, publishers in self.publisher_counts().items():
+            self._neighbours.count(topic, publishers)
         if not self._active or self._neighbours.paused:
             return
         for item in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):

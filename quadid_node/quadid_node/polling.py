@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -13,18 +13,6 @@ from rclpy.subscription import Subscription
 # (ros2/rclpy issue 1644); rclpy asks for some by default.  What they would tell is looked for in the graph instead.
 NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
-
-
-class Polled(NamedTuple):
-    """One polled subscription.
-
-    Attributes:
-        take: gives the next serialized message that waits; None when there is none.
-        publishers: how many publishers send to it now; one is counted before its first message can be taken.
-    """
-
-    take: Callable[[], bytes | None]
-    publishers: Callable[[], int]
 
 
 class PollingNode(Node):
@@ -40,8 +28,8 @@ class PollingNode(Node):
         """What the executor waits for."""
         return (s for s in super().subscriptions if s not in self._polled)
 
-    def poll(self, kind: Any, topic: str, qos: Any) -> Polled:
-        """Subscribes to a topic."""
+    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
+        """Subscribes to a topic; returns what gives its next serialized message that waits, None when there is none."""
         subscription = self.create_subscription(
             kind, topic, _never, qos, raw=True, event_callbacks=NO_SUBSCRIPTION_EVENTS
         )
@@ -53,7 +41,11 @@ class PollingNode(Node):
                 taken = handle.take_message(kind, True)
             return None if taken is None else taken[0]
 
-        return Polled(take, subscription.get_publisher_count)
+        return take
+
+    def publisher_counts(self) -> dict[str, int]:
+        """How many publishers send to each polled topic now; one is counted before its first message can be taken."""
+        return {s.topic_name: s.get_publisher_count() for s in self._polled}
 
     def destroy_polled(self) -> None:
         """Ends all polled subscriptions."""

@@ -20,8 +20,13 @@ from quadid_node.claim import Claim
 from quadid_node.convert import message_class, to_message
 from quadid_node.polling import NO_PUBLISHER_EVENTS
 
+# Said in full, so that they can be compared with what subscribers ask for.
+_ALWAYS = {"deadline": Infinite, "liveliness": LivelinessPolicy.AUTOMATIC, "liveliness_lease_duration": Infinite}
+USUAL_QOS = QoSProfile(
+    depth=10, durability=DurabilityPolicy.VOLATILE, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
+)  # fmt: skip
 LATCHED_QOS = QoSProfile(
-    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
 )  # fmt: skip
 KINDS = {
     "parameters": messages.PARAMETER_SET, "candidate": messages.PARAMETER_SET, "diagnosis": messages.DIAGNOSIS,
@@ -46,7 +51,7 @@ class Speaker:
         """
         self._node = node
         self.ours = node.resolve_topic_name(_NAMES["parameters"])
-        self._publishers = {topic: self._create(topic, 10) for topic in KINDS if topic != "parameters"}
+        self._publishers = {topic: self._create(topic, USUAL_QOS) for topic in KINDS if topic != "parameters"}
         self._claim: Claim | None = None
         if not observer:
             self._claim = Claim(
@@ -84,11 +89,7 @@ class Speaker:
 
     def _unheard(self, publisher: Any) -> bool:
         asked = [info.qos_profile for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
-        qos = publisher.qos_profile
-        offered = QoSProfile(
-            depth=qos.depth, reliability=qos.reliability, durability=qos.durability, deadline=Infinite,
-            liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Infinite,
-        )  # fmt: skip
+        offered = publisher.qos_profile
         return any(qos_check_compatible(offered, wish)[0] == QoSCompatibility.ERROR for wish in asked)
 
     def close(self) -> None:

@@ -52,5 +52,4 @@ def end_middleware() -> None:
     Cycles keep them beyond `destroy_node` and `rclpy.shutdown`.  Left to the interpreter's own end, threads that still
     receive what peers send race with it, and the process dies by SIGSEGV now and then.
     """
-    gc.unfreeze()
     gc.collect()

@@ -9,13 +9,13 @@ import sys
 import time
 from array import array
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import quadid_node.node
 from quadid_node.identify import main
-from quadid_node.polling import Polled
 
 from studies.soak import memory
 
@@ -30,19 +30,19 @@ class CountingNode(quadid_node.node.IdentifyNode):
         super().__init__(*arguments)
         self.late, self.counted, self.noted = array("d"), Counter[str](), time.monotonic()
 
-    def poll(self, kind: Any, topic: str, qos: Any) -> Polled:
+    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
         """As the node's, with a count."""
-        polled = super().poll(kind, topic, qos)
+        take = super().poll(kind, topic, qos)
 
         def counted() -> bytes | None:
-            data = polled.take()
+            data = take()
             if data is not None:
                 self.counted[topic] += 1
                 if topic == "imu":
                     self.late.append(time.time() - _LAST_DOUBLE.unpack_from(data, len(data) - 8)[0])
             return data
 
-        return polled._replace(take=counted)
+        return counted
 
     def _report(self) -> None:
         super()._report()
