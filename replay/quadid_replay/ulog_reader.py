@@ -168,7 +168,7 @@ def _reference(log: _Log) -> list[RawChannel]:
     columns = tuple(f"q_d[{i}]" for i in range(4))
     if not _has(log, key, *columns, "thrust_body[2]"):
         return []
-    throttle = -log.topics[key]["thrust_body[2]"].astype(np.float64)
+    throttle = -_stack(log.topics[key], ("thrust_body[2]",))
     values = np.column_stack([to_euler(_stack(log.topics[key], columns)), throttle])
     return [_raw(log, "attitude_reference", key, values, "timestamp")]
 

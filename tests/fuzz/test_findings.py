@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import time
 import warnings
 from pathlib import Path
@@ -18,6 +19,7 @@ from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import header
+from tests.replay.test_ulog import Ulog
 
 
 def opened(tmp_path: Path, data: bytes) -> Path:
@@ -94,3 +96,18 @@ def test_a_log_of_a_second_imu_only_has_no_gyro(tmp_path: Path) -> None:
         log.add("GYR", 10_000 * k, 1, 10_000 * k, 0.1, 0.2, 0.3)
         log.add("ATT", 10_000 * k, 100, 1000, -100, -500, 9000, 27000)
     assert "gyro" not in open_log(opened(tmp_path, bytes(log.data))).channels
+
+
+def test_a_throttle_that_signals_nan_passes_without_a_warning(tmp_path: Path) -> None:
+    log = Ulog()
+    log.format("vehicle_attitude_setpoint", "uint64_t timestamp;float[4] q_d;float[3] thrust_body;")
+    log.subscribe("vehicle_attitude_setpoint")
+    signalling = np.uint32(0x7F800001).view(np.float32)
+    for row in range(10):
+        body = struct.pack("<Q6f", 1_000_000 + 20_000 * row, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        throttle = signalling.tobytes() if row == 4 else struct.pack("<f", -0.5)
+        log.record("D", struct.pack("<H", 0) + body + throttle)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reference = open_log(opened(tmp_path, bytes(log.data))).channels["attitude_reference"]
+    assert len(reference.t) == 9, "the sample without a throttle is dropped"
