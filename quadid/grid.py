@@ -20,6 +20,7 @@ from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import REQUIRED, Plan, make_plan, on_grid, reach
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
+from quadid.within_samples import Feedback, follow_feedback
 
 FloatArray = NDArray[np.float64]
 Span = tuple[float, float]
@@ -89,7 +90,8 @@ def grid_recording(
     """Merges the channels of a recording onto uniform grids, one per stretch without gaps.
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
-    filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``.
+    filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``, with the slope within
+    each sample that the flight controller's feedback shows (`quadid.within_samples`).
 
     Args:
         recording: a log in core units and frames.
@@ -124,12 +126,14 @@ def grid_recording(
     if not windows:
         longest = max((b - a for a, b in spans), default=0.0)
         raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), start, stop)
-    return Gridded(windows, _report(plan, rotor, windows, len(spans) - 1, dropped, log_span))
+    windows, feedback = follow_feedback(windows, vehicle)
+    return Gridded(windows, _report(plan, rotor, windows, len(spans) - 1, dropped, log_span, feedback))
 
 
 def _report(
-    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
-) -> GridReport:
+    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span,
+    feedback: Feedback | None,
+) -> GridReport:  # fmt: skip
     return GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
@@ -141,7 +145,7 @@ def _report(
         rotor_source=rotor.source,
         rotor_rate=1.0 / sample_period(rotor.t),
         filtered=plan.filtered,
-        notes=(*rotor.notes, *_notes(plan, rotor.t)),
+        notes=(*rotor.notes, *_notes(plan, rotor.t, feedback)),
     )
 
 
@@ -203,13 +207,19 @@ def _log_span(recording: Recording) -> Span:
     return min(a for a, _ in ends), max(b for _, b in ends)
 
 
-def _notes(plan: Plan, rotor_times: FloatArray) -> list[str]:
+def _notes(plan: Plan, rotor_times: FloatArray, feedback: Feedback | None) -> list[str]:
     notes = []
     period = sample_period(rotor_times)
     if period > 1.5 * plan.step:
         notes.append(
             f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
             "fast motion cannot be attributed to the rotors"
+        )
+    if feedback is not None:
+        notes.append(
+            f"the commands follow feedback within each sample (about {feedback.proportional:.0f} 1/s^2 on the angle, "
+            f"{feedback.derivative:.0f} 1/s on the rate), as a controller faster than the log makes them do: "
+            "the rotor speeds are given that slope"
         )
     return notes
 

@@ -143,6 +143,8 @@ class Window:
         battery: shape (n, 1) [V]; or None.
         attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
         sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
+        rotor_slope: shape (n, rotors) [rad/s^2]: a held row is the mean of a speed that runs on at this slope within
+            its sample (`quadid.within_samples`); None: it stays the same.
         name: where it came from.
         log_span: first and last time [s] of the whole log, for effects that run over a flight.
     """
@@ -158,6 +160,7 @@ class Window:
     battery: FloatArray | None = None
     attitude_reference: FloatArray | None = None
     sampling: Sampling = "held"
+    rotor_slope: FloatArray | None = None
     name: str = ""
     log_span: tuple[float, float] = field(default=(np.nan, np.nan))
 
@@ -174,6 +177,13 @@ class Window:
                 f"{bad} rows of rotor_speed are not finite", "finite rotor speeds", "split the window there"
             )
         object.__setattr__(self, "rotor_speed", rotor)
+        if self.rotor_slope is not None:
+            if self.sampling != "held":
+                raise WindowError(f"rotor_slope with sampling '{self.sampling}'", "held", "leave rotor_slope out")
+            slope = _frozen(self.rotor_slope, "rotor_slope", rotor.shape[1])
+            if slope.shape != rotor.shape or not np.all(np.isfinite(slope)):
+                raise WindowError("rotor_slope", f"finite values, as many as rotor_speed {rotor.shape}")
+            object.__setattr__(self, "rotor_slope", slope)
         for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference"):
             values = getattr(self, name)
             if values is None:
@@ -203,8 +213,10 @@ class Window:
         """Returns rows `start` to `stop` (exclusive) as a window of the same log."""
         cut = {
             name: (None if getattr(self, name) is None else getattr(self, name)[start:stop])
-            for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
-        }
+            for name in (
+                "gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference", "rotor_slope",
+            )
+        }  # fmt: skip
         return Window(
             self.t0 + self.dt * start,
             self.dt,

@@ -1,10 +1,10 @@
-"""The nominal six of the independent cases when the hidden effect is known, and how gyro and attitude agree there.
+"""The nominal six of the independent cases when the hidden effect is known, and the feedback that each flight shows.
 
     QUADID_DATA=../shared/data python -m studies.case_parameters --out docs/results
 
-Errors in stated standard deviations, of the flight that trains and of the one that validates, each by itself.  The gain
-is that of the logged roll and pitch against the logged rates, put through Euler's kinematics, from 0.2 to 2 Hz: 1 where
-both are readings of one motion.
+Errors in stated standard deviations, of the flight that trains and of the one that validates, each by itself.  The last
+column is the inner loop of the flight controller that acted within the samples of the log (`quadid.within_samples`), in
+1/s^2 on the angle and 1/s on the rate; the rotor speeds run on within each sample as it says.
 """
 
 from __future__ import annotations
@@ -12,45 +12,27 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import csd
-from scipy.spatial.transform import Rotation
 
 from quadid.effects import EFFECTS
 from quadid.identify.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
+from quadid.within_samples import find_feedback
 from studies.cases import windows
 from studies.page import put_section
 
 FloatArray = NDArray[np.float64]
-BAND = (0.2, 2.0)
-"""Band of the gain [Hz]: below it the attitude's slow error tells, above it hardly any motion."""
-
-
-def kinematic_gains(window: Window) -> FloatArray:
-    """Gain of measured roll and pitch against those that the gyro's rates make, shape (2,)."""
-    assert window.gyro is not None
-    assert window.attitude is not None
-    _, pitch, roll = Rotation.from_quat(window.attitude[:, [1, 2, 3, 0]]).as_euler("ZYX").T
-    p, q, r = window.gyro.T
-    turning = q * np.sin(roll) + r * np.cos(roll)
-    made = (p + np.tan(pitch) * turning, q * np.cos(roll) - r * np.sin(roll))
-    out = []
-    for rate, angle in zip(made, (roll, pitch), strict=True):
-        expected = 0.5 * window.dt * (rate[1:] + rate[:-1])
-        f, cross = csd(expected, np.diff(angle), fs=1.0 / window.dt, nperseg=512)
-        _, power = csd(expected, expected, fs=1.0 / window.dt, nperseg=512)
-        used = (f >= BAND[0]) & (f <= BAND[1])
-        out.append(float(np.abs(cross[used].sum()) / power.real[used].sum()))
-    return np.array(out)
+INSIDE = 1.96
+"""Standard deviations to either side that hold the truth in 95 of 100 cases."""
 
 
 def names_of(answer: dict[str, Any]) -> list[str]:
@@ -64,16 +46,43 @@ def names_of(answer: dict[str, Any]) -> list[str]:
     return out
 
 
-def row(folder: Path, flight: str, answer: dict[str, Any]) -> tuple[str, FloatArray, FloatArray]:
-    """Table row of one flight, errors in standard deviations (6,), gains (2,)."""
+class Errors(NamedTuple):
+    """Errors of the nominal six in standard deviations, shape (6,).
+
+    Attributes:
+        flat: with rotor speeds that stay the same within a sample.
+        sloped: with what feedback makes of them; None where none was found.
+    """
+
+    flat: FloatArray
+    sloped: FloatArray | None
+
+
+def row(folder: Path, flight: str, answer: dict[str, Any]) -> tuple[str, Errors]:
+    """Table row of one flight, and its errors."""
     vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
     flown = windows(folder / f"{flight}.csv", vehicle)
+    errors = Errors(_errors([replace(w, rotor_slope=None) for w in flown], vehicle, answer), None)
+    feedback = find_feedback(flown)
+    if feedback is not None:
+        errors = errors._replace(sloped=_errors(flown, vehicle, answer))
+    shown = errors.flat if errors.sloped is None else errors.sloped
+    loop = "–" if feedback is None else f"{feedback.proportional:.0f}, {feedback.derivative:.0f}"
+    cells = " | ".join([*(f"{z:+.1f}" for z in shown), loop])
+    return f"| {answer['case']} {flight} | {', '.join(answer['effects']) or '–'} | {cells} |", errors
+
+
+def _errors(flown: list[Window], vehicle: Vehicle, answer: dict[str, Any]) -> FloatArray:
     found = fit(flown, vehicle, FitOptions(iterations=0), names=[*NOMINAL_NAMES, *names_of(answer)])
     truth = np.log([answer["nominal"][name] for name in NOMINAL_NAMES])
-    errors = (np.log(found.theta[: len(truth)]) - truth) / found.uncertainty.sigma[: len(truth)]
-    gains = kinematic_gains(flown[0])
-    cells = " | ".join([*(f"{z:+.1f}" for z in errors), *(f"{g:.4f}" for g in gains)])
-    return f"| {answer['case']} {flight} | {', '.join(answer['effects']) or '–'} | {cells} |", errors, gains
+    return np.asarray((np.log(found.theta[: len(truth)]) - truth) / found.uncertainty.sigma[: len(truth)])
+
+
+def _summary(what: str, errors: list[FloatArray]) -> str:
+    z = np.array(errors)
+    mean = ", ".join(f"{name} {m:+.1f}" for name, m in zip(NOMINAL_NAMES, z.mean(axis=0), strict=True))
+    inside = np.count_nonzero(np.abs(z) <= INSIDE)
+    return f"{what}: {inside} of {z.size} parameters inside their 95 % interval; mean error in sigma: {mean}."
 
 
 def main() -> None:
@@ -85,18 +94,23 @@ def main() -> None:
     answers = json.loads((data / "answers.json").read_text(encoding="utf-8"))
     known = [a for a in answers if "unknown" not in a["effects"]]
     text = ["`python -m studies.case_parameters --out docs/results`", "", (__doc__ or "").split("\n\n")[2], ""]
-    text.append(f"| flight | hidden, known here | {' | '.join(NOMINAL_NAMES)} | roll's gain | pitch's gain |")
-    text.append("|---" * (4 + len(NOMINAL_NAMES)) + "|")
-    gains = []
+    text.append(f"| flight | hidden, known here | {' | '.join(NOMINAL_NAMES)} | feedback |")
+    text.append("|---" * (3 + len(NOMINAL_NAMES)) + "|")
+    errors = []
     for answer in known:
         for flight in ("train", "validate"):
-            line, _, gain = row(data / answer["case"], flight, answer)
+            line, found = row(data / answer["case"], flight, answer)
             text.append(line)
-            gains.append(gain)
+            errors.append(found)
             print(line, flush=True)
-    mean, error = np.mean(gains, axis=0), np.std(gains, axis=0, ddof=1) / np.sqrt(len(gains))
-    text += ["", f"Mean gain: roll {mean[0]:.4f} ± {error[0]:.4f}, pitch {mean[1]:.4f} ± {error[1]:.4f}."]
-    print(text[-1])
+    fed = [(e.sloped, e.flat) for e in errors if e.sloped is not None]
+    summaries = [
+        _summary(f"The {len(fed)} flights with feedback within samples", [sloped for sloped, _ in fed]),
+        _summary("The same with speeds held flat", [flat for _, flat in fed]),
+        _summary(f"The {len(errors) - len(fed)} without", [e.flat for e in errors if e.sloped is None]),
+    ]
+    text += [line for summary in summaries for line in ("", summary)]
+    print("\n".join(summaries))
     if options.out:
         put_section(Path(options.out) / "cases.md", "Independent cases", "parameters", "\n".join(text))
 

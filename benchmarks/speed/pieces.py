@@ -26,8 +26,8 @@ PIECES = {
     "step with rotor and parasitic drag": "step_air_rare(1e-4, s)",
     "step with rotor drag and the body": "step_air_solid(1e-4, s)",
     "full step": "step_full(1e-4, s)",
-    "four rotors, held input": "rotors_step(u, k, True, False, geometry, 0.02, rot, s)",
-    "four rotors, delayed input": "rotors_step(u, k, True, True, geometry, 0.02, rot, s)",
+    "four rotors, held input": "rotors_step(u, slope, k, True, False, geometry, 0.02, rot, s)",
+    "four rotors, delayed input": "rotors_step(u, slope, k, True, True, geometry, 0.02, rot, s)",
     "residual": "compare(0, 0, k, measured, scale, s, out)",
     "sum and projection": "_collect(0, k, basis, out, total, inside, 9)",
     "IMU filter": "step_filter(0.02, s); use_filter(s)",
@@ -37,7 +37,7 @@ PIECES = {
     "misalignment, scale, biases": "distort_imu(s)",
     "factors of thrust and mass": "flight_factors(0.02 * k, 0.0, 40.0, 0.02, s)",
 }
-ARGUMENTS = "s, table, u, geometry, rot, measured, scale, out, basis, total, inside, past"
+ARGUMENTS = "s, table, u, slope, geometry, rot, measured, scale, out, basis, total, inside, past"
 
 
 def pieces(rounds: int) -> dict[str, Any]:
@@ -93,5 +93,13 @@ def _arrays() -> tuple[list[Any], Any]:
     for array in room:
         array[:] = 0.0
     out, total, inside, past = room
-    data = [rng.random((ROWS, 2 * ALL_MOMENTS)), u, geometry, rot, rng.random((ROWS, 16)), np.ones((ROWS, 9))]
+    data = [
+        rng.random((ROWS, 2 * ALL_MOMENTS)),
+        u,
+        np.empty((0, rotors)),
+        geometry,
+        rot,
+        rng.random((ROWS, 16)),
+        np.ones((ROWS, 9)),
+    ]
     return [s, *data, out, rng.random((1, 9 * ROWS, 6)), total, inside, past], s.copy()

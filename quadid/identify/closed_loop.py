@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.score import euler
 from quadid.identify.stabiliser_gains import Autopilot
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.rotation import euler
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 

@@ -16,6 +16,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.identify.noise import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.rotation import euler
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -260,12 +261,3 @@ def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
     angles[:, 2] = np.unwrap(angles[:, 2])
     difference = np.remainder(other - angles + np.pi, 2.0 * np.pi) - np.pi
     return angles, angles + difference
-
-
-def euler(q: FloatArray) -> FloatArray:
-    """Roll, pitch, yaw [rad] (z-y-x) of unit quaternions wxyz body to world, shapes (n, 4) -> (n, 3)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return np.column_stack([roll, pitch, yaw])

@@ -120,6 +120,7 @@ class Rollout:
         if window.velocity is not None or window.position is not None:
             self.channels = 15 if window.position is not None else 12
         self.measured, self.valid = _measured(window, self.channels)
+        self._slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
         self._mask = self.valid.astype(np.float64)
         self._flight = Flight(self.mass, self.reach, window.t0, window.dt, *window.log_span)
         self._tables: OrderedDict[tuple[float, float, float, bytes], FloatArray] = OrderedDict()
@@ -280,7 +281,9 @@ class Rollout:
         if table is None:
             w = self.window
             table = np.empty((len(w), 2 * ALL_MOMENTS))
-            rotor_table(w.rotor_speed, w.sampling == "held", need.delayed, self.geometry, w.dt, theta, table)
+            rotor_table(
+                w.rotor_speed, self._slope, w.sampling == "held", need.delayed, self.geometry, w.dt, theta, table
+            )
             self._tables[key] = table
             while len(self._tables) > _TABLES_KEPT:
                 self._tables.popitem(last=False)
@@ -292,8 +295,8 @@ class Rollout:
     ) -> None:  # fmt: skip
         w = self.window
         roll_segments(
-            w.rotor_speed, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured, scale,
-            lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1],
+            w.rotor_speed, self._slope, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured,
+            scale, lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1],
             segments.length, basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 

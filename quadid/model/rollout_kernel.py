@@ -146,10 +146,11 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 
 @nb.njit(**jit)
 def _march(
-    u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, dx: FloatArray, need: Needs,
-    channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
-    s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray, total: FloatArray, inside: FloatArray,
+    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray,
+    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
+    dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
+    ends: FloatArray, cost: FloatArray, s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray,
+    total: FloatArray, inside: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
@@ -166,7 +167,7 @@ def _march(
                 turned = first - memory
                 rotors_start(u, turned, rot)
             for k in range(turned, first):  # rows no segment covers: rotors still turn
-                rotors_step(u, k, held, need.delayed, geometry, dt, rot, s)
+                rotors_step(u, slope, k, held, need.delayed, geometry, dt, rot, s)
             turned = first + steps
         _start(seg, x0, dx, s)
         for i in range(steps):
@@ -177,7 +178,7 @@ def _march(
             else:
                 if k == following:
                     _copy(rot, ahead)
-                rotors_step(u, k, held, need.delayed, geometry, dt, rot, s)
+                rotors_step(u, slope, k, held, need.delayed, geometry, dt, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * k, flight.span0, flight.span1, dt, s)
             if need.att_delay:
@@ -231,10 +232,10 @@ def _march(
 
 @nb.njit(**allocating)
 def _roll_segments(
-    u: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray, measured: FloatArray,
-    scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray, theta: FloatArray,
-    dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
-    ends: FloatArray, cost: FloatArray,
+    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray,
+    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
+    theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray,
+    out: FloatArray, ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
 
@@ -244,6 +245,7 @@ def _roll_segments(
 
     Args:
         u: rotor input (n, rotors) [rad/s].
+        slope: of a held input within its samples, see `rotors_step`.
         held: the input acts held, else linear between samples.
         geometry: (rotors, 3): x, y [m], spin.
         flight: numbers of the window.
@@ -282,8 +284,8 @@ def _roll_segments(
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
     _march(
-        u, held, geometry, flight, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg, sums,
-        basis, out, ends, cost, s, rot, ahead, past, total, inside,
+        u, slope, held, geometry, flight, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg,
+        sums, basis, out, ends, cost, s, rot, ahead, past, total, inside,
     )  # fmt: skip
 
 

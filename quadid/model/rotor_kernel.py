@@ -2,7 +2,8 @@
 
 omega' = (u - omega) / tau.  Over each half step the means of omega and omega^2 are exact for first-order lag and pure
 delay.  The input u, delayed by (j + f) dt, switches (held) or bends (linear) once within a step, f dt after its start;
-each half step is therefore two pieces, one of which may have no length.
+each half step is therefore two pieces, one of which may have no length.  A held input may run on at a slope within its
+samples, whose mean it is (`quadid.within_samples`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from quadid.model import layout as ix
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_PART, C_ROW, C_SHIFT, C_TAU, C_W0, HALF, N_ROWS, P_E, P_E1,
-    P_E2, P_E3, P_H, PIECE, R_GAIN, R_NEXT, R_NOW, R_PAST, R_SPEED, ROTOR,
+    A_DO, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_PART, C_ROW, C_SHIFT, C_TAU, C_W0, HALF, N_ROWS, P_AT, P_E,
+    P_E1, P_E2, P_E3, P_H, PIECE, R_GAIN, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED,
+    ROTOR,
 )  # fmt: skip
 
 # isort: on
@@ -51,7 +53,9 @@ def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray
         f = delay - math.floor(delay)
         s[C_TAU + lane], s[C_SHIFT + lane], s[C_PART + lane] = tau, math.floor(delay), f
         cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
+        begins = (1.0 - f, 0.0, 1.5 - f, max(0.5 - f, 0.0))  # of each piece, in its sample of the input
         for piece in range(4):
+            s[P_AT + piece * PIECE + lane] = (begins[piece] - 0.5) * dt
             h = cuts[piece] * dt
             e = math.exp(-h / max(tau, 1e-12))
             at = piece * PIECE + lane
@@ -69,6 +73,8 @@ def rotors_start(u: FloatArray, k: int, rot: FloatArray) -> None:
         for lane in range(LANES):
             for row in (R_SPEED, R_PAST, R_NOW, R_NEXT):
                 rot[r, row + lane] = u[k, r]
+            for row in (R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE):
+                rot[r, row + lane] = 0.0
 
 
 @nb.njit(**inlined)
@@ -89,6 +95,14 @@ def _held_piece(w0, a, e, e1, e3, h):  # type: ignore[no-untyped-def]
     part = c * e1
     i1 = a * h + part
     return i1, a * (i1 + part) + c * c * e3, a + c * e
+
+
+@nb.njit(**inlined)
+def _sloped_piece(w0, a, slope, tau, piece, lane, s):  # type: ignore[no-untyped-def]
+    """As `_piece` for a sample of mean a and this slope; `piece`: which part of the step."""
+    e, e1, e2 = s[P_E + piece + lane], s[P_E1 + piece + lane], s[P_E2 + piece + lane]
+    e3, h, at = s[P_E3 + piece + lane], s[P_H + piece + lane], s[P_AT + piece + lane]
+    return _piece(w0, a + slope * at, slope, tau, e, e1, e2, e3, h)
 
 
 @nb.njit(**inlined)
@@ -151,6 +165,24 @@ def turn_delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-d
 
 
 @nb.njit(**jit)
+def _turn_sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
+    lane_kernel()
+    for lane in range(LANES):
+        gain, w0, tau = rot[r, R_GAIN + lane], rot[r, R_SPEED + lane], s[C_TAU + lane]
+        a0, a1 = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
+        s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, rot[r, R_NEXT + lane]
+        rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
+        k1, k2, w = _sloped_piece(w0, a0, s0, tau, A, lane, s)
+        m1, m2, wm = _sloped_piece(w, a1, s1, tau, B, lane, s)
+        l1, l2, w = _sloped_piece(wm, a0, s0, tau, C, lane, s)
+        n1, n2, w1 = _sloped_piece(w, a1, s1, tau, D, lane, s)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, gain, keep, lane, s)
+
+
+@nb.njit(**jit)
 def _turn_linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of piecewise linear input that bends within the step."""
     lane_kernel()
@@ -199,7 +231,7 @@ def _turn_linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-d
 
 
 @nb.njit(**jit)
-def _read_inputs(u: FloatArray, k: int, rot: FloatArray, s: FloatArray) -> None:
+def _read_inputs(u: FloatArray, slope: FloatArray, k: int, rot: FloatArray, s: FloatArray) -> None:
     """Reads the input one sample ahead of t_k - j dt, for each lane's own j; outside the window its end values hold."""
     lane_kernel()
     last = float(len(u) - 1)
@@ -208,16 +240,21 @@ def _read_inputs(u: FloatArray, k: int, rot: FloatArray, s: FloatArray) -> None:
     for r in range(len(rot)):
         for lane in range(LANES):
             rot[r, R_NEXT + lane] = u[int(s[C_ROW + lane]), r]
+        if len(slope) > 0:
+            for lane in range(LANES):
+                rot[r, R_NEXT_SLOPE + lane] = slope[int(s[C_ROW + lane]), r]
 
 
 @nb.njit(**jit)
 def rotors_step(
-    u: FloatArray, k: int, held: bool, delayed: bool, geometry: FloatArray, dt: float, rot: FloatArray, s: FloatArray
-) -> None:
+    u: FloatArray, slope: FloatArray, k: int, held: bool, delayed: bool, geometry: FloatArray, dt: float,
+    rot: FloatArray, s: FloatArray,
+) -> None:  # fmt: skip
     """Advances all rotors over step k and sums their moments for both half steps.
 
     Args:
         u: shape (n, rotors), input [rad/s].
+        slope: shape (n, rotors), of a held input within each sample [rad/s^2]; no rows: it stays the same.
         k: step, from t_k to t_k+1.
         held: the input acts held, else linear between samples.
         delayed: False when no lane has a delay.
@@ -226,15 +263,18 @@ def rotors_step(
         rot: rows of the rotors, (rotors, ROTOR), advanced in place.
         s: rows; moments of both half steps written.
     """
-    plain = held and not delayed
+    sloped = len(slope) > 0
+    plain = held and not delayed and not sloped
     if not plain:
-        _read_inputs(u, k, rot, s)
+        _read_inputs(u, slope, k, rot, s)
     inv = 2.0 / dt
     for r in range(len(geometry)):
         x, y, spin = geometry[r, 0], geometry[r, 1], geometry[r, 2]
         keep = 0.0 if r == 0 else 1.0
         if plain:
             _turn_held(u[k, r], x, y, spin, r, inv, keep, rot, s)
+        elif sloped:
+            _turn_sloped(x, y, spin, r, inv, keep, rot, s)
         elif held:
             turn_delayed(x, y, spin, r, inv, keep, rot, s)
         else:
@@ -243,8 +283,9 @@ def rotors_step(
 
 @nb.njit(**allocating)
 def _table(
-    u: FloatArray, held: bool, delayed: bool, geometry: FloatArray, dt: float, theta: FloatArray, table: FloatArray
-) -> None:
+    u: FloatArray, slope: FloatArray, held: bool, delayed: bool, geometry: FloatArray, dt: float, theta: FloatArray,
+    table: FloatArray,
+) -> None:  # fmt: skip
     """Moments of every step of a window for lanes that share lag, delay, dead speed and losses.
 
     Arguments as in `rotors_step`, and: theta, the same parameter vector in every lane, (LANES, size); table,
@@ -256,7 +297,7 @@ def _table(
     rotors_start(u, 0, rot)
     s[A_S2 : A_S2 + 2 * HALF] = 0.0
     for k in range(len(u)):
-        rotors_step(u, k, held, delayed, geometry, dt, rot, s)
+        rotors_step(u, slope, k, held, delayed, geometry, dt, rot, s)
         for row in range(ALL_MOMENTS):
             table[k, row] = s[A_S2 + row * LANES]
             table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]

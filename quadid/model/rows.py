@@ -31,9 +31,10 @@ def _rows(first: int, count: int) -> range:
 (C_GB, C_AB, C_GS, C_R) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)
 # Constants of the rotors: lag, delay in whole steps and the rest, input row in use.
 (C_TAU, C_SHIFT, C_PART, C_ROW) = _rows(C_R + 9 * LANES, 4)
-# Constants of the four pieces of a step: e = exp(-h / tau), its integrals, and the length h.
-(P_E, P_E1, P_E2, P_E3, P_H) = _rows(C_ROW + LANES, 5)
-PIECE = 5 * LANES
+# Constants of the four pieces of a step: e = exp(-h / tau), its integrals, the length h, and where it begins, counted
+# from the middle of its sample of the input.
+(P_E, P_E1, P_E2, P_E3, P_H, P_AT) = _rows(C_ROW + LANES, 6)
+PIECE = 6 * LANES
 # Rotor moments, means over the first half step; those over the second follow at + HALF.
 (A_S2, A_X2, A_Y2, A_Z2, A_O1, A_S1, A_DO, A_G, A_M) = _rows(P_E + 4 * PIECE, 9)
 ALL_MOMENTS = 7
@@ -54,6 +55,7 @@ HALF = 9 * LANES
 (D_QW, D_QX, D_QY, D_QZ, D_P, D_Q, D_R, D_P0, D_Q0, D_R0, D_H) = _rows(N_QZ + LANES, 11)
 N_ROWS = D_H // LANES + 1
 
-# Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gain.
-(R_SPEED, R_PAST, R_NOW, R_NEXT, R_GAIN) = _rows(0, 5)
-ROTOR = 5 * LANES
+# Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gain; the
+# input's slope one sample back, now, one ahead.
+(R_SPEED, R_PAST, R_NOW, R_NEXT, R_GAIN, R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE) = _rows(0, 8)
+ROTOR = 8 * LANES

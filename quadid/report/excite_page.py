@@ -76,7 +76,7 @@ def _bars(result: JsonDict) -> dict[str, Any]:
 
 
 def _attitude(window: Window) -> dict[str, Any]:
-    from quadid.identify.score import euler
+    from quadid.rotation import euler
 
     assert window.attitude is not None
     angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))

@@ -9,10 +9,11 @@ from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
 from quadid.identify.horizon import horizon_scores, rate_errors, true_rate
 from quadid.identify.noise import NoiseModel
-from quadid.identify.score import euler, mse_score
+from quadid.identify.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.rotation import euler
 from quadid.vehicle import Vehicle
 
 PELICAN = Vehicle.shipped("pelican")

@@ -1,0 +1,164 @@
+"""What a held command does within its samples where feedback that is faster than the log drives it.
+
+A flight controller acts some hundred times a second; a log at 50 Hz keeps what its commands were on average over each
+sample.  Within the sample they follow the feedback: the angular acceleration about an axis runs on at the slope
+-(kp omega + kd omega').  At the samples the rate does not notice, for the mean is right.  Its integral, the angle,
+does: over a sample of length T it moves further than the trapezoidal rule makes of the rates at both ends, and all
+together by T^2 / 12 (kp angle + kd rate).  With kp = 66 1/s^2, kd = 14 1/s and T = 20 ms that is 0.2 % and 0.5 ms:
+little, but the moment (J_zz - J_xx) p r that couples the axes is larger by these 0.2 % too, and with it J_zz and d,
+which two minutes of flight tell to 0.1 %.
+
+The surplus of the measured angle's change is compared with measured rate and acceleration, frequency by frequency, so
+that kp and kd are read off a flight without knowing any parameter of the vehicle, and speeds get their slope from them.
+Motors that lag behind, or a delay, smooth the torque: then nothing is found, and the speeds stay as they were logged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.chi_square import exceeded
+from quadid.rotation import euler
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+STRETCH_SECONDS = 10.0
+"""Stretches compared by themselves [s], each half over the one before."""
+LEAST_STRETCHES = 8
+NEIGHBOURS = 5
+"""Frequencies over which the spectrum of the errors is smoothed."""
+FALSE_ALARM = 0.01
+"""Probability of a slope in a flight without feedback; one that noise has made up is as small as the noise."""
+LEAST_RATE = 1.5
+"""Standard errors by which the share of the rate must be more than nothing; a smooth torque has one of the angle."""
+STEEPEST_PITCH = 1.2
+"""Pitch [rad] beyond which Euler's angles are left alone."""
+LEAST_CORRELATION = 0.5
+"""Of angular acceleration and rotor moment; below it the speeds do not tell what slope they need."""
+
+
+class Feedback(NamedTuple):
+    """Inner loop of a flight controller as the log shows it.
+
+    Attributes:
+        proportional: kp [1/s^2], angular acceleration for an angle.
+        derivative: kd [1/s], angular acceleration for a rate.
+        sigma: standard errors of both.
+    """
+
+    proportional: float
+    derivative: float
+    sigma: tuple[float, float]
+
+
+def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[Window], Feedback | None]:
+    """Gives the rotor speeds of a log the slope within each sample that its feedback shows.
+
+    Args:
+        windows: of one log.
+        vehicle: where its rotors are.
+
+    Returns:
+        The windows with `rotor_slope`, and the feedback; the same windows and None without evidence.
+    """
+    found = find_feedback(windows)
+    slopes = [_slope(w, vehicle, found) for w in windows] if found is not None else []
+    if found is None or any(slope is None for slope in slopes):
+        return list(windows), None
+    return [replace(w, rotor_slope=slope) for w, slope in zip(windows, slopes, strict=True)], found
+
+
+def find_feedback(windows: Sequence[Window]) -> Feedback | None:
+    """Feedback within the samples of held commands; None where the data do not show any.
+
+    Least squares in the frequency domain, weighted by the spectrum that the errors turn out to have (Whittle): the
+    gyro's noise rules at low frequencies, the attitude's at high ones.  Standard errors are of the scatter between
+    stretches.
+    """
+    if not windows or any(w.sampling != "held" for w in windows):
+        return None
+    dt = windows[0].dt
+    spectra = np.array([spectrum for w in windows for spectrum in _spectra(w)])
+    if len(spectra) < LEAST_STRETCHES or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
+        return None  # too little, or a sensor that always says the same
+    shares, covariance = _weighted(spectra)
+    sigma = np.sqrt(np.diag(covariance))
+    evidence = float(shares @ np.linalg.solve(covariance, shares))
+    if evidence < exceeded(FALSE_ALARM, 2) or shares[0] < 0.0 or shares[1] < LEAST_RATE * sigma[1]:
+        return None
+    scale = 12.0 / dt**2
+    (proportional, derivative), (sigma_p, sigma_d) = scale * shares, scale * sigma
+    found = Feedback(float(proportional), float(derivative), (float(sigma_p), float(sigma_d)))
+    stable = found.derivative * dt < 1.0 and found.proportional * dt**2 < 1.0
+    return found if stable else None
+
+
+def _spectra(window: Window) -> list[ComplexArray]:
+    """Rate, its change, and the surplus of the angle's change, of roll and pitch; (frequencies, 3) of each stretch."""
+    if window.gyro is None or window.attitude is None:
+        return []
+    angles = euler(window.attitude)[:, :2]
+    roll, pitch = angles.T
+    p, q, r = window.gyro.T
+    turning = q * np.sin(roll) + r * np.cos(roll)
+    rates = np.column_stack([p + np.tan(pitch) * turning, q * np.cos(roll) - r * np.sin(roll)])
+    middle, change = 0.5 * (rates[1:] + rates[:-1]), np.diff(rates, axis=0) / window.dt
+    turned = np.remainder(np.diff(angles, axis=0) + np.pi, 2.0 * np.pi) - np.pi
+    columns = np.stack([middle, change, turned / window.dt - middle], axis=2)
+    length = round(STRETCH_SECONDS / window.dt)
+    taper = np.hanning(length)[:, None]
+    out = []
+    for start in range(0, len(columns) - length + 1, length // 2):
+        rows = columns[start : start + length]
+        if np.isfinite(rows).all() and np.abs(pitch[start : start + length]).max() < STEEPEST_PITCH:
+            out += [np.fft.rfft(taper * rows[:, axis], axis=0)[1:] for axis in range(2)]
+    return out
+
+
+def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, FloatArray]:
+    """Shares of rate and its change in the surplus, with their covariance, from spectra (stretches, frequencies, 3)."""
+    x, y = spectra[:, :, :2], spectra[:, :, 2]
+    weights = np.ones(x.shape[1])
+    for _ in range(rounds):
+        inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)
+        shares = inverse @ np.einsum("sfi,sf,f->i", x.conj(), y, weights).real
+        power = np.pad(np.mean(np.abs(y - x @ shares) ** 2, axis=0), NEIGHBOURS // 2, mode="edge")
+        weights = 1.0 / np.convolve(power, np.full(NEIGHBOURS, 1.0 / NEIGHBOURS), "valid")
+    inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)
+    scores = np.einsum("sfi,sf,f->si", x.conj(), y - x @ shares, weights).real
+    return shares, inverse @ scores.T @ scores @ inverse
+
+
+def _slope(window: Window, vehicle: Vehicle, found: Feedback) -> FloatArray | None:
+    """Slope of the speeds [rad/s^2], shape (n, rotors); where gyro or rotors stand still, nothing runs on."""
+    assert window.gyro is not None
+    speed, rate = window.rotor_speed, window.gyro[:, :2]
+    turn = np.diff(rate, axis=0, append=rate[-1:]) / window.dt
+    middle = rate + 0.5 * window.dt * turn
+    x, y = vehicle.rotor_positions[:, :2].T
+    wrench = np.array([np.ones(len(x)), -y, x, vehicle.spins])
+    effect = np.array([_slope_of(turn[:-1, i], speed[:-1] ** 2 @ wrench[1 + i]) for i in range(2)])
+    if np.isnan(effect).any():
+        return None
+    wanted = np.zeros((len(window), 4))
+    wanted[:, 1:3] = -(found.proportional * middle + found.derivative * turn) / effect
+    wanted[~np.isfinite(wanted).all(axis=1)] = 0.0
+    squares = wanted @ np.linalg.pinv(wrench).T
+    return np.asarray(np.where(speed > 0.0, squares / np.maximum(2.0 * speed, 1e-9), 0.0))
+
+
+def _slope_of(turn: FloatArray, moment: FloatArray) -> float:
+    """Angular acceleration for a moment of one rotor unit; NaN where one does not follow the other."""
+    known = np.isfinite(turn)
+    if np.count_nonzero(known) < 2 or np.std(moment[known]) == 0.0 or np.std(turn[known]) == 0.0:
+        return float("nan")
+    (a, b), (_, c) = np.cov(moment[known], turn[known])
+    return float(b / a) if b > LEAST_CORRELATION * np.sqrt(a * c) else float("nan")
