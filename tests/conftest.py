@@ -35,11 +35,12 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One process runs a file from beginning to end: what its tests share is flown, fitted or compiled once.
 
-    Those of `tests/node` are one group over all files (their own conftest).
+    All files of `tests/node` are one group: they measure time, and two at once would disturb each other.
     """
     for item in items:
-        if item.path.parent.name != "node":
-            item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(REPOSITORY))))
+        place = item.path.relative_to(REPOSITORY)
+        node = place.is_relative_to("tests/node")
+        item.add_marker(pytest.mark.xdist_group("node" if node else str(place)))
 
 
 def in_ci() -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,12 +37,22 @@ class Climb:
         model: the selected model on this rung.
     """
 
-    def __init__(self, ladder: Sequence[Shooting], theta: FloatArray) -> None:
-        """Starts nowhere; call `place`."""
+    def __init__(self, ladder: Sequence[Shooting], theta: FloatArray, known: Model | None = None) -> None:
+        """Begins on the longest segments that a model follows, or the shortest.
+
+        Args:
+            ladder: the data cut into segments of falling length.
+            theta: nominal optimum.
+            known: the model, fitted with a poorer noise model; None: the nominal one.
+        """
         self._ladder, self._theta = ladder, theta
-        self._rung = len(ladder) - 1
         self._nominal: dict[int, Model] = {}
-        self.model = self.nominal
+        like = self.nominal_on(len(ladder) - 1) if known is None else known
+        for rung in range(self._longest(like), len(ladder)):
+            self._rung = rung
+            self.model = self.nominal_on(rung) if known is None else self._refitted(rung, known)
+            if self._follows(rung, self.model):
+                break
 
     @property
     def shooting(self) -> Shooting:
@@ -65,23 +75,15 @@ class Climb:
             self._nominal[rung] = fit_model(self._ladder[rung], self._theta, ())
         return self._nominal[rung]
 
-    def refitted(self, rung: int, model: Model) -> Model:
+    def _refitted(self, rung: int, model: Model) -> Model:
         """A model fitted on another rung."""
         fitted = fit_model(self._ladder[rung], model.theta, model.causes, iterations=10)
         return replace(fitted, worth=model.worth)
 
-    def place(self, fit: Callable[[int], Model], like: Model) -> None:
-        """Goes to the longest segments that a model follows, or the shortest; `like`: one with the same causes."""
-        for rung in range(self._longest(like), len(self._ladder)):
-            model = fit(rung)
-            if self._follows(rung, model) or rung == len(self._ladder) - 1:
-                self._rung, self.model = rung, model
-                return
-
     def up(self) -> bool:
         """Goes to longer segments if the model follows them now."""
         for rung in range(self._longest(self.model), self._rung):
-            model = self.refitted(rung, self.model)
+            model = self._refitted(rung, self.model)
             if self._follows(rung, model):
                 self._rung, self.model = rung, model
                 return True

@@ -79,14 +79,11 @@ def select(
         elsewhere: nominal parameters, shape (6,), to start from too while the misfit is large.
         known: selection made with a poorer noise model, to go on from.
     """
-    climb = Climb(ladder, theta)
+    climb = Climb(ladder, theta, known)
     rounds: list[Round] = []
     compared: set[str] = set()
     tests = len(listed)
-    if known is None:
-        climb.place(climb.nominal_on, climb.nominal_on(len(ladder) - 1))
-    else:
-        climb.place(lambda rung: climb.refitted(rung, known), known)
+    if known is not None:
         climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
     while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))

@@ -104,7 +104,7 @@ def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, 
 def _on_logs(
     decisive: Shooting, search: Search, rest: dict[str, Model], logs: Sequence[Window]
 ) -> tuple[Validation, tuple[Worth, ...]]:
-    scorer = Shooting(logs, decisive.vehicle, decisive.seconds, decisive.noise, decisive.layout)
+    scorer = decisive.on(logs)
     nominal, rows = block_deviance(scorer, search.nominal)
     extended, _ = block_deviance(scorer, search.model)
     mse, untidy = float(extended.sum()) / rows, np.empty(0)
@@ -174,12 +174,8 @@ def _second_halves(scorer: Shooting, search: Search, logs: Sequence[Window]) -> 
         middle = len(window) // 2
         if not per_log or middle < 4 * scorer.length:
             continue
-        seconds, noise = scorer.seconds, scorer.noise
-        first = Shooting([window.slice(0, middle)], scorer.vehicle, seconds, noise, scorer.layout)
+        first, second = scorer.on([window.slice(0, middle)]), scorer.on([window.slice(middle, len(window))])
         theta = polish(first, model.theta, first.free(per_log), iterations=6).theta
-        second = Shooting(
-            [window.slice(middle, len(window))], scorer.vehicle, scorer.seconds, scorer.noise, scorer.layout
-        )
         total, count = block_deviance(second, model, theta)
         refitted.append(total)
         nominal.append(block_deviance(second, search.nominal)[0])

@@ -148,8 +148,7 @@ def fit(
     if not options.polish:
         return _finish(short, theta, free_names, Convergence.BUDGET, evaluations)
     report("polish", 0.0)
-    if short.count > SHORT_SEGMENTS:
-        short = short.thinned(-(-short.count // SHORT_SEGMENTS))
+    short = short.at_most(SHORT_SEGMENTS)
     free = short.free(free_names)
     first = polish(short, theta, free, iterations=8)
     short.noise = residual_noise(short, first)

@@ -136,6 +136,10 @@ class Shooting:
         thin._reckoned = {n: [v[::every] for v in velocities] for n, velocities in self._reckoned.items()}
         return thin
 
+    def on(self, windows: Sequence[Window]) -> Shooting:
+        """The same problem on other data."""
+        return Shooting(windows, self.vehicle, self.seconds, self.noise, self.layout)
+
     def at_most(self, most: int) -> Shooting:
         """The same problem on at most about `most` segments, spread evenly."""
         return self.thinned(max(-(-self.count // most), 1))

@@ -98,8 +98,7 @@ def _oracle(case: Case, workings: Workings, validate: Window) -> float:
             shooting, model, _cause(listed, effect, values), _near_truth(shooting, model, effect, values), 12
         )
     model = fit_model(shooting, model.theta, model.causes, model.states, 12)
-    scorer = Shooting([validate], shooting.vehicle, shooting.length * shooting.dt, shooting.noise, shooting.layout)
-    deviance, rows = block_deviance(scorer, model)
+    deviance, rows = block_deviance(shooting.on([validate]), model)
     return float(deviance.sum()) / rows
 
 

@@ -19,12 +19,10 @@ HERE = Path(__file__).resolve().parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep them in one xdist worker: they measure time, and two of them at once would disturb each other."""
+    """Marks those that need ROS."""
     for item in items:
-        if HERE in item.path.parents:
-            item.add_marker(pytest.mark.xdist_group("node"))
-            if item.path.stem.startswith("test_ros"):
-                item.add_marker(pytest.mark.ros)
+        if HERE in item.path.parents and item.path.stem.startswith("test_ros"):
+            item.add_marker(pytest.mark.ros)
 
 
 @pytest.fixture(scope="session", autouse=True)

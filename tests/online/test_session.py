@@ -11,7 +11,7 @@ from quadid.identify.fit import FitOptions, fit
 from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState, fit_window
 from quadid.online.changes import ChangeReply
 from quadid.online.gate import GateSettings
-from quadid.online.records import Publish
+from quadid.online.records import OnlineSet, Publish
 from quadid.online.voice import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -132,15 +132,20 @@ def test_a_restored_set_is_published_stale_and_confirmed_by_flight() -> None:
     assert not session.status().stale
 
 
-def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> None:
-    stream = samples(flight(24.0, 9).recording)
+def _learned(seconds: float, seed: int, until: float) -> tuple[Session, OnlineSet, list[Sample]]:
+    """A session that has a set in force after `until` seconds of a flight, that set, and the samples still to come."""
+    stream = samples(flight(seconds, seed).recording)
     session = Session(PELICAN, QUICK)
-    drive(session, [s for s in stream if s.t < 20.0])
+    drive(session, [s for s in stream if s.t < until])
     force = session.ledger.in_force
     assert force is not None
-    for sample in stream:
-        if sample.t >= 20.0:
-            session.push(sample)
+    return session, force, [s for s in stream if s.t >= until]
+
+
+def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> None:
+    session, force, later = _learned(24.0, 9, 20.0)
+    for sample in later:
+        session.push(sample)
     session.poll()
     request = session.running
     assert isinstance(request, FitRequest)
@@ -156,15 +161,10 @@ def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> Non
 
 
 def test_a_rollback_drops_the_work_that_was_begun() -> None:
-    stream = samples(flight(24.0, 9).recording)
-    session = Session(PELICAN, QUICK)
-    drive(session, [s for s in stream if s.t < 20.0])
-    force = session.ledger.in_force
-    assert force is not None
+    session, force, later = _learned(24.0, 9, 20.0)
     session.ledger.accept(replace(force, reason="a second one"), "test", 20.0, 20.0)
-    for sample in stream:
-        if sample.t >= 20.0:
-            session.push(sample)
+    for sample in later:
+        session.push(sample)
     pieces = 0
     while session.running is None:  # stop at every piece of a tick in turn
         session.poll(1)
@@ -175,21 +175,17 @@ def test_a_rollback_drops_the_work_that_was_begun() -> None:
     session.deliver(fit_window(request))
     session.poll(1)  # the estimate is fused, the gate is not asked yet
     assert session.roll_back("bob").done
-    later = answer(session)
-    assert not published(later, "candidate"), "what was begun before the rollback is not published after it"
+    afterwards = answer(session)
+    assert not published(afterwards, "candidate"), "what was begun before the rollback is not published after it"
     assert session.status().phase is Phase.COLLECTING
 
 
 def test_a_set_that_turns_out_worse_is_taken_back() -> None:
-    stream = samples(flight(40.0, 10).recording)
-    session = Session(PELICAN, QUICK)
-    drive(session, [s for s in stream if s.t < 14.0])
-    good = session.ledger.in_force
-    assert good is not None
+    session, good, later = _learned(40.0, 10, 14.0)
     worse = tuple(replace(p, value=p.value * (1.04 if p.name == "b" else 1.0)) for p in good.parameters)
     bad = replace(good, parameters=replace(good.parameters, parameters=worse))
     session.ledger.accept(bad, "test", 14.0, 14.0)
-    actions = drive(session, [s for s in stream if s.t >= 14.0])
+    actions = drive(session, later)
     back = published(actions)[0]
     assert back.state is SetState.ROLLED_BACK
     assert back.approved_by == "auto"
