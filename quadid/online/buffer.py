@@ -31,8 +31,8 @@ FloatArray = NDArray[np.float64]
 
 SETTLE = 0.5
 """Rows leave this long [s] after their time, so that slower and delayed channels are there."""
-BLOCK = 10
-"""Rows that leave at once."""
+BLOCK = 20
+"""Rows that leave at once: many of them are read from the channels for little more than one."""
 HISTORY = 2.0
 """Past samples kept [s]: rates and gaps are judged from them."""
 _LARGE = 1e150
@@ -143,7 +143,7 @@ class Buffer:
         start, t = 0, self._plain(block)
         while start < len(block.t):
             # Up to the message with which a block of rows is settled, samples only add up.
-            stop = start if t is None else start + int(np.argmax(np.append(t[start:], np.inf) >= self._next))
+            stop = start if t is None else start + _first(t[start:] >= self._next)
             if t is not None and stop > start:
                 self._extend(block, t, start, stop)
             for sample in block.samples(stop, len(block.t) if t is None else stop + 1):
@@ -284,6 +284,12 @@ class Buffer:
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
         self._steering.advance(self._lines, until, float(at[0]) - HISTORY)
         return self._steering.signal(until)
+
+
+def _first(true: NDArray[np.bool_]) -> int:
+    """Where the first True stands, shape (n,), n > 0; n for none."""
+    at = int(true.argmax())
+    return at if true[at] else len(true)
 
 
 def _unit(q: tuple[float, ...]) -> tuple[float, ...]:

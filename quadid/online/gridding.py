@@ -13,14 +13,12 @@ from quadid.tracks import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
 
 FloatArray = NDArray[np.float64]
 
-CHANNELS_A_PIECE = 2
-"""Channels that are read in one piece of work."""
 LOST = 2.05
 """Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
 
 
 def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
-    """Reads the channels of a plan; returns values by channel, NaN where nothing was measured.
+    """Reads the channels of a plan, one a piece; returns values by channel, NaN where nothing was measured.
 
     Optional channels that say nothing in these rows are left out.
 
@@ -29,9 +27,8 @@ def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[st
         at: times of the rows [s], shape (n,).
     """
     columns = {}
-    for k, name in enumerate(name for name in (*REQUIRED, *OPTIONAL) if name in plan.tracks):
-        if k % CHANNELS_A_PIECE == 0:
-            yield
+    for name in (name for name in (*REQUIRED, *OPTIONAL) if name in plan.tracks):
+        yield
         values = on_grid(name, _mended(plan.tracks[name], plan.step), at, plan)
         if name in REQUIRED or not np.isnan(values).all():
             columns[name] = values

@@ -58,6 +58,7 @@ class BlockReader:
         self._decode, self._blocks, self._extra = decode, blocks, extra
         self._places: list[tuple[struct.Struct, int, int]] | None = None
         self._frame: list[tuple[int, int | None, bytes]] = []
+        self._many: np.dtype[np.void] = np.dtype([])
         self._noted: Any = None
         self._size = 0
 
@@ -75,17 +76,17 @@ class BlockReader:
 
     def read_many(self, messages: Sequence[bytes]) -> ReadMany | None:
         """Reads messages as `read` does one after the other; None when not all of them have the layout last learnt."""
-        size = self._size
-        if self._places is None or any(len(data) != size for data in messages):
+        if self._places is None or {*map(len, messages)} != {self._size}:
             return None
-        rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), size)
+        data = b"".join(messages)
+        rows = np.frombuffer(data, dtype=np.uint8).reshape(len(messages), self._size)
         for begin, end, same in self._frame:
-            if not (rows[:, begin:end] == np.frombuffer(same, dtype=np.uint8)).all():
+            if same and rows[:, begin:end].tobytes() != same * len(messages):
                 return None
-        stamps = np.ascontiguousarray(rows[:, _STAMP_AT:_AFTER_STAMP])
-        blocks = [np.ascontiguousarray(rows[:, a:b]).view("<f8").astype(np.float64) for _, a, b in self._places]
+        read = np.frombuffer(data, dtype=self._many)
+        blocks = [read[f"block {k}"].astype(np.float64) for k in range(len(self._places))]
         return ReadMany(
-            stamps.view("<i4")[:, 0].astype(np.int64), stamps.view("<u4")[:, 1].astype(np.int64), blocks, self._noted
+            read["seconds"].astype(np.int64), read["nanoseconds"].astype(np.int64), blocks, self._noted
         )  # fmt: skip
 
     def _learn(self, data: bytes, blocks: Blocks, extra: Any) -> None:
@@ -104,6 +105,12 @@ class BlockReader:
             begin = at + len(packed)
         self._frame = [*frame, (begin, None, data[begin:])]
         self._places, self._noted, self._size = places, extra, len(data)
+        self._many = np.dtype({
+            "names": ["seconds", "nanoseconds", *(f"block {k}" for k in range(len(places)))],
+            "formats": ["<i4", "<u4", *(("<f8", ((b - a) // 8,)) for _, a, b in places)],
+            "offsets": [_STAMP_AT, _STAMP_AT + 4, *(a for _, a, _ in places)],
+            "itemsize": len(data),
+        })  # fmt: skip
 
 
 class BlockWriter:

@@ -14,16 +14,31 @@ FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
 """Standard gravity [m/s^2], the unit of accelerometers that count in g."""
 _HALF = np.sqrt(0.5)
+_BODY, _WORLD = np.array([1.0, -1.0, -1.0]), np.array([1.0, 1.0, -1.0])
+
+
+def _columns(*columns: FloatArray) -> FloatArray:
+    """As `np.column_stack`, which takes longer than the sums of a few rows."""
+    out = np.empty((len(columns[0]), len(columns)))
+    for k, column in enumerate(columns):
+        out[:, k] = column
+    return out
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products of rows, shape (n, 3): `np.cross` to the bit, which takes ten times as long for a few rows."""
+    (a1, a2, a3), (b1, b2, b3) = a.T, b.T
+    return _columns(a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1)
 
 
 def flip_body(vectors: FloatArray) -> FloatArray:
     """Turns body vectors between FLU and FRD (its own inverse), shape (n, 3)."""
-    return np.asarray(vectors * np.array([1.0, -1.0, -1.0]))
+    return np.asarray(vectors * _BODY)
 
 
 def flip_world(vectors: FloatArray) -> FloatArray:
     """Turns world vectors between ENU and NED (its own inverse), shape (n, 3)."""
-    return np.asarray(vectors[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]))
+    return np.asarray(vectors[:, [1, 0, 2]] * _WORLD)
 
 
 def flip_attitude(q: FloatArray) -> FloatArray:
@@ -33,7 +48,7 @@ def flip_attitude(q: FloatArray) -> FloatArray:
     inverse, sign included.
     """
     w, x, y, z = q.T
-    return np.asarray(_HALF * np.column_stack([w + z, x + y, x - y, w - z]))
+    return np.asarray(_HALF * _columns(w + z, x + y, x - y, w - z))
 
 
 def from_euler(angles: FloatArray) -> FloatArray:
@@ -41,13 +56,11 @@ def from_euler(angles: FloatArray) -> FloatArray:
     half = 0.5 * angles
     with np.errstate(invalid="ignore"):
         (cr, cp, cy), (sr, sp, sy) = np.cos(half).T, np.sin(half).T
-    return np.column_stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
+    return _columns(
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
     )
 
 
@@ -58,7 +71,7 @@ def to_euler(q: FloatArray) -> FloatArray:
         roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return np.column_stack([roll, pitch, yaw])
+    return _columns(roll, pitch, yaw)
 
 
 def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid_replay.cdr_blocks import Blocks
-from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
+from quadid_replay.frames import cross, flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.motors import RPM
 
 FloatArray = NDArray[np.float64]
@@ -194,7 +194,7 @@ TYPES: dict[str, MessageType] = {
 def _rotated_velocity(columns: FloatArray) -> FloatArray:
     """Turns attitude FLU->ENU (wxyz) and body velocity FLU, shape (n, 7), into world velocity NED, shape (n, 3)."""
     w, axis, v = columns[:, :1], columns[:, 1:4], columns[:, 4:]
-    turned = v + 2.0 * np.cross(axis, np.cross(axis, v) + w * v)
+    turned = v + 2.0 * cross(axis, cross(axis, v) + w * v)
     return flip_world(turned)
 
 

@@ -53,6 +53,9 @@ class SignalColumns:
         told = []
         for run, column in self._kind.deciding:
             values = blocks[run][:, column]
+            if (values == values[0]).all():  # as nearly always
+                told.append((bool(values[0] == -1.0), False))
+                continue
             absent, unknown = values == -1.0, np.isnan(values)
             if (absent != absent[0]).any() or (unknown != unknown[0]).any():
                 return None
