@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 import rclpy
 from quadid_node.convert import message_class
-from quadid_node.node import SENSOR_QOS, STEP_SECONDS
+from quadid_node.node import SENSOR_QOS
 from quadid_node.polling import PollingNode
 from quadid_node.presets import source
+from quadid_node.rounds import ROUND_SECONDS
 from quadid_node.stopping import Stop
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -32,7 +33,7 @@ class BareNode(PollingNode):
             else:
                 self.create_subscription(kind, entry.topic, lambda data: None, SENSOR_QOS, raw=True)
         if polled:
-            self.create_timer(2.0 * STEP_SECONDS, self._empty)  # it takes in every other step
+            self.create_timer(ROUND_SECONDS, self._empty)
 
     def _empty(self) -> None:
         for take in self._takes:

@@ -12,8 +12,8 @@ from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer
 from quadid_node.intake import Intake
 from quadid_node.messages import Clock
-from quadid_node.node import WORK_SECONDS
 from quadid_node.presets import source
+from quadid_node.rounds import ROUND_SECONDS
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
 from quadid_replay import write_mcap
@@ -22,10 +22,6 @@ from quadid_replay.mcap_records import McapFile
 from benchmarks.online.accuracy import PELICAN
 from benchmarks.online.feeder import recording
 from quadid.online import SessionSettings
-from quadid.window import Block
-
-STEP_EVERY = 64
-"""Messages between two looks at the session: 40 ms of them."""
 
 
 def own_code(seconds: float) -> dict[str, Any]:
@@ -45,15 +41,13 @@ def own_code(seconds: float) -> dict[str, Any]:
         decoder = Decoder(e, clock, chooser, 4, deserializer(e.type))
         intake.open(e, e.topic, decoder, lambda q=arrived[e.topic]: q.popleft() if q else None)  # type: ignore[misc]
     service = Service(PELICAN, SessionSettings(window=60.0, diagnose=0.0), InlineWorker())
+    a_round = round(len(messages) / seconds * ROUND_SECONDS)
     begin = time.process_time()
     for k, (topic, data) in enumerate(messages):
         arrived[topic].append(data)
-        if k % STEP_EVERY == 0:
-            for item in intake.read(intake.take()):
-                if isinstance(item, Block):
-                    service.push_block(item)
-                else:
-                    service.push(item)
-            service.step(WORK_SECONDS)
+        if k % a_round == 0:
+            for items in intake.read(intake.take()):
+                service.push_all(items)
+            service.step()
     spent = time.process_time() - begin
     return {"messages": len(messages), "us_per_message": spent / len(messages) * 1e6, "share": spent / seconds}

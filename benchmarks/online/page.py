@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS
 
+from quadid.online.buffer import SETTLE
 from quadid.parameters import NOMINAL_NAMES
 
 Result = Mapping[str, Any]
@@ -105,12 +107,14 @@ def _refit(r: Result) -> list[str]:
 def _load(r: Result) -> list[str]:
     lines = [
         "The node in its own process, a feeder in another: IMU 1 kHz, attitude and rotor speeds 250 Hz, references "
-        "and odometry 50 Hz. Nobody is woken for a message: a step every 20 ms takes all that wait from the "
-        "middleware, or, in turns, does a little of the session's work. A step is how long services and timers may "
-        "have to wait; a message waits for the next step that takes, half of 40 ms in the mean, which delays nothing, "
-        "since rows of the grid wait 500 ms for the slowest channel. Both by the clock, so other programs on the "
-        "machine count too (load average: runnable programs, 2 cores); beside it what a step took of the processor. "
-        "Goals: under 15 % of a core, callbacks held up for less than 5 ms (p99).", "",
+        f"and odometry 50 Hz. Nobody is woken for a message: every {1e3 * ROUND_SECONDS:.0f} ms all that wait are "
+        "taken from the middleware, read, and worked on, and once a second status and health are told; piece by "
+        f"piece, in steps {1e3 * STEP_SECONDS:.0f} ms apart, in which no piece begins after "
+        f"{1e3 * WORK_SECONDS:.1f} ms. A step is how long services and timers may have to wait (steps count in which "
+        "there was something to do, from the first message on). A message waits for the next round; to a row of the "
+        f"grid, which waits {1e3 * SETTLE:.0f} ms for the slowest channel, that adds a round at most. Both by the "
+        "clock, so other programs on the machine count too (load average: runnable programs, 2 cores); beside it what "
+        "a step took of the processor. Goals: under 15 % of a core, callbacks held up for less than 5 ms (p99).", "",
         "| run | node, % of a core | fit process, % | IMU received % | message waits, idle p50 / p99 ms | while "
         "fitting p50 / p99 ms | a step p50 / p99 ms | of the processor | memory MiB begin → end | load average |",
         "|---|---|---|---|---|---|---|---|---|---|",
@@ -129,8 +133,8 @@ def _costs(r: Result) -> list[str]:
     return [
         "A node of the same executor that takes the same messages and does nothing with them: "
         f"{100 * r['woken']['share']:.1f} % of a core when it is woken for each, {100 * r['polled']['share']:.1f} % "
-        f"when it takes them every 40 ms. Our own code without ROS: {own['us_per_message']:.0f} us a "
-        f"message, {100 * own['share']:.1f} % of a core at these rates.",
+        f"when it takes them every {1e3 * ROUND_SECONDS:.0f} ms. Our own code without ROS: "
+        f"{own['us_per_message']:.0f} us a message, {100 * own['share']:.1f} % of a core at these rates.",
     ]  # fmt: skip
 
 

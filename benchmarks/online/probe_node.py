@@ -1,6 +1,7 @@
 """The node itself, watched: how late each IMU message was taken and whether a fit ran, how long each step took.
 
-By the clock, and of this thread's processor time, which other programs on the machine do not lengthen much.
+By the clock, and of this thread's processor time, which other programs on the machine do not lengthen much.  Steps
+count from the first message on, and only those in which there was something to do.
 """
 
 from __future__ import annotations
@@ -46,10 +47,11 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         return noted
 
     def _step(self) -> None:
-        begin, cpu = time.monotonic(), time.thread_time()
+        resting, begin, cpu = self._rounds.resting, time.monotonic(), time.thread_time()
         super()._step()
-        self.cpu.append(time.thread_time() - cpu)
-        self.steps.append(time.monotonic() - begin)
+        if self.idle and not resting:
+            self.cpu.append(time.thread_time() - cpu)
+            self.steps.append(time.monotonic() - begin)
 
     def destroy_node(self) -> None:
         """Writes what was noted."""

@@ -71,8 +71,8 @@ class Intake:
         messages = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
         return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
 
-    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[Sample | Block]:
-        """Reads what was taken.
+    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Sample | Block]]:
+        """Reads what was taken, one topic after the other.
 
         Args:
             waiting: what `take` gave.
@@ -84,7 +84,8 @@ class Intake:
                 if record is not None:
                     for data in piece:
                         record(entry.topic, entry.type.replace("/", "/msg/"), data)
-                yield from decoder.take(piece)
+                if piece:
+                    yield list(decoder.take(piece))
 
     def clear(self) -> None:
         """Forgets the topics."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from std_srvs.srv import Trigger
 from quadid.errors import QuadidError
 from quadid.online import Event, Publish
 from quadid.online.ledger import Answer
-from quadid.window import Block
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
@@ -30,20 +29,17 @@ from quadid_node.neighbours import Neighbours, Offer
 from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
 from quadid_node.polling import PollingNode
 from quadid_node.presets import Source, source
-from quadid_node.recorder import Beginning, Recorder
+from quadid_node.recorder import WRITTEN, Beginning, Recorder
+from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
 from quadid_node.service import Output, Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker, with_ground
 
-STEP_SECONDS = 0.02
-"""A step is taken this often [s]: messages are taken from the middleware in one, worked on in the next.
-
-Waking for each message would cost twice the processor time; services and timers wait for a step at most.
-"""
-WORK_SECONDS, CATCHING_UP, BACKLOG = 0.0015, 10.0, 2.0
-"""No piece of the session's work begins later than this in a step [s]; later in proportion, up to so many times, when
-there is a backlog of more than this much data [s]."""
+CATCHING_UP, BACKLOG = 10.0, 2.0
+"""A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
+REPORT_SECONDS = 1.0
+"""Status and health are told this often [s]."""
 WARM_UP_SECONDS = 8.0
 """How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
 SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -70,7 +66,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._speaker: Speaker | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
-        self._active = self._taking = False
+        self._rounds, self._report_at = Rounds(self._round), 0.0
+        self._active = False
 
     @property
     def warm(self) -> bool:
@@ -161,13 +158,12 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for name, answer in (("fit_now", self._fit_now), ("approve", self._approve), ("rollback", self._roll_back)):
             service = self.create_service(Trigger, f"quadid/{name}", answer)
             self._open.append((self.destroy_service, service))
-        for period, work in ((STEP_SECONDS, self._step), (1.0, self._report)):
-            timer = self.create_timer(period, work, clock=self._steady)
-            self._open.append((self.destroy_timer, timer))
+        self._open.append((self.destroy_timer, self.create_timer(STEP_SECONDS, self._step, clock=self._steady)))
 
     def _tear_down(self) -> None:
         self._active = False
         gc.unfreeze()
+        self._rounds.drop()
         self._intake.clear()
         self.destroy_polled()
         for destroy, item in reversed(self._open):
@@ -186,35 +182,46 @@ class IdentifyNode(PollingNode, LifecycleNode):
     # --- callbacks
 
     def _step(self) -> None:
-        """Takes what has arrived, or works on it: in turns, so that nobody has to wait for both."""
-        self._taking = not self._taking
-        if self._service is None:
-            return
-        if self._taking:
-            self._take_in(self._service)
-        else:
-            self._work(self._service)
+        """Goes on with the round, for longer when the session is far behind its data."""
+        if self._service is not None:
+            behind = self._service.session.backlog / BACKLOG
+            self._rounds.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
 
-    def _work(self, service: Service) -> None:
-        """Writes what is recorded; does some of the session's work."""
-        end = time.monotonic() + WORK_SECONDS * min(max(service.session.backlog / BACKLOG, 1.0), CATCHING_UP)
-        if self._recorder is not None:
-            self._recorder.write()
-        for output in service.step(end - time.monotonic()) if self._active else service.idle():
-            self._put(output)
+    def _round(self) -> Iterator[None]:
+        """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
+        assert self._service is not None
+        assert self._speaker is not None
+        yield from self._take_in(self._service)
+        while self._recorder is not None and self._recorder.write(WRITTEN):
+            yield
+        now = time.monotonic()
+        if now >= self._report_at:
+            self._report_at = max(self._report_at, now - ROUND_SECONDS) + REPORT_SECONDS
+            yield from self._report(self._service, self._speaker)
+        yield from self._work(self._service)
 
-    def _take_in(self, service: Service) -> None:
-        """Gives the service what has arrived since the last step."""
+    def _take_in(self, service: Service) -> Iterator[None]:
+        """Gives the service what has arrived since the last round, topic by topic."""
         waiting = self._intake.take()
         for topic, publishers in self.publisher_counts().items():
             self._neighbours.count(topic, publishers)
+        yield
         if not self._active or self._neighbours.paused:
             return
-        for item in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
-            if isinstance(item, Block):
-                service.push_block(item)
-            else:
-                service.push(item)
+        for items in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
+            service.push_all(items)
+            yield
+            if not self._active:
+                return
+
+    def _work(self, service: Service) -> Iterator[None]:
+        """Works on what was taken in, until that is done or the round lasts too long."""
+        for outputs in service.pieces() if self._active else [service.idle()]:
+            for output in outputs:
+                self._put(output)
+            yield
+            if self._rounds.overdue or not self._active:
+                return
 
     def _put(self, output: Output) -> None:
         if isinstance(output, Event):
@@ -236,30 +243,29 @@ class IdentifyNode(PollingNode, LifecycleNode):
         else:
             log.error(text)
 
-    def _report(self) -> None:
-        """Once a second: status, health, and who else publishes."""
-        if self._service is None or self._speaker is None:
-            return
-        self._look_around(self._service, self._speaker)
-        health = self._service.health()
+    def _report(self, service: Service, speaker: Speaker) -> Iterator[None]:
+        """Once a second: status, health, and who else publishes inputs or the parameter sets of our vehicle."""
+        deaf = speaker.deaf()
+        yield
+        self._neighbours.look(deaf)
+        yield
+        force = service.session.ledger.in_force
+        if speaker.step(self._active) and force is not None:
+            self._put(Publish("parameters", force))
+        self._neighbours.note(speaker.ours, speaker.problem)
+        yield
+        health = service.health()
         fields = messages.fit_status(health.status, self._id, self._stamps, health.fit_seconds)
         if "no rotor speeds" in fields["reason"]:
             fields["reason"] += f"; here: {self._hint}"
-        self._speaker.publish("status", fields)
+        speaker.publish("status", fields)
+        yield
         notes = dict(self._neighbours.notes)
         notes |= {t: f"{d.failed} messages could not be read" for t, d in self._intake.decoders.items() if d.failed}
         stamp = self.get_clock().now().to_msg()
         now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
         report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)
-        self._speaker.publish("diagnostics", report)
-
-    def _look_around(self, service: Service, speaker: Speaker) -> None:
-        """Who else publishes inputs, or the parameter sets of our vehicle."""
-        self._neighbours.look(speaker.deaf())
-        force = service.session.ledger.in_force
-        if speaker.step(self._active) and force is not None:
-            self._put(Publish("parameters", force))
-        self._neighbours.note(speaker.ours, speaker.problem)
+        speaker.publish("diagnostics", report)
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:
         if self._service is not None:
@@ -286,5 +292,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
             return response
         answer = command(self._service)
         response.success, response.message = answer.done, answer.text
-        self._work(self._service)
+        for output in self._service.step(WORK_SECONDS):
+            self._put(output)
         return response

@@ -25,6 +25,8 @@ from quadid_node.presets import Input
 from quadid_node.store import Restored
 
 RECORD = "quadid.session"
+WRITTEN = 32
+"""Messages that are written in about a millisecond."""
 CHUNK_BYTES = 1 << 16
 """A small chunk is compressed in half a millisecond; a usual one would hold up the node for ten."""
 
@@ -57,11 +59,13 @@ class Recorder:
         self._last = max(time.time_ns(), self._last + 1)
         self._waiting.append((topic, kind, data, self._last))
 
-    def write(self) -> None:
-        """Writes what was taken since the last call."""
-        waiting, self._waiting = self._waiting, []
-        for message in waiting:
+    def write(self, most: int | None = None) -> bool:
+        """Writes what waits, `most` messages at most; returns whether some are left."""
+        most = len(self._waiting) if most is None else most
+        now, self._waiting = self._waiting[:most], self._waiting[most:]
+        for message in now:
             self._writer.write_cdr(*message)
+        return bool(self._waiting)
 
     def close(self) -> None:
         """Writes what waits and the end of the file."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
@@ -107,6 +107,14 @@ class Service:
             self._arrived[name] = now
         self.session.push_block(block)
 
+    def push_all(self, items: Iterable[Sample | Block]) -> None:
+        """Takes samples and messages in order."""
+        for item in items:
+            if isinstance(item, Block):
+                self.push_block(item)
+            else:
+                self.push(item)
+
     def step(self, seconds: float = math.inf) -> list[Output]:
         """Moves everything on by what there is to do; never waits.
 
@@ -116,11 +124,22 @@ class Service:
         Returns:
             What to publish and tell, already in the history.
         """
-        outputs, begin = self._tidy(), self._clock()
+        outputs, begin = list[Output](), self._clock()
+        for piece in self.pieces():
+            outputs += piece
+            if self._clock() - begin >= seconds:
+                break
+        return outputs
+
+    def pieces(self) -> Iterator[list[Output]]:
+        """As `step`, and gives control back, with what is to be published and told, after each piece of the work."""
+        outputs = self._tidy()
         while True:
             outputs += self._carried_out(self.session.poll(1))
-            if not self.session.busy or self._clock() - begin >= seconds:
-                return self._journalled(outputs)
+            yield self._journalled(outputs)
+            if not self.session.busy:
+                return
+            outputs = []
 
     def _carried_out(self, actions: list[Action]) -> list[Output]:
         """Gives requests to the workers; returns the rest."""

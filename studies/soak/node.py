@@ -9,13 +9,15 @@ import sys
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import quadid_node.node
 from quadid_node.identify import main
+from quadid_node.service import Service
+from quadid_node.speaker import Speaker
 
 from studies.soak import memory
 
@@ -44,8 +46,8 @@ class CountingNode(quadid_node.node.IdentifyNode):
 
         return counted
 
-    def _report(self) -> None:
-        super()._report()
+    def _report(self, service: Service, speaker: Speaker) -> Iterator[None]:
+        yield from super()._report(service, speaker)
         if time.monotonic() - self.noted >= EVERY and self.late:
             self.note()
 

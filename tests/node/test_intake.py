@@ -67,7 +67,8 @@ def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[M
         for topic, data in messages[k : k + batch]:
             arrived[topic].append(data)
         now[0] = min(k + batch, len(messages)) * SECONDS / len(messages)
-        items = list(intake.read(intake.take(), lambda topic, kind, data: recorded.append((topic, data))))
+        read = intake.read(intake.take(), lambda topic, kind, data: recorded.append((topic, data)))
+        items = [item for topic in read for item in topic]
         blocks += sum(isinstance(item, Block) for item in items)
         out += flat(iter(items))
     return out, recorded, blocks
