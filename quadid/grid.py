@@ -8,7 +8,7 @@ rotor speeds included; channels slower than the grid stay untouched and are NaN 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import REQUIRED, Plan, make_plan, on_grid, reach
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
-from quadid.within_samples import Feedback, follow_feedback
+from quadid.within_samples import follow_feedback
 
 FloatArray = NDArray[np.float64]
 Span = tuple[float, float]
@@ -91,7 +91,7 @@ def grid_recording(
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
     filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``, with the slope within
-    each sample that the flight controller's feedback shows (`quadid.within_samples`).
+    each sample that the flight controller's feedback makes (`quadid.within_samples`).
 
     Args:
         recording: a log in core units and frames.
@@ -126,14 +126,14 @@ def grid_recording(
     if not windows:
         longest = max((b - a for a, b in spans), default=0.0)
         raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), start, stop)
-    windows, feedback = follow_feedback(windows, vehicle)
-    return Gridded(windows, _report(plan, rotor, windows, len(spans) - 1, dropped, log_span, feedback))
+    windows, followed = follow_feedback(windows, vehicle)
+    report = _report(plan, rotor, windows, len(spans) - 1, dropped, log_span)
+    return Gridded(windows, replace(report, notes=(*report.notes, followed)) if followed else report)
 
 
 def _report(
-    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span,
-    feedback: Feedback | None,
-) -> GridReport:  # fmt: skip
+    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
+) -> GridReport:
     return GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
@@ -145,7 +145,7 @@ def _report(
         rotor_source=rotor.source,
         rotor_rate=1.0 / sample_period(rotor.t),
         filtered=plan.filtered,
-        notes=(*rotor.notes, *_notes(plan, rotor.t, feedback)),
+        notes=(*rotor.notes, *_notes(plan, rotor.t)),
     )
 
 
@@ -207,19 +207,13 @@ def _log_span(recording: Recording) -> Span:
     return min(a for a, _ in ends), max(b for _, b in ends)
 
 
-def _notes(plan: Plan, rotor_times: FloatArray, feedback: Feedback | None) -> list[str]:
+def _notes(plan: Plan, rotor_times: FloatArray) -> list[str]:
     notes = []
     period = sample_period(rotor_times)
     if period > 1.5 * plan.step:
         notes.append(
             f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
             "fast motion cannot be attributed to the rotors"
-        )
-    if feedback is not None:
-        notes.append(
-            f"the commands follow feedback within each sample (about {feedback.proportional:.0f} 1/s^2 on the angle, "
-            f"{feedback.derivative:.0f} 1/s on the rate), as a controller faster than the log makes them do: "
-            "the rotor speeds are given that slope"
         )
     return notes
 

@@ -10,12 +10,13 @@ which two minutes of flight tell to 0.1 %.
 
 The surplus of the measured angle's change is compared with measured rate and acceleration, frequency by frequency, so
 that kp and kd are read off a flight without knowing any parameter of the vehicle, and speeds get their slope from them.
-Motors that lag behind, or a delay, smooth the torque: then nothing is found, and the speeds stay as they were logged.
+Motors that lag behind, or a delay, smooth the torque: then nothing is found, and the speeds stay as they were logged,
+unless the vehicle file tells its stabiliser and how often it runs: then that control law gives the slope.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
 from quadid.rotation import euler
+from quadid.stabiliser import mixer_matrix
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -59,21 +61,31 @@ class Feedback(NamedTuple):
     sigma: tuple[float, float]
 
 
-def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[Window], Feedback | None]:
-    """Gives the rotor speeds of a log the slope within each sample that its feedback shows.
+def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[Window], str]:
+    """Gives the rotor speeds of a log the slope within each sample that feedback makes.
 
     Args:
         windows: of one log.
-        vehicle: where its rotors are.
+        vehicle: where its rotors are; its stabiliser, where known.
 
     Returns:
-        The windows with `rotor_slope`, and the feedback; the same windows and None without evidence.
+        The windows with `rotor_slope`, and a sentence that says so; the same windows and "" without evidence.
     """
-    found = find_feedback(windows)
-    slopes = [_slope(w, vehicle, found) for w in windows] if found is not None else []
-    if found is None or any(slope is None for slope in slopes):
-        return list(windows), None
-    return [replace(w, rotor_slope=slope) for w, slope in zip(windows, slopes, strict=True)], found
+    slopes: list[FloatArray | None] = []
+    known = vehicle.stabiliser
+    if known is not None and known.rate is not None:
+        slopes = [_slope_of_law(w, vehicle, known.gains, known.rate) for w in windows]
+        told = f"as the vehicle file's stabiliser, which runs at {known.rate:.0f} Hz, makes them do"
+    else:
+        found = find_feedback(windows)
+        if found is not None:
+            slopes = [_slope_of_motion(w, vehicle, found) for w in windows]
+            loop = f"about {found.proportional:.0f} 1/s^2 on the angle, {found.derivative:.0f} 1/s on the rate"
+            told = f"as a controller faster than the log makes them do ({loop})"
+    if not slopes or any(slope is None for slope in slopes):
+        return list(windows), ""
+    text = f"the commands follow feedback within each sample, {told}: the rotor speeds are given that slope"
+    return [replace(w, rotor_slope=slope) for w, slope in zip(windows, slopes, strict=True)], text
 
 
 def find_feedback(windows: Sequence[Window]) -> Feedback | None:
@@ -137,25 +149,58 @@ def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, Float
     return shares, inverse @ scores.T @ scores @ inverse
 
 
-def _slope(window: Window, vehicle: Vehicle, found: Feedback) -> FloatArray | None:
-    """Slope of the speeds [rad/s^2], shape (n, rotors); where gyro or rotors stand still, nothing runs on."""
-    assert window.gyro is not None
-    speed, rate = window.rotor_speed, window.gyro[:, :2]
-    turn = np.diff(rate, axis=0, append=rate[-1:]) / window.dt
-    middle = rate + 0.5 * window.dt * turn
+def _slope_of_law(window: Window, vehicle: Vehicle, gains: Mapping[str, float], rate: float) -> FloatArray | None:
+    """Slope of the speeds [rad/s^2], shape (n, rotors), that the control law of `quadid.stabiliser` makes.
+
+    Nothing runs on where the gyro is missing or a speed is at its limit; None where a sample holds one step of the law.
+    """
+    steps = rate * window.dt
+    if window.gyro is None or window.sampling != "held" or steps < 1.5:
+        return None
+    speed, middle, turn = window.rotor_speed, *_motion(window)
+    mixer = mixer_matrix(vehicle, gains)
+    torque = (speed**2 @ np.linalg.pinv(mixer).T)[:, 1:]
+    miss, wanted = torque - torque.mean(axis=0), np.zeros((len(window), 4))
+    for i, axis in enumerate(("roll", "pitch", "yaw")):
+        of_angle, of_rate = gains[f"{axis}_p"], gains[f"{axis}_rate_p"]
+        wanted[:, 1 + i] = -of_rate * (of_angle * middle[:, i] + turn[:, i])
+        wanted[:, 1 + i] += gains[f"{axis}_rate_i"] / of_rate * miss[:, i]
+    wanted[~np.isfinite(wanted).all(axis=1)] = 0.0
+    free = (speed > gains["min_speed"]) & (speed < gains["max_speed"])
+    share = 1.0 - 1.0 / steps**2  # of a straight line's first moment in a staircase of so many steps
+    return _of_squares(np.where(free, share * (wanted @ mixer.T), 0.0), speed)
+
+
+def _slope_of_motion(window: Window, vehicle: Vehicle, found: Feedback) -> FloatArray | None:
+    """Slope of the speeds [rad/s^2], shape (n, rotors); where the gyro is missing, nothing runs on.
+
+    None where the motion does not follow the speeds.
+    """
+    speed, middle, turn = window.rotor_speed, *_motion(window)
     x, y = vehicle.rotor_positions[:, :2].T
     wrench = np.array([np.ones(len(x)), -y, x, vehicle.spins])
-    effect = np.array([_slope_of(turn[:-1, i], speed[:-1] ** 2 @ wrench[1 + i]) for i in range(2)])
+    effect = np.array([_effect(turn[:-1, i], speed[:-1] ** 2 @ wrench[1 + i]) for i in range(2)])
     if np.isnan(effect).any():
         return None
     wanted = np.zeros((len(window), 4))
-    wanted[:, 1:3] = -(found.proportional * middle + found.derivative * turn) / effect
+    wanted[:, 1:3] = -(found.proportional * middle + found.derivative * turn)[:, :2] / effect
     wanted[~np.isfinite(wanted).all(axis=1)] = 0.0
-    squares = wanted @ np.linalg.pinv(wrench).T
-    return np.asarray(np.where(speed > 0.0, squares / np.maximum(2.0 * speed, 1e-9), 0.0))
+    return _of_squares(wanted @ np.linalg.pinv(wrench).T, speed)
 
 
-def _slope_of(turn: FloatArray, moment: FloatArray) -> float:
+def _motion(window: Window) -> tuple[FloatArray, FloatArray]:
+    """Rate [rad/s] in the middle of each sample and angular acceleration [rad/s^2] over it, shape (n, 3)."""
+    assert window.gyro is not None
+    turn = np.diff(window.gyro, axis=0, append=window.gyro[-1:]) / window.dt
+    return window.gyro + 0.5 * window.dt * turn, turn
+
+
+def _of_squares(slope: FloatArray, speed: FloatArray) -> FloatArray:
+    """Slope of speeds from that of their squares; a rotor that stands still goes on standing."""
+    return np.asarray(np.where(speed > 0.0, slope / np.maximum(2.0 * speed, 1e-9), 0.0))
+
+
+def _effect(turn: FloatArray, moment: FloatArray) -> float:
     """Angular acceleration for a moment of one rotor unit; NaN where one does not follow the other."""
     known = np.isfinite(turn)
     if np.count_nonzero(known) < 2 or np.std(moment[known]) == 0.0 or np.std(turn[known]) == 0.0:

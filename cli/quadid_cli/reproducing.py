@@ -171,7 +171,8 @@ def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
         flight = fly_once(base, seconds=plan.seconds, seed=10 * seed + i, effects=EFFECTS, command_rate=STABILISER_RATE)
         path = place / f"set{i + 1}.mcap"
         write_mcap(path, flight.recording)
-        sets.append(load_log(str(path), base, GRID).windows)
+        flown = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=STABILISER_RATE)})
+        sets.append(load_log(str(path), flown, GRID).windows)
         logs.append(str(path))
     vehicle = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=SIMULATED_RATE)})
     write_text(place / "pelican.yaml", vehicle.to_yaml())

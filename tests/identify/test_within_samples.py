@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from quadid.errors import WindowError
+from quadid.flight import fly
+from quadid.flight.stabiliser import default_gains
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.score import mse_score
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
-from quadid.vehicle import Vehicle
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Stabiliser, Vehicle
 from quadid.window import Window
 from quadid.within_samples import find_feedback, follow_feedback
 from tests.identify.fast_loop import EVERY, fly_fast
@@ -50,8 +54,8 @@ def test_two_windows_of_a_flight_tell_what_one_does(fast: Window) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_commands_held_like_the_log_stay_as_they_are(seed: int) -> None:
     flown = fly_fast(PELICAN, 60.0, seed, KP, KD, act_every=EVERY)
-    (followed,), found = follow_feedback([flown], PELICAN)
-    assert found is None
+    (followed,), said = follow_feedback([flown], PELICAN)
+    assert not said
     assert followed is flown
 
 
@@ -70,8 +74,8 @@ def test_readings_of_speeds_too_little_flight_or_a_stuck_gyro_show_nothing(fast:
 def test_rows_without_gyro_hold_their_speed(fast: Window) -> None:
     gyro = np.array(fast.gyro)
     gyro[100] = np.nan
-    (followed,), found = follow_feedback([replace(fast, gyro=gyro)], PELICAN)
-    assert found is not None
+    (followed,), said = follow_feedback([replace(fast, gyro=gyro)], PELICAN)
+    assert "faster than the log" in said
     assert followed.rotor_slope is not None
     assert np.isfinite(followed.rotor_slope).all()
     assert not followed.rotor_slope[99:101].any()
@@ -80,8 +84,7 @@ def test_rows_without_gyro_hold_their_speed(fast: Window) -> None:
 
 def test_speeds_that_follow_leave_nothing_but_noise() -> None:
     quiet = fly_fast(PELICAN, 60.0, 5, KP, KD, noise=0.1)
-    (followed,), found = follow_feedback([quiet], PELICAN)
-    assert found is not None
+    (followed,), _ = follow_feedback([quiet], PELICAN)
     flat, sloped = (_error(fit([w], PELICAN, FitOptions(iterations=0)), w) for w in (quiet, followed))
     assert flat > 1.5
     assert sloped < 1.1
@@ -91,6 +94,38 @@ def _error(found: Fit, window: Window) -> float:
     """Mean square of roll, pitch and yaw over what the sensors' noise makes it."""
     channels = mse_score([window], PELICAN, found.theta).channels
     return float(np.mean([c.rmse**2 for c in channels[3:6]]) / (0.1 * 0.0012) ** 2)
+
+
+def test_behind_a_lag_the_stabiliser_of_the_vehicle_file_tells_it() -> None:
+    flown = fly(PELICAN, seconds=120.0, seed=7, command_rate=1000.0, effects={"motor_lag": {"tau": 0.035}})
+    known = _with_stabiliser(flown.gains, 1000.0)
+    (followed,), said = follow_feedback([flown.window], known)
+    assert "the vehicle file's stabiliser, which runs at 1000 Hz" in said
+    flat, sloped = (_deviations(w, flown.truth.parameters.as_dict()) for w in (flown.window, followed))
+    assert np.sqrt(np.mean(flat[2:4] ** 2)) > 3.0, "J_xx and J_yy"
+    assert abs(flat[6]) > 3.0, "the lag"
+    assert np.sqrt(np.mean(sloped**2)) < 1.3
+
+
+def test_a_stabiliser_as_fast_as_the_log_holds_its_commands(fast: Window) -> None:
+    gains = default_gains(PELICAN)
+    for rate in (50.0, None):
+        known = _with_stabiliser(gains, rate)
+        (followed,), said = follow_feedback([replace(fast, gyro=np.zeros((len(fast), 3)))], known)
+        assert not said
+        assert followed.rotor_slope is None
+
+
+def _with_stabiliser(gains: Mapping[str, float], rate: float | None) -> Vehicle:
+    return PELICAN.model_copy(update={"stabiliser": Stabiliser(gains=dict(gains), rate=rate)})
+
+
+def _deviations(window: Window, truth: Mapping[str, float]) -> FloatArray:
+    """Errors of the six and of the motor lag in standard deviations."""
+    found = fit([window], PELICAN, FitOptions(iterations=0), names=[*NOMINAL_NAMES, "motor_lag.tau"])
+    six = (np.log(found.theta[:6]) - np.log([truth[n] for n in NOMINAL_NAMES])) / found.uncertainty.sigma[:6]
+    lag = found.parameters["motor_lag.tau"]
+    return np.append(six, (lag.value - 0.035) / lag.sigma)
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.0), (0.0, 0.03), (0.027, 0.0), (0.0052, 0.02)])
