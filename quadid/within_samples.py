@@ -16,6 +16,7 @@ unless the vehicle file tells its stabiliser and how often it runs: then that co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -34,7 +35,8 @@ ComplexArray = NDArray[np.complex128]
 
 STRETCH_SECONDS = 10.0
 """Stretches compared by themselves [s], each half over the one before."""
-LEAST_STRETCHES = 8
+LEAST_STRETCHES, MOST_STRETCHES = 8, 1000
+"""More than the latter are thinned evenly: they tell kp and kd to a hundredth, and memory would grow with the log."""
 NEIGHBOURS = 5
 """Frequencies over which the spectrum of the errors is smoothed."""
 FALSE_ALARM = 0.01
@@ -98,7 +100,8 @@ def find_feedback(windows: Sequence[Window]) -> Feedback | None:
     if not windows or any(w.sampling != "held" for w in windows):
         return None
     dt = windows[0].dt
-    spectra = np.array([spectrum for w in windows for spectrum in _spectra(w)])
+    every = max(math.ceil(2.0 * dt * sum(map(len, windows)) / STRETCH_SECONDS / MOST_STRETCHES), 1)
+    spectra = np.array([spectrum for w in windows for spectrum in _spectra(w, every)])
     if len(spectra) < LEAST_STRETCHES or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
         return None  # too little, or a sensor that always says the same
     shares, covariance = _weighted(spectra)
@@ -113,8 +116,8 @@ def find_feedback(windows: Sequence[Window]) -> Feedback | None:
     return found if stable else None
 
 
-def _spectra(window: Window) -> list[ComplexArray]:
-    """Rate, its change, and the surplus of the angle's change, of roll and pitch; (frequencies, 3) of each stretch."""
+def _spectra(window: Window, every: int) -> list[ComplexArray]:
+    """Rate, its change, surplus of the angle's change, of roll and pitch; (frequencies, 3) of every n-th stretch."""
     if window.gyro is None or window.attitude is None:
         return []
     angles = euler(window.attitude)[:, :2]
@@ -128,7 +131,7 @@ def _spectra(window: Window) -> list[ComplexArray]:
     length = round(STRETCH_SECONDS / window.dt)
     taper = np.hanning(length)[:, None]
     out = []
-    for start in range(0, len(columns) - length + 1, length // 2):
+    for start in range(0, len(columns) - length + 1, every * (length // 2)):
         rows = columns[start : start + length]
         if np.isfinite(rows).all() and np.abs(pitch[start : start + length]).max() < STEEPEST_PITCH:
             out += [np.fft.rfft(taper * rows[:, axis], axis=0)[1:] for axis in range(2)]
@@ -143,7 +146,10 @@ def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, Float
         inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)
         shares = inverse @ np.einsum("sfi,sf,f->i", x.conj(), y, weights).real
         power = np.pad(np.mean(np.abs(y - x @ shares) ** 2, axis=0), NEIGHBOURS // 2, mode="edge")
-        weights = 1.0 / np.convolve(power, np.full(NEIGHBOURS, 1.0 / NEIGHBOURS), "valid")
+        power = np.convolve(power, np.full(NEIGHBOURS, 1.0 / NEIGHBOURS), "valid")
+        if not np.any(power):
+            break  # nothing left: noise-free data
+        weights = 1.0 / np.maximum(power, 1e-9 * power.mean())
     inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)
     scores = np.einsum("sfi,sf,f->si", x.conj(), y - x @ shares, weights).real
     return shares, inverse @ scores.T @ scores @ inverse
