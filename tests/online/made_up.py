@@ -1,0 +1,122 @@
+"""A flight without a simulator and a worker without a fit: a session is driven in milliseconds.
+
+The recording follows rigid-body arithmetic of a vehicle with the parameters `TRUE`; a fit answers with these,
+times stated factors, and with a stated standard deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from quadid.online import FitReply, FitRequest, Session
+from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.fusion import WindowEstimate
+from quadid.online.voice import Action
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Sample
+from tests.online.test_gate import TRUE
+
+PELICAN = Vehicle.shipped("pelican")
+Worker = Callable[[FitRequest | ChangeRequest], FitReply | ChangeReply | None]
+"""Answers a request; None: it is still at work."""
+
+
+@lru_cache(maxsize=8)
+def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop: float = 0.15) -> tuple[Sample, ...]:
+    """Samples at 50 Hz from 0 s on: weaving about hover; at `drop_at` [s] the share `drop` of thrust is lost."""
+    t = np.arange(round(seconds * 50.0)) / 50.0
+    rng = np.random.default_rng(seed)
+    turn = np.array([5.0, 6.1, 2.3])  # rad/s
+    rate = 0.9 * np.sin(np.outer(t, turn))
+    inertia = np.array([TRUE["J_xx"], TRUE["J_yy"]])
+    wanted = 0.9 * turn[:2] * np.cos(np.outer(t + 0.01, turn[:2])) * inertia / TRUE["b"]
+    arms = np.column_stack([-PELICAN.rotor_positions[:, 1], PELICAN.rotor_positions[:, 0]])
+    square = PELICAN.hover_speed(TRUE["b"]) ** 2 * (1.0 + 0.08 * np.sin(3.1 * t))[:, None]
+    square = square + wanted @ np.linalg.pinv(arms)
+    lift = TRUE["b"] * square.sum(axis=1) * np.where(t < drop_at, 1.0, 1.0 - drop) / PELICAN.mass
+    half = -0.45 / turn * np.cos(np.outer(t, turn)) + 0.001 * rng.normal(size=(len(t), 3))
+    channels = {
+        "gyro": rate + 0.02 * rng.normal(size=rate.shape),
+        "accel": np.column_stack([np.zeros_like(t), np.zeros_like(t), -lift]) + 0.1 * rng.normal(size=rate.shape),
+        "attitude": np.column_stack([np.sqrt(1.0 - np.sum(half**2, axis=1)), half]),
+        "rotor_speed": np.sqrt(square),
+    }
+    rows = {name: values.tolist() for name, values in channels.items()}
+    return tuple(Sample(s, name, tuple(rows[name][k])) for k, s in enumerate(t.tolist()) for name in channels)
+
+
+DROPPED = light_flight(30.0, 1, 14.3)
+"""15 % of thrust are lost after 14.3 s."""
+
+
+def on_the_ground(seconds: float) -> list[Sample]:
+    """Idling rotors, nothing moves."""
+    rng = np.random.default_rng(2)
+    return [
+        Sample(0.02 * k, name, tuple((level + 0.01 * rng.normal(size=level.size)).tolist()))
+        for k in range(round(50.0 * seconds))
+        for name, level in (
+            ("gyro", np.zeros(3)),
+            ("accel", np.array([0.0, 0.0, -GRAVITY])),
+            ("rotor_speed", np.full(4, 80.0)),
+        )
+    ]
+
+
+def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shift: float = 0.0) -> list[Sample]:
+    """Samples with start <= t < stop [s], their times then shifted [s]."""
+    return [replace(s, t=s.t + shift) for s in stream if start - 1e-9 <= s.t < stop - 1e-9]
+
+
+def tells(sigma: float = 0.005, **factors: float) -> Worker:
+    """A worker whose fits say the truth times `factors`, with a relative standard deviation of `sigma`."""
+
+    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply:
+        if isinstance(request, ChangeRequest):
+            return ChangeReply(request.number, problem="made up")
+        values = np.array([TRUE[n] * factors.get(n, 1.0) for n in NOMINAL_NAMES])
+        window = WindowEstimate(
+            request.start, request.stop, np.log(values), np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0
+        )
+        theta = request.theta.copy()
+        theta[:6] = values
+        return FitReply(request.number, "", np.full(6, sigma), True, window, theta)
+
+    return work
+
+
+def works(session: Session, stream: Sequence[Sample], worker: Worker) -> list[Action]:
+    """Pushes the samples, polls after each moment's four, and hands the worker's answers in until it gives none."""
+    out: list[Action] = []
+    for start in range(0, max(len(stream), 1), 4):
+        for sample in stream[start : start + 4]:
+            session.push(sample)
+        out += answered(session, worker)
+    return out
+
+
+def answered(session: Session, worker: Worker) -> list[Action]:
+    """Polls and hands the worker's answers in until nothing is left to do, or the worker gives none."""
+    out, last = session.poll(), 0
+    while session.running is not None and (reply := worker(session.running)) is not None:
+        assert session.running.number > last, "a request that was answered must not be asked again"
+        last = session.running.number
+        session.deliver(reply)
+        out += session.poll()
+    return out
+
+
+def numbers(actions: list[Action]) -> list[int]:
+    """Numbers of the requests that were made."""
+    return [a.number for a in actions if isinstance(a, FitRequest | ChangeRequest)]
+
+
+def first_fit(actions: list[Action]) -> FitRequest:
+    """The first fit that was asked for."""
+    return next(a for a in actions if isinstance(a, FitRequest))

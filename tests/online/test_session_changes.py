@@ -1,0 +1,143 @@
+"""The session without simulator and fit: sudden changes, and studies beside the fits."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings
+from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.records import OnlineFinding
+from quadid.online.study import StudyReply, StudyRequest
+from quadid.online.voice import Action
+from quadid.window import Sample
+from tests.online.driving import EPOCH, diagnosed, events, published
+from tests.online.made_up import (
+    DROPPED,
+    PELICAN,
+    Worker,
+    between,
+    first_fit,
+    light_flight,
+    numbers,
+    on_the_ground,
+    tells,
+    works,
+)
+
+QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2, pause=0.0))
+MASS = OnlineFinding(
+    "mass_change", {"fraction": 0.17}, {"fraction": 0.01}, {"fraction": ""}, 9.0, 1.0, 1e-9, (), "seen"
+)
+
+
+def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> None:
+    session = Session(PELICAN, QUICK)
+
+    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
+        if isinstance(request, ChangeRequest):
+            return ChangeReply(request.number, MASS)
+        return tells(b=0.85 if request.stop > 18.0 else 1.0)(request)
+
+    actions = works(session, between(DROPPED, 0.0, 17.5, EPOCH), work)
+    (seen,) = events(actions, "change")
+    assert (seen.level, seen.t) == ("warning", EPOCH + 16.0)
+    told_as = rf"thrust stepped by -16\.\d% at {EPOCH + 14.3:.2f} s \(\d+ standard errors\)"
+    assert re.fullmatch(told_as, seen.text), "0.85 is 16.3 % less on the log scale"
+    status = session.status()
+    assert status.phase is Phase.CANDIDATE
+    assert "a change of thrust is being looked into" in status.reason
+    assert max(a.stop for a in actions if isinstance(a, FitRequest)) == first_fit(actions).stop + 11.0, "no fit since"
+    assert not [a for a in actions if isinstance(a, ChangeRequest)], "3 s of data must follow first"
+    actions += works(session, between(DROPPED, 17.5, 29.7, EPOCH), work)
+    (question,) = [a for a in actions if isinstance(a, ChangeRequest)]
+    assert question.time == pytest.approx(EPOCH + 14.3, abs=0.03)
+    assert numbers(actions) == list(range(1, len(numbers(actions)) + 1)), "one count for all requests"
+    (told,) = diagnosed(actions)
+    assert (told.findings, told.verdict) == ((MASS,), "explained")
+    assert told.start == pytest.approx(EPOCH + 14.3, abs=0.03)
+    assert told.stop == EPOCH + 18.0
+    after = [s for s in published(actions, "candidate") if s.stop > EPOCH + 18.0]
+    assert after
+    assert min(s.start for s in after) >= EPOCH + 14.3
+    assert len(events(actions, "change")) == 1
+
+
+def test_while_a_change_is_explained_the_session_waits() -> None:
+    session = Session(PELICAN, QUICK)
+
+    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
+        return None if isinstance(request, ChangeRequest) else tells()(request)
+
+    works(session, between(DROPPED, 0.0, 20.7), work)
+    question = session.running
+    assert isinstance(question, ChangeRequest)
+    assert session.status().phase is Phase.FITTING
+    session.deliver(ChangeReply(question.number - 1, MASS))
+    assert session.poll() == []
+    session.deliver(ChangeReply(question.number, problem="no known cause explains it"))
+    said = session.poll()
+    (told,) = diagnosed(said)
+    assert (told.findings, told.verdict) == ((), "unknown")
+    assert "no known cause" in events(said, "finding")[0].text
+    assert isinstance(session.running, FitRequest), "the fits go on"
+
+
+def test_a_change_of_a_vehicle_that_is_not_known_yet_needs_no_fit() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(DROPPED, 0.0, 20.7), lambda r: FitReply(r.number, problem="no luck"))
+    assert not [a for a in actions if isinstance(a, ChangeRequest)]
+    (told,) = diagnosed(actions)
+    assert told.verdict == "unknown"
+    assert told.findings[0].values["fraction"] == pytest.approx(1.0 / 0.85 - 1.0, rel=0.1)
+
+
+def studies(actions: list[Action]) -> list[StudyRequest]:
+    return [a for a in actions if isinstance(a, StudyRequest)]
+
+
+LONG = light_flight(96.0)
+STUDYING = QUICK.model_copy(update={"diagnose": 60.0, "refit": 2.0, "seed": 3})
+
+
+def test_a_minute_is_studied_beside_the_fits_and_told_half_a_minute_later() -> None:
+    session = Session(PELICAN, STUDYING)
+    actions = works(session, between(LONG, 0.0, 63.7, EPOCH), tells())
+    (study,) = studies(actions)
+    assert study.stop - study.start == 60.0
+    assert study.seed == 3
+    assert sum(len(w) for w in study.windows) >= 2995
+    assert study.stop <= 62.0 + study.start, "asked for as soon as there is a minute"
+    session.deliver(StudyReply(study.number + 1, (), "unknown"))
+    session.deliver(StudyReply(study.number, (MASS,), "explained"))
+    assert session.running is None, "nothing waits for a study"
+    rest = works(session, between(LONG, 63.7, 95.7, EPOCH), tells())
+    (told,) = diagnosed(rest)
+    assert (told.findings, told.verdict) == ((MASS,), "explained")
+    assert (told.stop - told.start, told.t) == (60.0, told.stop)
+    assert told.stop == session.buffer.time.stamp(study.stop)
+    assert numbers(actions + rest) == list(range(1, session.status().fits + 1)), "studies have their own count"
+
+
+@pytest.mark.parametrize("worker", ["failing", "blind", "off"])
+def test_what_is_not_known_or_does_not_move_is_not_studied(worker: str) -> None:
+    def blind(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
+        return tells()(request) if request.stop < 20.0 else FitReply(request.number, excitation=np.full(6, 5.0))
+
+    def failing(request: FitRequest | ChangeRequest) -> FitReply:
+        return FitReply(request.number, problem="no luck")
+
+    settings = STUDYING.model_copy(update={"diagnose": 0.0}) if worker == "off" else STUDYING
+    workers: dict[str, Worker] = {"failing": failing, "blind": blind, "off": tells()}
+    assert not studies(works(Session(PELICAN, settings), between(LONG, 0.0, 63.7), workers[worker]))
+
+
+def test_while_the_data_are_bad_nothing_is_studied() -> None:
+    ground: list[Sample] = [replace(s, t=s.t + 50.0) for s in on_the_ground(20.0)]
+    session = Session(PELICAN, STUDYING)
+    actions = works(session, between(LONG, 0.0, 50.0) + ground, tells())
+    assert session.status().phase is Phase.NOT_FLYING
+    assert not studies(actions)

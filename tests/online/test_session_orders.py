@@ -1,0 +1,236 @@
+"""The session without simulator and fit: what people order, what breaks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from quadid.online import FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
+from quadid.online.changes import ChangeRequest
+from tests.online.driving import EPOCH, diagnosed, events, published
+from tests.online.made_up import DROPPED, PELICAN, between, first_fit, light_flight, numbers, tells, works
+
+GATE = GateSettings(windows=2, pause=0.0)
+QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
+MANUAL = QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})})
+FLIGHT = light_flight(30.0)
+
+
+def never(request: FitRequest | ChangeRequest) -> None:
+    """A worker that does not answer."""
+
+
+def with_two_sets(shift: float = 0.0) -> Session:
+    """A session after 13.7 s with a blunt and a sharper set; samples are shifted by so much [s]."""
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 8.7, shift), tells(sigma=0.02))
+    works(session, between(FLIGHT, 8.7, 13.7, shift), tells(sigma=0.002))
+    assert session.ledger.predecessor is not None
+    return session
+
+
+# --- orders
+
+
+def test_a_set_waits_for_a_person_and_is_approved_once() -> None:
+    session = Session(PELICAN, MANUAL)
+    assert not session.approve("ann").done, "nothing waits yet"
+    actions = works(session, between(FLIGHT, 0.0, 10.7, EPOCH), tells())
+    assert not published(actions)
+    candidate = published(actions, "candidate")[-1]
+    status = session.status()
+    assert (candidate.state, status.phase, status.pending) == (SetState.PENDING, Phase.PENDING, candidate.sequence)
+    assert not session.approve("ann", candidate.sequence + 1).done
+    assert session.poll() == []
+    assert session.approve("ann", candidate.sequence).done
+    assert not session.approve("bob", candidate.sequence).done
+    said = session.poll()
+    (accepted,) = published(said)
+    assert (accepted.state, accepted.approved_by) == (SetState.ACCEPTED, "ann")
+    assert accepted.parameters.values.tobytes() == candidate.parameters.values.tobytes()
+    (event,) = events(said, "accepted")
+    assert event.t == pytest.approx(EPOCH + 10.7 - session.backlog, abs=0.03), "what the data have been read to"
+    assert (session.status().pending, session.status().in_force) == (0, accepted.sequence)
+
+
+def test_a_rollback_without_an_earlier_set_changes_nothing() -> None:
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 8.7), tells())
+    before = session.status()
+    answer = session.roll_back("bob")
+    assert not answer.done
+    assert "no earlier set" in answer.text
+    assert session.poll() == []
+    after = session.status()
+    assert (after.phase, after.approval, after.in_force) == (before.phase, "auto", 1)
+    assert numbers(works(session, between(FLIGHT, 8.7, 9.7), tells())) == [6], "the fits go on"
+
+
+def test_a_rollback_returns_to_the_set_before_and_learns_anew_from_there() -> None:
+    session = with_two_sets(EPOCH)
+    good, before = session.ledger.predecessor, session.ledger.in_force
+    assert good is not None
+    assert before is not None
+    assert session.roll_back("bob").done
+    said = session.poll()
+    (back,) = published(said)
+    assert (back.state, back.approved_by, back.sequence) == (SetState.ROLLED_BACK, "bob", before.sequence + 1)
+    assert back.parameters.values.tobytes() == good.parameters.values.tobytes()
+    (event,) = events(said, "rollback")
+    read_to = EPOCH + 13.7 - session.backlog
+    assert event.t == pytest.approx(read_to, abs=0.03)
+    status = session.status()
+    assert (status.phase, status.approval) == (Phase.COLLECTING, "manual")
+    assert "rolled back by bob" in status.reason
+    later = works(session, between(FLIGHT, 13.7, 26.7, EPOCH), tells(sigma=0.0005))
+    assert first_fit(later).search, "nothing is taken for known"
+    assert min(w.t0 for w in first_fit(later).windows) + session_start(session) >= read_to - 0.03
+    assert not published(later), "from now on a person approves"
+    assert session.status().phase is Phase.PENDING
+
+
+def session_start(session: Session) -> float:
+    """What turns session time into stamps [s]."""
+    return session.buffer.time.stamp(0.0)
+
+
+def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_counts() -> None:
+    session = with_two_sets()
+    works(session, between(FLIGHT, 13.7, 14.7), never)
+    request = session.running
+    assert isinstance(request, FitRequest)
+    fits = session.status().fits
+    assert session.roll_back("bob").done
+    session.poll()
+    reply = tells()(request)
+    assert reply is not None
+    session.deliver(reply)
+    assert session.poll() == []
+    assert (session.running, session.status().fits) == (None, fits)
+    later = works(session, between(FLIGHT, 14.7, 19.7), tells())
+    assert numbers(later) == [request.number + 1, request.number + 2]
+    assert session.status().fits == fits + 2
+    assert len(published(later, "candidate")) == 2
+
+
+def test_a_rollback_in_the_middle_of_an_answer_drops_the_rest_of_it() -> None:
+    session = with_two_sets()
+    works(session, between(FLIGHT, 13.7, 14.7), never)
+    assert session.running is not None
+    reply = tells(sigma=0.0005)(session.running)
+    assert reply is not None
+    session.deliver(reply)
+    session.poll(1)  # fused, the gate is not asked yet
+    assert session.roll_back("bob").done
+    assert not published(session.poll(), "candidate")
+    assert session.status().phase is Phase.COLLECTING
+
+
+def test_a_rollback_ends_the_search_for_what_a_change_was() -> None:
+    session = Session(PELICAN, QUICK)
+    works(session, between(DROPPED, 0.0, 8.7), tells(sigma=0.02))
+    works(session, between(DROPPED, 8.7, 16.7), tells(sigma=0.002))
+    assert "being looked into" in session.status().reason
+    assert session.roll_back("bob").done
+    later = works(session, between(DROPPED, 16.7, 24.7), tells(b=0.85))
+    assert not diagnosed(later)
+    assert isinstance(first_fit(later), FitRequest)
+    assert not [a for a in later if isinstance(a, ChangeRequest)]
+
+
+def test_fit_now_takes_what_there_is_at_the_next_tick_and_once() -> None:
+    session = Session(PELICAN, SessionSettings(diagnose=0.0, refit=30.0))
+    assert not numbers(works(session, between(FLIGHT, 0.0, 5.7), tells()))
+    answer = session.fit_now()
+    assert answer.done
+    assert "next tick" in answer.text
+    asked = works(session, between(FLIGHT, 5.7, 6.7), tells())
+    assert numbers(asked) == [1]
+    assert (first_fit(asked).start, first_fit(asked).stop) == (0.0, 6.0)
+    assert not numbers(works(session, between(FLIGHT, 6.7, 9.7), tells())), "asked once, done once"
+
+
+def test_fit_now_with_hardly_any_data_says_what_is_missing() -> None:
+    session = Session(PELICAN, SessionSettings(diagnose=0.0))
+    works(session, between(FLIGHT, 0.0, 2.2), tells())
+    session.fit_now()
+    assert not numbers(works(session, between(FLIGHT, 2.2, 3.7), tells()))
+    assert session.status().phase is Phase.COLLECTING
+    assert session.status().reason == "3 of 10 s of flight; no gaps"
+    short = Session(PELICAN, SessionSettings(diagnose=0.0))
+    works(short, between(FLIGHT, 0.0, 3.7, 0.4), tells())
+    short.fit_now()
+    assert numbers(works(short, between(FLIGHT, 3.7, 4.7, 0.4), tells())) == [1], "3.6 s are nearly four"
+
+
+# --- what breaks
+
+
+def test_a_set_that_predicts_worse_than_its_predecessor_is_taken_back_by_itself() -> None:
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 8.7), tells())
+    good = session.ledger.in_force
+    assert good is not None
+    worse = tuple(replace(p, value=p.value * (1.06 if p.name == "b" else 1.0)) for p in good.parameters)
+    session.ledger.accept(replace(good, parameters=replace(good.parameters, parameters=worse)), "test", 8.0, 8.0)
+    actions = works(session, between(FLIGHT, 8.7, 13.7), tells())
+    (back,) = published(actions)
+    assert (back.state, back.approved_by) == (SetState.ROLLED_BACK, "auto")
+    assert "predecessor" in back.reason
+    assert back.parameters.values.tobytes() == good.parameters.values.tobytes()
+    assert [e.level for e in events(actions, "rollback")] == ["warning"]
+    assert session.status().approval == "auto"
+
+
+def test_a_stuck_gyro_blocks_and_is_named_once() -> None:
+    stuck = [replace(s, values=(0.1, 0.2, 0.3)) if s.channel == "gyro" and s.t > 9.0 else s for s in FLIGHT]
+    session = Session(PELICAN, QUICK)
+    actions = works(session, stuck[: 4 * 50 * 16], tells())
+    assert session.status().phase is Phase.BLOCKED
+    assert "gyro is stuck" in session.status().reason
+    assert len(events(actions, "blocked")) == 1
+    assert max(a.stop for a in actions if isinstance(a, FitRequest)) <= 10.0
+    assert session.status().in_force == 1, "the last good set holds"
+
+
+@pytest.mark.parametrize(("missing", "word"), [("rotor_speed", "no rotor speeds"), ("gyro", "")])
+def test_a_missing_channel_is_told(missing: str, word: str) -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, [s for s in between(FLIGHT, 0.0, 9.7) if s.channel != missing], tells())
+    assert not numbers(actions)
+    assert word in session.status().reason
+    assert session.status().phase is (Phase.BLOCKED if word else Phase.WAITING)
+    if word:
+        (event,) = events(actions, "blocked")
+        assert (event.t, "fix" in event.text) == (1.0, True)
+
+
+def test_a_gap_is_counted_and_a_long_one_holds_the_fits_back() -> None:
+    session = Session(PELICAN, SessionSettings(diagnose=0.0))
+    brief = [s for s in FLIGHT if not (s.channel == "rotor_speed" and 11.0 <= s.t < 11.6)]
+    works(session, [s for s in brief if s.t < 15.7], tells())
+    status = session.status()
+    assert status.gaps == 1
+    assert 9.0 < status.window_seconds < 10.0
+    assert status.samples == round(status.window_seconds * 50.0)
+    assert status.fits == 6
+    session = Session(PELICAN, SessionSettings(diagnose=0.0))
+    long = [s for s in FLIGHT if not (s.channel == "rotor_speed" and 11.0 <= s.t < 14.0)]
+    works(session, [s for s in long if s.t < 15.7], tells())
+    assert session.status().phase is Phase.COLLECTING
+    assert "s of usable data in the last" in session.status().reason
+    assert session.status().fits < 6
+
+
+def test_a_reboot_begins_anew_and_mixes_nothing() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(FLIGHT, 0.0, 6.7, 500.0), tells())
+    actions += works(session, between(FLIGHT, 10.0, 20.7, -9.0), tells())
+    begun = events(actions, "stream")
+    assert [(e.level, e.text) for e in begun] == [("info", "a stream of data begins")] * 2
+    assert [e.t for e in begun] == [500.0, pytest.approx(1.0, abs=0.1)]
+    asked = [a for a in actions if isinstance(a, FitRequest)]
+    assert all(a.windows[-1].t.max() - a.windows[0].t0 < 4.3 for a in asked)
+    fit_of_the_new = [s.stop for s in published(actions, "candidate") if s.stop < 100.0]
+    assert fit_of_the_new[0] == pytest.approx(5.0, abs=1.0), "no sooner than a window after it began"

@@ -1,0 +1,285 @@
+"""The session without simulator and fit: when it asks, what it publishes, how its work is cut into pieces.
+
+The session and all it consists of are real; recording and fits are arithmetic (`tests.online.made_up`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
+from quadid.online.records import Publish
+from quadid.online.voice import Action
+from quadid.parameters import NOMINAL_NAMES
+from quadid.window import Block
+from tests.online.driving import EPOCH, events, published
+from tests.online.made_up import PELICAN, answered, between, light_flight, on_the_ground, tells, works
+from tests.online.test_gate import TRUE, online_set, scaled
+
+QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2))
+"""A first set after 8 s."""
+FLIGHT = light_flight(30.0)
+EARLIER = replace(online_set(scaled(b=0.97)), sequence=7, reason="of yesterday")
+
+
+def fits(actions: list[Action]) -> list[FitRequest]:
+    return [a for a in actions if isinstance(a, FitRequest)]
+
+
+def told(actions: list[Action]) -> list[object]:
+    """Everything a session said and asked, comparable."""
+    return [
+        (a.topic, a.item.sequence, a.item.state, a.item.reason, a.item.input_hash, a.item.parameters.values.tobytes())
+        if isinstance(a, Publish)
+        else (a.number, a.start, a.stop, a.theta.tobytes(), [w.gyro.tobytes() for w in a.windows if w.gyro is not None])
+        if isinstance(a, FitRequest)
+        else a
+        for a in actions
+    ]
+
+
+def test_before_the_first_sample_it_waits_and_says_so() -> None:
+    session = Session(PELICAN)
+    assert session.poll() == []
+    assert not session.busy
+    status = session.status()
+    assert (status.phase, status.backlog, status.samples, status.in_force, status.pending) == (
+        Phase.WAITING,
+        0,
+        0,
+        0,
+        0,
+    )
+    assert math.isnan(status.t)
+    assert math.isnan(status.mse)
+    assert np.isnan(status.excitation).all()
+    assert not status.stale
+    assert session.running is None
+
+
+def test_two_windows_that_agree_give_a_set_and_a_third_gives_no_news() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(FLIGHT, 0.0, 12.7, EPOCH), tells())
+    (first,) = published(actions)
+    assert (first.sequence, first.state, first.approved_by, first.check) == (1, SetState.ACCEPTED, "auto", "approval")
+    assert (first.start, first.stop, first.samples) == (EPOCH, EPOCH + 8.0, 400)
+    for name in NOMINAL_NAMES:
+        assert first.parameters[name].value == pytest.approx(TRUE[name], rel=0.005)
+    candidates = published(actions, "candidate")
+    assert [c.stop - EPOCH for c in candidates] == [4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0]
+    assert [c.state for c in candidates[:4]] == [SetState.REJECTED] * 4
+    assert "keep flying" in candidates[0].reason
+    assert "no news" in candidates[-1].reason
+
+
+def test_the_status_tells_what_was_done() -> None:
+    session = Session(PELICAN, QUICK)
+    stream = between(FLIGHT, 0.0, 12.7, EPOCH)
+    works(session, stream, tells(sigma=0.006))
+    status = session.status()
+    assert status.t == stream[-1].t
+    assert status.phase is Phase.ACCEPTED
+    assert (status.fits, status.rejected, status.in_force, status.pending) == (9, 8, 1, 0)
+    assert (status.samples, status.gaps, status.approval, status.stale, status.faults) == (211, 0, "auto", False, {})
+    assert status.window_seconds == pytest.approx(4.22)
+    assert status.mse == 1.0
+    assert np.all(status.excitation == 0.006)
+    assert 0.0 < status.backlog < 0.7, "only what the filters still need"
+
+
+def test_a_fit_is_asked_for_every_second_with_a_full_window_of_data_and_some_before() -> None:
+    asked = fits(works(Session(PELICAN, QUICK.model_copy(update={"seed": 5})), between(FLIGHT, 0.0, 9.7), tells()))
+    assert [a.number for a in asked] == [1, 2, 3, 4, 5, 6]
+    assert [(a.start, a.stop) for a in asked] == [(float(k), k + 4.0) for k in range(6)]
+    assert {a.seed for a in asked} == {5}
+    assert [a.search for a in asked] == [True, False, False, False, False, False], "once known, no global search"
+    first, last = asked[0].windows[0], asked[-1].windows[0]
+    assert (len(first), first.t0) == (200, 0.0)
+    assert (len(last), last.dt) == (211, 0.02)
+    assert last.t0 == pytest.approx(4.78)
+
+
+@pytest.mark.parametrize(("refit", "stops"), [(0.5, [3.5, 4.0, 4.5, 5.0, 5.5, 6.0]), (2.0, [5.0, 7.0, 9.0])])
+def test_the_time_between_fits_is_kept(refit: float, stops: list[float]) -> None:
+    session = Session(PELICAN, QUICK.model_copy(update={"refit": refit}))
+    asked = fits(works(session, between(FLIGHT, 0.0, stops[-1] + 0.7), tells()))
+    assert [a.stop for a in asked] == stops
+
+
+def test_the_first_tick_follows_the_first_sample() -> None:
+    asked = fits(works(Session(PELICAN, QUICK), between(FLIGHT, 0.0, 6.3, 0.7), tells()))
+    assert [a.stop for a in asked] == [5.0, 6.0], "4 s after 0.7 s, at whole seconds"
+    assert asked[0].start == 1.0
+    half = Session(PELICAN, QUICK.model_copy(update={"refit": 0.5}))
+    assert fits(works(half, between(FLIGHT, 0.0, 5.7, 0.7), tells()))[0].stop == 4.5, "half a second short is enough"
+
+
+def test_the_grid_has_the_rate_of_the_settings() -> None:
+    session = Session(PELICAN, QUICK.model_copy(update={"rate": 25.0}))
+    asked = fits(works(session, between(FLIGHT, 0.0, 9.7), tells()))
+    assert asked[-1].windows[0].dt == 0.04
+    assert [a.stop for a in asked[:5]] == [4.0, 5.0, 6.0, 7.0, 8.0]
+
+
+def test_windows_the_gate_and_memory_follow_the_settings() -> None:
+    three = QUICK.model_copy(update={"gate": GateSettings(windows=3)})
+    (first,) = published(works(Session(PELICAN, three), between(FLIGHT, 0.0, 14.7), tells()))
+    assert first.stop == 12.0
+    sharp, blunt = (
+        published(works(Session(PELICAN, QUICK.model_copy(update={"memory": m})), FLIGHT, tells()), "candidate")[-1]
+        for m in (1e6, 20.0)
+    )
+    ratio = blunt.parameters["b"].sigma / sharp.parameters["b"].sigma
+    assert 1.1 < ratio < 2.0, "who forgets claims to know less"
+
+
+def test_how_it_is_polled_changes_nothing() -> None:
+    stream = between(FLIGHT, 0.0, 14.7, EPOCH)
+    plain = works(Session(PELICAN, QUICK), stream, tells())
+    session, work, late = Session(PELICAN, QUICK), tells(), list[Action]()
+    for sample in stream:  # all at once, then piece by piece with answers that come late
+        session.push(sample)
+    for k in range(4000):
+        late += session.poll(1)
+        if session.running is not None and k % 7 == 0:
+            reply = work(session.running)
+            assert reply is not None
+            session.deliver(reply)
+    assert not session.busy
+    assert told(late) == told(plain)
+    assert published(late)
+
+
+def test_blocks_of_messages_give_what_samples_give() -> None:
+    stream = between(FLIGHT, 0.0, 9.7, EPOCH)
+    plain = works(Session(PELICAN, QUICK), stream, tells())
+    session = Session(PELICAN, QUICK)
+    t = np.array([s.t for s in stream[::4]])
+    names = [s.channel for s in stream[:4]]
+    columns = tuple((name, np.array([s.values for s in stream[k::4]])) for k, name in enumerate(names))
+    session.push_block(Block(t, columns))
+    assert told(answered(session, tells())) == told(plain)
+
+
+def test_pieces_are_counted() -> None:
+    counts = []
+    for most in (1, 3):
+        session, polls = Session(PELICAN, QUICK), 0
+        for sample in between(FLIGHT, 0.0, 4.0):  # ends before the first fit
+            session.push(sample)
+        while session.busy and polls < 1000:
+            session.poll(most)
+            polls += 1
+        counts.append(polls)
+    assert 20 < counts[0] < 1000
+    assert counts[1] == math.ceil(counts[0] / 3)
+
+
+def test_where_no_piece_is_allowed_none_is_done() -> None:
+    session = Session(PELICAN, QUICK)
+    for sample in between(FLIGHT, 0.0, 0.9):  # one block of rows
+        session.push(sample)
+    assert session.poll(0) == []
+    assert session.busy
+    before = session.status()
+    assert before.phase is Phase.WAITING
+    session.poll()
+    assert session.backlog > 0.0
+
+
+def test_while_a_fit_runs_the_data_wait_and_then_are_caught_up_with() -> None:
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 4.7), lambda request: None)
+    request = session.running
+    assert isinstance(request, FitRequest)
+    assert not session.busy
+    before = session.backlog
+    assert works(session, between(FLIGHT, 4.7, 7.7), lambda request: None) == []
+    assert session.running is request
+    assert session.status().phase is Phase.FITTING
+    assert session.status().backlog == pytest.approx(before + 3.0, abs=0.05)
+    reply = tells()(request)
+    assert reply is not None
+    session.deliver(reply)
+    assert session.busy
+    asked = fits(answered(session, tells()))
+    assert [a.stop for a in asked] == [5.0, 6.0, 7.0], "no window is left out"
+    assert session.backlog < 0.7
+
+
+def test_answers_to_nothing_and_to_something_else_are_ignored() -> None:
+    session = Session(PELICAN, QUICK)
+    session.deliver(FitReply(1, problem="nobody asked"))
+    works(session, between(FLIGHT, 0.0, 4.7), lambda request: None)
+    request = session.running
+    assert isinstance(request, FitRequest)
+    for number in (request.number - 1, request.number + 1):
+        session.deliver(FitReply(number, problem="another one's"))
+        assert session.poll() == []
+        assert session.running is request
+    (candidate,) = published(answered(session, tells()), "candidate")
+    assert candidate.stop == 4.0
+    session.deliver(FitReply(request.number, problem="the same once more"))
+    assert session.poll() == []
+    assert session.status().phase is Phase.CANDIDATE
+
+
+def test_a_failed_fit_is_told_once_and_the_next_windows_are_learned_from() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(FLIGHT, 0.0, 6.7), lambda r: FitReply(r.number, problem="the worker died"))
+    assert len(fits(actions)) == 3
+    (event,) = events(actions, "failed")
+    assert (event.t, event.level, event.text) == (4.0, "info", "the worker died")
+    assert (session.status().phase, session.status().reason) == (Phase.FAILED, "the worker died")
+    assert session.status().fits == 0
+    assert published(works(session, between(FLIGHT, 6.7, 16.0), tells()))
+    assert session.status().phase is Phase.ACCEPTED
+
+
+def test_a_window_that_reveals_nothing_is_named_and_nothing_is_published() -> None:
+    bounds = np.array([0.01, 0.1, 0.02, 0.03, 0.4, 2.0])
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(FLIGHT, 0.0, 6.7), lambda r: FitReply(r.number, excitation=bounds))
+    assert not published(actions, "candidate")
+    assert session.status().phase is Phase.NOT_EXCITED
+    assert "J_r only to 200%" in session.status().reason
+    assert np.array_equal(session.status().excitation, bounds)
+
+
+def test_a_restored_set_holds_as_stale_until_flight_confirms_it() -> None:
+    session = Session(PELICAN, QUICK, restored=EARLIER, next_sequence=12)
+    (stale,) = published(session.poll())
+    assert (stale.sequence, stale.state) == (7, SetState.STALE)
+    assert "of yesterday" in stale.reason
+    status = session.status()
+    assert (status.in_force, status.stale) == (7, True)
+    actions = works(session, between(FLIGHT, 0.0, 9.7), tells())
+    assert fits(actions)[0].theta[:6] == pytest.approx(EARLIER.parameters.values), "the search starts there"
+    (confirmed,) = published(actions)
+    assert (confirmed.sequence, confirmed.state, confirmed.stop) == (12, SetState.ACCEPTED, 8.0)
+    assert (session.status().in_force, session.status().stale) == (12, False)
+
+
+def test_creeping_is_measured_from_the_baseline_of_earlier_runs() -> None:
+    def creeping(baseline: float) -> list[SetState]:
+        known = online_set(scaled(b=baseline))
+        session = Session(PELICAN, QUICK, restored=EARLIER, next_sequence=12, baseline=known)
+        return [c.state for c in published(works(session, between(FLIGHT, 0.0, 9.7), tells()), "candidate")]
+
+    assert creeping(0.97)[4] is SetState.ACCEPTED
+    assert creeping(0.65)[4] is SetState.PENDING, "54 % above what a person last approved"
+
+
+def test_the_ground_is_not_learned_from() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, on_the_ground(8.0), tells())
+    assert not fits(actions)
+    assert session.status().phase is Phase.NOT_FLYING
+    assert "on the ground" in session.status().reason
+    assert [e.t for e in events(actions, "not_flying")] == [4.0], "told once"
+    (first,) = published(works(session, between(FLIGHT, 0.0, 10.0, 8.0), tells()))
+    assert first.start >= 8.0 - 0.22 - 1e-6
