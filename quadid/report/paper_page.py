@@ -96,7 +96,8 @@ def paper_markdown(result: JsonDict, figures: str) -> str:
         f"Three sets of {flight['seconds']:g} s of a simulated Pelican, stabiliser at {flight['stabiliser_rate']:g} "
         "Hz, logged at 50 Hz; set 1 trains, sets 2 and 3 validate and are seen by no fit. The vehicle flies with "
         f"effects that the paper's model lacks: {_effects(flight['effects'])}. Its equations are not those of the "
-        "model that is fitted. The stabiliser's gains are given.", "",
+        "model that is fitted. The stabiliser's gains are given; within each logged sample the rotor commands run on "
+        "as its law says.", "",
     ]  # fmt: skip
     for table in all_tables(result):
         lines += [f"## {table.title}", "", markdown(table), ""]
