@@ -44,7 +44,7 @@ class _Reader(pickle.Unpickler):
 
 def pack(item: object) -> bytes:
     """A request or an answer as bytes."""
-    return pickle.dumps(item, protocol=4)
+    return pickle.dumps(item, protocol=5)  # keeps arrays read-only: the kernels that are warm are those for such
 
 
 def unpack(data: bytes) -> Any:

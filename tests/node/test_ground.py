@@ -246,6 +246,7 @@ def test_a_parcel_comes_out_as_it_went_in(request_: FitRequest) -> None:
     assert back.theta.tobytes() == request_.theta.tobytes()
     assert back.vehicle == request_.vehicle
     assert np.array_equal(back.windows[0].rotor_speed, request_.windows[0].rotor_speed)
+    assert not back.windows[0].rotor_speed.flags.writeable, "kernels are warm for read-only arrays"
 
 
 class _Evil:
