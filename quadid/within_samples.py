@@ -77,16 +77,16 @@ def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[W
     known = vehicle.stabiliser
     if known is not None and known.rate is not None:
         slopes = [_slope_of_law(w, vehicle, known.gains, known.rate) for w in windows]
-        told = f"as the vehicle file's stabiliser, which runs at {known.rate:.0f} Hz, makes them do"
+        told = f"the vehicle file's stabiliser runs at {known.rate:.0f} Hz, faster than this log"
     else:
         found = find_feedback(windows)
         if found is not None:
             slopes = [_slope_of_motion(w, vehicle, found) for w in windows]
             loop = f"about {found.proportional:.0f} 1/s^2 on the angle, {found.derivative:.0f} 1/s on the rate"
-            told = f"as a controller faster than the log makes them do ({loop})"
+            told = f"the flight controller acted faster than this log ({loop})"
     if not slopes or any(slope is None for slope in slopes):
         return list(windows), ""
-    text = f"the commands follow feedback within each sample, {told}: the rotor speeds are given that slope"
+    text = f"{told}; the rotor speeds follow it within each sample, nothing to do"
     return [replace(w, rotor_slope=slope) for w, slope in zip(windows, slopes, strict=True)], text
 
 
