@@ -107,9 +107,9 @@ def _refit(r: Result) -> list[str]:
 def _load(r: Result) -> list[str]:
     lines = [
         "The node in its own process, a feeder in another: IMU 1 kHz, attitude and rotor speeds 250 Hz, references "
-        f"and odometry 50 Hz. Nobody is woken for a message: every {1e3 * ROUND_SECONDS:.0f} ms all that wait are "
+        f"and odometry 50 Hz. Nobody is woken for a message: every {1e3 * ROUND_SECONDS:g} ms all that wait are "
         "taken from the middleware, read, and worked on, and once a second status and health are told; piece by "
-        f"piece, in steps {1e3 * STEP_SECONDS:.0f} ms apart, in which no piece begins after "
+        f"piece, in steps {1e3 * STEP_SECONDS:g} ms apart, in which no piece begins after "
         f"{1e3 * WORK_SECONDS:.1f} ms. A step is how long services and timers may have to wait (steps count in which "
         "there was something to do, from the first message on). A message waits for the next round; to a row of the "
         f"grid, which waits {1e3 * SETTLE:.0f} ms for the slowest channel, that adds a round at most. Both by the "
@@ -133,7 +133,7 @@ def _costs(r: Result) -> list[str]:
     return [
         "A node of the same executor that takes the same messages and does nothing with them: "
         f"{100 * r['woken']['share']:.1f} % of a core when it is woken for each, {100 * r['polled']['share']:.1f} % "
-        f"when it takes them every {1e3 * ROUND_SECONDS:.0f} ms. Our own code without ROS: "
+        f"when it takes them every {1e3 * ROUND_SECONDS:g} ms. Our own code without ROS: "
         f"{own['us_per_message']:.0f} us a message, {100 * own['share']:.1f} % of a core at these rates.",
     ]  # fmt: skip
 

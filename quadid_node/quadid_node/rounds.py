@@ -9,9 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
-STEP_SECONDS = 0.02
+STEP_SECONDS = 0.0125
 """A step is taken this often [s]."""
-STEPS = 5
+STEPS = 8
 """Steps from the beginning of a round to that of the next."""
 ROUND_SECONDS = STEPS * STEP_SECONDS
 """Messages are taken from the middleware this often [s]: rows of the grid wait five times as long for late channels."""
