@@ -51,6 +51,8 @@ def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop:
     return tuple(Sample(s, name, tuple(rows[name][k])) for k, s in enumerate(t.tolist()) for name in channels)
 
 
+PIECES = 5000
+"""Far more pieces than there ever are between two polls: a session that would never end is stopped."""
 DROPPED = light_flight(30.0, 1, 14.3)
 """15 % of thrust are lost after 14.3 s."""
 
@@ -103,12 +105,13 @@ def works(session: Session, stream: Sequence[Sample], worker: Worker) -> list[Ac
 
 def answered(session: Session, worker: Worker) -> list[Action]:
     """Polls and hands the worker's answers in until nothing is left to do, or the worker gives none."""
-    out, last = session.poll(), 0
+    out, last = session.poll(PIECES), 0
     while session.running is not None and (reply := worker(session.running)) is not None:
         assert session.running.number > last, "a request that was answered must not be asked again"
         last = session.running.number
         session.deliver(reply)
-        out += session.poll()
+        out += session.poll(PIECES)
+    assert not session.busy, "the work there is comes to an end"
     return out
 
 

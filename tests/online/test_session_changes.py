@@ -86,6 +86,27 @@ def test_while_a_change_is_explained_the_session_waits() -> None:
     assert isinstance(session.running, FitRequest), "the fits go on"
 
 
+def test_an_answer_of_the_wrong_kind_is_ignored_and_the_question_asked_again() -> None:
+    def confused(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply:
+        if isinstance(request, FitRequest):
+            return ChangeReply(request.number, MASS)
+        return FitReply(request.number, problem="an answer to a fit")
+
+    session = Session(PELICAN, QUICK)
+    actions = works(session, between(DROPPED, 0.0, 4.7), confused)
+    assert numbers(actions) == [1]
+    assert not diagnosed(actions)
+    assert numbers(works(session, between(DROPPED, 4.7, 5.7), tells())) == [2]
+    works(session, between(DROPPED, 5.7, 16.7), tells())
+    actions = works(session, between(DROPPED, 16.7, 18.7), confused)
+    assert [a.stop for a in actions if isinstance(a, ChangeRequest)] == [18.0]
+    assert not diagnosed(actions)
+    assert session.status().phase is not Phase.FAILED
+    actions = works(session, between(DROPPED, 18.7, 19.7), tells())
+    assert [a.stop for a in actions if isinstance(a, ChangeRequest)] == [19.0]
+    assert len(diagnosed(actions)) == 1
+
+
 def test_a_change_of_a_vehicle_that_is_not_known_yet_needs_no_fit() -> None:
     session = Session(PELICAN, QUICK)
     actions = works(session, between(DROPPED, 0.0, 20.7), lambda r: FitReply(r.number, problem="no luck"))

@@ -8,8 +8,19 @@ import pytest
 
 from quadid.online import FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
 from quadid.online.changes import ChangeRequest
+from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
-from tests.online.made_up import DROPPED, PELICAN, between, first_fit, light_flight, numbers, tells, works
+from tests.online.made_up import (
+    DROPPED,
+    PELICAN,
+    between,
+    first_fit,
+    light_flight,
+    numbers,
+    on_the_ground,
+    tells,
+    works,
+)
 
 GATE = GateSettings(windows=2, pause=0.0)
 QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
@@ -153,9 +164,9 @@ def test_fit_now_takes_what_there_is_at_the_next_tick_and_once() -> None:
 
 def test_fit_now_with_hardly_any_data_says_what_is_missing() -> None:
     session = Session(PELICAN, SessionSettings(diagnose=0.0))
-    works(session, between(FLIGHT, 0.0, 2.2), tells())
+    works(session, between(FLIGHT, 0.0, 2.2, EPOCH), tells())
     session.fit_now()
-    assert not numbers(works(session, between(FLIGHT, 2.2, 3.7), tells()))
+    assert not numbers(works(session, between(FLIGHT, 2.2, 3.7, EPOCH), tells()))
     assert session.status().phase is Phase.COLLECTING
     assert session.status().reason == "3 of 10 s of flight; no gaps"
     short = Session(PELICAN, SessionSettings(diagnose=0.0))
@@ -204,6 +215,32 @@ def test_a_missing_channel_is_told(missing: str, word: str) -> None:
     if word:
         (event,) = events(actions, "blocked")
         assert (event.t, "fix" in event.text) == (1.0, True)
+
+
+def test_the_ground_is_not_learned_from() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = works(session, on_the_ground(8.0), tells())
+    assert not numbers(actions)
+    assert session.status().phase is Phase.NOT_FLYING
+    assert "on the ground" in session.status().reason
+    assert [e.t for e in events(actions, "not_flying")] == [4.0], "told once"
+    (first,) = published(works(session, between(FLIGHT, 0.0, 10.0, 8.0), tells()))
+    assert first.start >= 8.0 - 0.22 - 1e-6
+
+
+def test_a_known_vehicle_that_its_rotors_carry_by_a_third_only_does_not_fly() -> None:
+    factor = {"rotor_speed": 0.6, "accel": 0.36}  # light on its legs
+
+    def lightly(start: float, stop: float) -> list[Sample]:
+        stretch = between(FLIGHT, start, stop)
+        return [replace(s, values=tuple(v * factor.get(s.channel, 1.0) for v in s.values)) for s in stretch]
+
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 9.7) + lightly(9.7, 15.7), tells())
+    assert session.status().phase is Phase.NOT_FLYING
+    assert "of the weight" in session.status().reason
+    guessed = Session(PELICAN, QUICK)
+    assert numbers(works(guessed, lightly(0.0, 4.7), tells())), "while its thrust is a guess it may well fly"
 
 
 def test_a_gap_is_counted_and_a_long_one_holds_the_fits_back() -> None:
