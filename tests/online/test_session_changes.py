@@ -129,7 +129,7 @@ def test_a_minute_is_studied_beside_the_fits_and_told_half_a_minute_later() -> N
     actions = works(session, between(LONG, 0.0, 63.7, EPOCH), tells())
     (study,) = studies(actions)
     assert study.stop - study.start == 60.0
-    assert study.seed == 3
+    assert (study.vehicle, study.seed) == (PELICAN, 3)
     assert sum(len(w) for w in study.windows) >= 2995
     assert study.stop <= 62.0 + study.start, "asked for as soon as there is a minute"
     session.deliver(StudyReply(study.number + 1, (), "unknown"))

@@ -54,6 +54,7 @@ def test_before_the_first_sample_it_waits_and_says_so() -> None:
         0,
         0,
     )
+    assert (status.window_seconds, status.gaps, status.fits) == (0.0, 0, 0)
     assert math.isnan(status.t)
     assert math.isnan(status.mse)
     assert np.isnan(status.excitation).all()
@@ -122,10 +123,17 @@ def test_the_first_tick_follows_the_first_sample() -> None:
     assert half.buffer.time.stamp(late[0].stop) == EPOCH + 4.5, "half a second short is enough"
 
 
+@pytest.mark.parametrize("shift", [0.56, 0.58, 0.6])
+def test_a_window_holds_every_row_up_to_its_tick_wherever_blocks_of_rows_end(shift: float) -> None:
+    asked = fits(works(Session(PELICAN, QUICK), between(FLIGHT, 0.0, 6.7, shift), tells()))
+    assert [a.windows[-1].t[-1] for a in asked] == pytest.approx([a.stop - 0.02 for a in asked], abs=1e-6)
+
+
 def test_the_grid_has_the_rate_of_the_settings() -> None:
     session = Session(PELICAN, QUICK.model_copy(update={"rate": 25.0}))
     asked = fits(works(session, between(FLIGHT, 0.0, 9.7), tells()))
-    assert asked[-1].windows[0].dt == 0.04
+    assert asked[4].windows[0].dt == 0.04
+    assert len(asked[4].windows[0]) == pytest.approx(4.22 * 25.0, abs=0.6)
     assert [a.stop for a in asked[:5]] == [4.0, 5.0, 6.0, 7.0, 8.0]
 
 
