@@ -152,7 +152,7 @@ $(QUALITY): pyproject.toml $(DEV)
 	$(PIP) install --editable ".[quality]"
 	@touch $@
 
-mutation: $(MESSAGES) $(QUALITY) ## gate and ledger spoilt line by line: which tests notice? into docs/results/mutation.md (20 min)
+mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line: which tests notice? into docs/results/mutation.md (40 min)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run --max-children 2
 	$(STUDY) studies.mutation --out docs/results
 
