@@ -87,7 +87,7 @@ def _head(file: Path) -> bytes:
 
 
 def _unreadable(file: Path, error: OSError) -> LogError:
-    return LogError(f"{file} cannot be read ({error.strerror})", ALLOWED, "check its permissions")
+    return LogError(f"{file} cannot be read ({error.strerror or error})", ALLOWED, "check its permissions")
 
 
 def _sha256(file: Path) -> str:
