@@ -6,8 +6,8 @@ Inside the core all data are SI, world NED, body FRD, quaternions body to world,
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +28,8 @@ CHANNELS: dict[str, tuple[int | None, str]] = {
     "position": (3, "m, NED"),
     "battery": (1, "V"),
 }
+_MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
+"""Channels of a window that may be missing."""
 """Known channels: number of columns (None: one per rotor) and unit.  ``accel`` is specific force (-g on z at rest)."""
 
 
@@ -184,7 +186,7 @@ class Window:
             if slope.shape != rotor.shape or not np.all(np.isfinite(slope)):
                 raise WindowError("rotor_slope", f"finite values, as many as rotor_speed {rotor.shape}")
             object.__setattr__(self, "rotor_slope", slope)
-        for name in ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference"):
+        for name in _MEASURED:
             values = getattr(self, name)
             if values is None:
                 continue
@@ -211,18 +213,6 @@ class Window:
 
     def slice(self, start: int, stop: int) -> Window:
         """Returns rows `start` to `stop` (exclusive) as a window of the same log."""
-        cut = {
-            name: (None if getattr(self, name) is None else getattr(self, name)[start:stop])
-            for name in (
-                "gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference", "rotor_slope",
-            )
-        }  # fmt: skip
-        return Window(
-            self.t0 + self.dt * start,
-            self.dt,
-            self.rotor_speed[start:stop],
-            sampling=self.sampling,
-            name=self.name,
-            log_span=self.log_span,
-            **cut,
-        )
+        values = {name: getattr(self, name) for name in ("rotor_speed", "rotor_slope", *_MEASURED)}
+        cut: dict[str, Any] = {name: rows[start:stop] for name, rows in values.items() if rows is not None}
+        return replace(self, t0=self.t0 + self.dt * start, **cut)

@@ -45,6 +45,8 @@ LEAST_RATE = 1.5
 """Standard errors by which the share of the rate must be more than nothing; a smooth torque has one of the angle."""
 STEEPEST_PITCH = 1.2
 """Pitch [rad] beyond which Euler's angles are left alone."""
+_UNIT = {"thrust_coefficient": 1.0, "drag_coefficient": 1.0}
+"""Torques for the squares of the speeds, where the coefficients are not known."""
 LEAST_CORRELATION = 0.5
 """Of angular acceleration and rotor moment; below it the speeds do not tell what slope they need."""
 
@@ -165,7 +167,7 @@ def _slope_of_law(window: Window, vehicle: Vehicle, gains: Mapping[str, float], 
         return None
     speed, middle, turn = window.rotor_speed, *_motion(window)
     mixer = mixer_matrix(vehicle, gains)
-    torque = (speed**2 @ np.linalg.pinv(mixer).T)[:, 1:]
+    torque = _torques(speed, mixer)
     miss, wanted = torque - torque.mean(axis=0), np.zeros((len(window), 4))
     for i, axis in enumerate(("roll", "pitch", "yaw")):
         of_angle, of_rate = gains[f"{axis}_p"], gains[f"{axis}_rate_p"]
@@ -183,15 +185,15 @@ def _slope_of_motion(window: Window, vehicle: Vehicle, found: Feedback) -> Float
     None where the motion does not follow the speeds.
     """
     speed, middle, turn = window.rotor_speed, *_motion(window)
-    x, y = vehicle.rotor_positions[:, :2].T
-    wrench = np.array([np.ones(len(x)), -y, x, vehicle.spins])
-    effect = np.array([_effect(turn[:-1, i], speed[:-1] ** 2 @ wrench[1 + i]) for i in range(2)])
+    mixer = mixer_matrix(vehicle, _UNIT)
+    torque = _torques(speed, mixer)
+    effect = np.array([_effect(turn[:-1, i], torque[:-1, i]) for i in range(2)])
     if np.isnan(effect).any():
         return None
     wanted = np.zeros((len(window), 4))
     wanted[:, 1:3] = -(found.proportional * middle + found.derivative * turn)[:, :2] / effect
     wanted[~np.isfinite(wanted).all(axis=1)] = 0.0
-    return _of_squares(wanted @ np.linalg.pinv(wrench).T, speed)
+    return _of_squares(wanted @ mixer.T, speed)
 
 
 def _motion(window: Window) -> tuple[FloatArray, FloatArray]:
@@ -199,6 +201,11 @@ def _motion(window: Window) -> tuple[FloatArray, FloatArray]:
     assert window.gyro is not None
     turn = np.diff(window.gyro, axis=0, append=window.gyro[-1:]) / window.dt
     return window.gyro + 0.5 * window.dt * turn, turn
+
+
+def _torques(speed: FloatArray, mixer: FloatArray) -> FloatArray:
+    """Torques about the body axes that a mixer asked for with these speeds, shape (n, 3)."""
+    return np.asarray((speed**2 @ np.linalg.pinv(mixer).T)[:, 1:])
 
 
 def _of_squares(slope: FloatArray, speed: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import WindowError
+from quadid.rotation import euler
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -42,10 +43,7 @@ def quadrotor_io(window: Window) -> tuple[FloatArray, FloatArray]:
 
 def _euler(q: FloatArray) -> FloatArray:
     """Roll, pitch, yaw [rad] of quaternions body to world, shape (n, 3); yaw unwrapped over missing rows."""
-    w, x, y, z = q.T
-    phi = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    theta = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    psi = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    seen = np.isfinite(psi)
-    psi[seen] = np.unwrap(psi[seen])
-    return np.column_stack([phi, theta, psi])
+    angles = euler(q)
+    seen = np.isfinite(angles[:, 2])
+    angles[seen, 2] = np.unwrap(angles[seen, 2])
+    return angles

@@ -27,7 +27,9 @@ def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[st
         at: times of the rows [s], shape (n,).
     """
     columns = {}
-    for name in (name for name in (*REQUIRED, *OPTIONAL) if name in plan.tracks):
+    for name in (*REQUIRED, *OPTIONAL):
+        if name not in plan.tracks:
+            continue
         yield
         values = on_grid(name, _mended(plan.tracks[name], plan.step), at, plan)
         if name in REQUIRED or not np.isnan(values).all():

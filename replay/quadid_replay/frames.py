@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.rotation import euler
+
 FloatArray = NDArray[np.float64]
 
 GRAVITY = 9.80665
@@ -66,12 +68,8 @@ def from_euler(angles: FloatArray) -> FloatArray:
 
 def to_euler(q: FloatArray) -> FloatArray:
     """Turns quaternions wxyz, shape (n, 4), into roll, pitch, yaw [rad], shape (n, 3)."""
-    w, x, y, z = q.T
     with np.errstate(over="ignore", invalid="ignore"):
-        roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-        pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return _columns(roll, pitch, yaw)
+        return euler(q)
 
 
 def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

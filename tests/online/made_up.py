@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from quadid.online import FitReply, FitRequest, Session
+from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
 from quadid.online.changes import ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
 from quadid.online.voice import Action
@@ -53,6 +53,9 @@ def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop:
 
 PIECES = 5000
 """Far more pieces than there ever are between two polls: a session that would never end is stopped."""
+GATE = GateSettings(windows=2, pause=0.0)
+QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
+"""A first set after 8 s, and no pause before the next."""
 DROPPED = light_flight(30.0, 1, 14.3)
 """15 % of thrust are lost after 14.3 s."""
 

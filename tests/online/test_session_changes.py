@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings
+from quadid.online import FitReply, FitRequest, Phase, Session
 from quadid.online.changes import ChangeReply, ChangeRequest
 from quadid.online.records import OnlineFinding
 from quadid.online.study import StudyReply, StudyRequest
@@ -18,6 +18,7 @@ from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
     DROPPED,
     PELICAN,
+    QUICK,
     Worker,
     between,
     first_fit,
@@ -28,7 +29,6 @@ from tests.online.made_up import (
     works,
 )
 
-QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2, pause=0.0))
 MASS = OnlineFinding(
     "mass_change", {"fraction": 0.17}, {"fraction": 0.01}, {"fraction": ""}, 9.0, 1.0, 1e-9, (), "seen"
 )

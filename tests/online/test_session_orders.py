@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.online import FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
+from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.changes import ChangeRequest
 from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
     DROPPED,
+    GATE,
     PELICAN,
+    QUICK,
     between,
     first_fit,
     light_flight,
@@ -22,8 +24,6 @@ from tests.online.made_up import (
     works,
 )
 
-GATE = GateSettings(windows=2, pause=0.0)
-QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
 MANUAL = QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})})
 FLIGHT = light_flight(30.0)
 
