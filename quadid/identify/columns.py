@@ -43,6 +43,12 @@ class Columns:
     coloured: NDArray[np.bool_]
     whitener: FloatArray
 
+    @property
+    def projected(self) -> FloatArray:
+        """What `parameters` do that the initial state cannot undo, shape (segments, length, channels, P)."""
+        flat = self.parameters - self.basis @ (self.basis.transpose(0, 2, 1) @ self.parameters)
+        return flat.reshape(*self.weights.shape, -1)
+
     def whiten(self, rows: FloatArray, channel: int) -> FloatArray:
         """Weights and whitens changes of one channel, shape (segments, length, columns)."""
         weight = self.weights[:, :, channel, None]

@@ -17,6 +17,7 @@ from quadid.identify.polish import Convergence, Polished, Prior, default_prior, 
 from quadid.identify.scale import with_uncertain_scale
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.swarm import Stop, Swarm, SwarmOptions
+from quadid.identify.two_cuts import LINEARISATIONS, with_second_cut
 from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
@@ -170,7 +171,7 @@ def fit(
         result = first
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
-    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result)
+    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust)
     return replace(found, warnings=(*aside, *found.warnings))
 
 
@@ -215,12 +216,15 @@ def _at_rest(free: Free, theta: FloatArray) -> bool:
 
 def _finish(
     shooting: Shooting, theta: FloatArray, names: list[str], outcome: Convergence, evaluations: int,
-    polished: Polished | None = None,
+    polished: Polished | None = None, robust: bool = False,
 ) -> Fit:  # fmt: skip
     free = shooting.free(names)
     prior = default_prior(shooting, free)
+    both = None if polished is None else with_second_cut(shooting, polished, free, prior, robust)
     lin = polished.lin if polished is not None else shooting.linearise(theta, free)
-    unc = uncertainty(lin, free, prior, theta)
+    unc = uncertainty(lin, free, prior, theta, None if both is None else both.information)
+    if both is not None:
+        theta, evaluations = both.theta, evaluations + LINEARISATIONS * (len(free.entries) + 10)
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)

@@ -127,22 +127,39 @@ class Shooting:
         """Puts back what `snapshot` gave."""
         self._x0 = dict(kept)
 
-    def thinned(self, every: int) -> Shooting:
-        """The same problem on every n-th segment of each window, the first included; states are its own copy."""
+    def thinned(self, every: int, run: int = 1) -> Shooting:
+        """The same problem on every n-th segment of each window, the first included; states are its own copy.
+
+        With `run` two or more that follow each other are kept each time, and as many more left out.
+        """
+        kept = [np.flatnonzero(np.arange(len(s.starts)) % (every * run) < run) for s in self.segments]
         thin = copy(self)
-        thin.segments = [s.every(every) for s in self.segments]
-        thin.robust = [None if r is None else r[::every] for r in self.robust]
-        thin._x0 = {n: [x[::every].copy() for x in states] for n, states in self._x0.items()}
-        thin._reckoned = {n: [v[::every] for v in velocities] for n, velocities in self._reckoned.items()}
+        thin.segments = [s.at(k) for s, k in zip(self.segments, kept, strict=True)]
+        thin.robust = [None if r is None else r[k] for r, k in zip(self.robust, kept, strict=True)]
+        thin._x0 = {n: [x[k] for x, k in zip(states, kept, strict=True)] for n, states in self._x0.items()}
+        thin._reckoned = {n: [v[k] for v, k in zip(vs, kept, strict=True)] for n, vs in self._reckoned.items()}
         return thin
 
     def on(self, windows: Sequence[Window]) -> Shooting:
         """The same problem on other data."""
         return Shooting(windows, self.vehicle, self.seconds, self.noise, self.layout)
 
-    def at_most(self, most: int) -> Shooting:
-        """The same problem on at most about `most` segments, spread evenly."""
-        return self.thinned(max(-(-self.count // most), 1))
+    def at_most(self, most: int, run: int = 1) -> Shooting:
+        """The same problem on at most about `most` segments, spread evenly; `run` as in `thinned`."""
+        return self.thinned(max(-(-self.count // most), 1), run)
+
+    def between(self) -> Shooting:
+        """The same problem cut half a segment later, so that borders lie where the middle of segments was.
+
+        Windows too short for that are left out.
+        """
+        later = copy(self)
+        cuts = [(r, s.later(s.length // 2, len(r))) for r, s in zip(self.rollouts, self.segments, strict=True)]
+        later.rollouts = [r for r, s in cuts if len(s.starts)]
+        later.segments = [s for _, s in cuts if len(s.starts)]
+        later.robust = [None] * len(later.rollouts)
+        later._x0, later._reckoned = {}, {}
+        return later
 
     def swarm_cost(self, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
         """Cost of many parameter vectors at once on at most `most` segments, spread evenly.

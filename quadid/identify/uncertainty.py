@@ -46,12 +46,21 @@ class Uncertainty:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def uncertainty(lin: Linearised, free: Free, prior: Prior, theta: FloatArray) -> Uncertainty:
+def uncertainty(
+    lin: Linearised, free: Free, prior: Prior, theta: FloatArray, information: FloatArray | None = None
+) -> Uncertainty:
     """Posterior covariance, widened where the segment scores are larger or more correlated than the noise model says.
 
     The widening is the ratio of the heteroscedasticity- and autocorrelation-consistent ("sandwich") variance (Newey and
     West, Econometrica 55 (1987) 703) to the model's; it is applied only where it exceeds its own sampling error, so
     that well-modelled data keep the efficient interval.
+
+    Args:
+        lin: linearisation at `theta`.
+        free: parameters.
+        prior: what is known of them beforehand.
+        theta: full vector.
+        information: of the data, shape (P, P), where more was used than `lin`; by default its own.
     """
     precision, _, _ = prior_terms(free, prior, theta)
     covariance = np.linalg.inv(lin.gram.sum(axis=0) + np.diag(precision))
@@ -61,6 +70,8 @@ def uncertainty(lin: Linearised, free: Free, prior: Prior, theta: FloatArray) ->
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
         inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
+    if information is not None:
+        covariance = np.linalg.inv(information + np.diag(precision))
     return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
 
 

@@ -74,6 +74,15 @@ class Segments:
         """Returns every n-th segment, the first included."""
         return Segments(self.length, self.lead, np.ascontiguousarray(self.starts[::n]))
 
+    def at(self, places: NDArray[np.intp]) -> Segments:
+        """Returns the segments at `places`."""
+        return Segments(self.length, self.lead, self.starts[places])
+
+    def later(self, shift: int, rows: int) -> Segments:
+        """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
+        starts = self.starts + shift
+        return Segments(self.length, self.lead, np.ascontiguousarray(starts[starts < rows - self.length]))
+
 
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
@@ -158,7 +167,7 @@ class Rollout:
             )
 
         def one(block: int, lanes: _Lanes) -> None:
-            rows = residuals[block].reshape(count, segments.length, -1)
+            rows = residuals[block].reshape(count, segments.length, self.channels * LANES)
             self._run(segments, n_pre, x0, lanes, self._mask, None, rows, ends[block], _NOTHING)
 
         self._each_block(segments, n_pre, theta, dx, self.channels, one)

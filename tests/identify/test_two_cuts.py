@@ -1,0 +1,110 @@
+"""Two cuts of one flight: more is known than from one, as much more as the information says, and never less."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from quadid.identify import fit as fitting
+from quadid.identify import two_cuts
+from quadid.identify.fit import FitOptions, fit
+from quadid.identify.noise import NoiseModel
+from quadid.identify.polish import default_prior, polish
+from quadid.identify.shooting import Shooting
+from quadid.identify.two_cuts import BothCuts, with_second_cut
+from quadid.parameters import NOMINAL_NAMES
+from quadid.window import Window
+from tests.identify.flights import PELICAN, at_truth, flown, values_of, with_noise
+
+FloatArray = NDArray[np.float64]
+WHITE = np.repeat([0.01, 0.003, 0.1], 3)
+DRAWS = 60
+
+
+def both(window: Window, start: FloatArray | None = None) -> tuple[BothCuts | None, FloatArray, FloatArray]:
+    """What both cuts tell of a window with the noise `WHITE`, and value and information of one, nominal parameters."""
+    noise = NoiseModel(WHITE, np.zeros(9))
+    shooting = Shooting([window], PELICAN, 1.0, noise)
+    free = shooting.free(NOMINAL_NAMES)
+    prior = default_prior(shooting, free)
+    one = polish(shooting, shooting.layout.initial(PELICAN) if start is None else start, free)
+    return with_second_cut(shooting, one, free, prior, robust=False), one.theta[:6], one.lin.gram.sum(axis=0)
+
+
+def test_two_cuts_are_nearer_to_the_truth_by_what_their_information_says() -> None:
+    flight = flown(3, noise_scale=0.0)
+    start = at_truth(Shooting([flight.window], PELICAN, 1.0), flight.truth.parameters)
+    errors, single, promised = [], [], []
+    for seed in range(DRAWS):
+        found, one, _ = both(with_noise(flight.window, seed), start)
+        assert found is not None
+        errors.append(np.log(found.theta[:6] / values_of(flight.truth.parameters)))
+        single.append(np.log(one / values_of(flight.truth.parameters)))
+        promised.append(np.diag(np.linalg.inv(found.information)))
+    variance, before = np.var(errors, axis=0), np.var(single, axis=0)
+    # A variance of 60 draws is known to 18 %; the differences between two of the same draws much better.
+    assert np.all(np.abs(np.log(variance / np.mean(promised, axis=0))) < 0.6)
+    at = {n: i for i, n in enumerate(NOMINAL_NAMES)}
+    for name in ("d", "J_zz", "J_r"):
+        assert variance[at[name]] < 0.85 * before[at[name]], f"{name} hardly crosses a border of segments"
+    assert np.all(variance < 1.1 * before)
+
+
+def test_the_gain_is_between_nothing_and_that_of_twice_the_data() -> None:
+    found, _, information = both(with_noise(flown(3, noise_scale=0.0).window, 1))
+    assert found is not None
+    gained = np.linalg.eigvals(np.linalg.solve(information, found.information)).real
+    assert gained.min() > 0.9
+    assert gained.max() < 2.3
+
+
+def test_the_segments_of_the_second_cut_begin_in_the_middle_of_those_of_the_first() -> None:
+    shooting = Shooting([flown(3).window, flown(3).window.slice(0, 62)], PELICAN, 1.0)
+    second = shooting.between()
+    assert second.segments[0].starts[0] == shooting.segments[0].starts[0] + 25
+    assert np.all(second.segments[0].starts + 50 < len(flown(3).window))
+    assert len(shooting.segments[1].starts) == 1
+    assert len(second.segments) == 1, "no room for it in the short one"
+    free = second.free(NOMINAL_NAMES)
+    lin = second.linearise(second.layout.initial(PELICAN), free)
+    assert len(lin.cost) == second.count
+    found = with_second_cut(shooting, polish(shooting, second.layout.initial(PELICAN), free), free,
+                            default_prior(shooting, free), robust=True)  # fmt: skip
+    assert found is not None
+    assert np.isfinite(found.information).all()
+
+
+def test_too_few_segments_or_moments_set_aside_leave_the_result_as_it_is() -> None:
+    assert both(with_noise(flown(3, noise_scale=0.0).window.slice(0, 500), 1))[0] is None
+    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    free = shooting.free(NOMINAL_NAMES)
+    prior = default_prior(shooting, free)
+    found = polish(shooting, shooting.layout.initial(PELICAN), free)
+    shooting.local = ("cg_offset.x",)
+    assert with_second_cut(shooting, found, free, prior, robust=True) is None
+    shooting.local = ()
+    assert with_second_cut(shooting, replace(found, cost=np.inf), free, prior, robust=True) is None
+
+
+def test_a_fit_narrows_what_crosses_borders_and_leaves_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    window = flown(3).window
+    found = fit([window], PELICAN, FitOptions(iterations=0)).parameters
+    monkeypatch.setattr(fitting, "with_second_cut", lambda *given: None)
+    one = fit([window], PELICAN, FitOptions(iterations=0)).parameters
+    assert found["J_r"].sigma < 0.9 * one["J_r"].sigma
+    assert found["b"].sigma == pytest.approx(one["b"].sigma, rel=0.05)
+
+
+def test_what_both_cuts_share_needs_only_some_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    window = with_noise(flown(3, noise_scale=0.0).window, 1)
+    whole, _, _ = both(window)
+    monkeypatch.setattr(two_cuts, "MOST_COMPARED", 30)
+    some, _, _ = both(window)
+    assert whole is not None
+    assert some is not None
+    assert np.array_equal(whole.theta, some.theta)
+    ratio = np.diag(np.linalg.inv(some.information)) / np.diag(np.linalg.inv(whole.information))
+    assert np.all(np.abs(np.log(ratio)) < 0.15)
