@@ -56,7 +56,10 @@ def poor_guess(vehicle: Vehicle, truth: dict[str, float], seed: int, spread: flo
 
 
 def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
-    """Cramer-Rao bound of the log parameters at the truth, with the noise spectrum found at the truth."""
+    """Cramer-Rao bound of the log parameters at the truth, with the noise spectrum found at the truth.
+
+    That of one cut into segments with an initial state each; the fit weighs two.
+    """
     shooting = Shooting([window], vehicle, SEGMENT)
     theta = shooting.layout.neutral()
     theta[: len(truth)] = truth
@@ -106,7 +109,7 @@ def table(outcomes: list[Outcome]) -> str:
     n = len(outcomes)
     inside = np.mean(np.abs(error) <= 1.959964 * sigma, axis=0)
     rows = [
-        "| parameter | RMS error % | bound % | ratio | bias % ± s.e. | coverage % ± s.e. |",
+        "| parameter | RMS error % | bound of one cut % | ratio | bias % ± s.e. | coverage % ± s.e. |",
         "|---|---|---|---|---|---|",
     ]
     for j, name in enumerate(NOMINAL_NAMES):

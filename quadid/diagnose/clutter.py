@@ -60,7 +60,7 @@ def without_in_clutter(
     used = Free(tuple(e for e, keep in zip(free.entries, takes_up, strict=True) if keep))
     shooting.restore(model.states)
     start = used.move(theta, step[np.array(takes_up)])
-    result = polish(shooting, start, used, iterations=_ITERATIONS, tolerance=0.1)
+    result = polish(shooting, start, used, iterations=_ITERATIONS, tolerance=0.1, settled=True)
     return replace(as_model(shooting, result, used, causes), worth=model.worth)
 
 

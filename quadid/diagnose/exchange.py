@@ -66,7 +66,7 @@ def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidat
         sketches = sorted(((sketch(shooting, rest, r), r) for r in rivals), key=lambda pair: -pair[0].drop)
         worth = rest.deviance - model.deviance
         drawn = [(s, r) for s, r in sketches if s.drop > NEAR * worth][:2]
-        trials = [_stand_in(rest, extend(shooting, rest, r, s.theta), r) for s, r in drawn]
+        trials = [_stand_in(rest, extend(shooting, rest, r, s), r) for s, r in drawn]
         if not trials:
             continue
         holder = _stand_in(rest, model, cause)

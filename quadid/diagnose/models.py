@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, held_out_deviance
 from quadid.diagnose.candidates import Candidate
-from quadid.identify.polish import Polished, Prior, bounded_step, default_prior, polish, prior_terms
+from quadid.identify.polish import Polished, Prior, bounded_step, default_prior, polish, prior_terms, scaled_difference
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.identify.uncertainty import score_products
 from quadid.parameters import NOMINAL_NAMES
@@ -100,7 +100,8 @@ def fit_model(
     if states is not None:
         shooting.restore(states)
     free = shooting.free(free_names(causes))
-    result = polish(shooting, theta, free, iterations=iterations, tolerance=tolerance)
+    settled = states is not None
+    result = polish(shooting, theta, free, iterations=iterations, tolerance=tolerance, settled=settled)
     return as_model(shooting, result, free, causes)
 
 
@@ -120,10 +121,12 @@ class Sketch:
     Attributes:
         theta: full vector after the step.
         drop: predicted fall of the deviance.
+        states: initial states there.
     """
 
     theta: FloatArray
     drop: float
+    states: States
 
 
 def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Sequence[FloatArray] = ()) -> Sketch:
@@ -161,13 +164,17 @@ def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: Flo
     h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
     z = bounded_step(free, theta, h, g)
     deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
-    return Sketch(free.move(theta, z), model.deviance - deviance)
+    moved = free.move(theta, z)
+    states = shooting.step_states(theta, free, lin, scaled_difference(free, theta, moved))
+    shooting.adopt(moved, free, states)
+    return Sketch(moved, model.deviance - deviance, shooting.snapshot())
 
 
 def _walk(shooting: Shooting, model: Model, free: Free, theta: FloatArray) -> Sketch:
     """What a few steps bring: far from the optimum a linear promise is worth nothing."""
     result = polish(shooting, theta, free, iterations=FAR_STEPS)
-    return Sketch(result.theta, model.deviance - result.cost - float(result.lin.occam.sum()))
+    drop = model.deviance - result.cost - float(result.lin.occam.sum())
+    return Sketch(result.theta, drop, shooting.snapshot())
 
 
 def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Model, int]:
@@ -179,17 +186,19 @@ def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Mode
 
 
 def extend(
-    shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | None = None, iterations: int = 6
-) -> Model:
+    shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | Sketch | None = None,
+    iterations: int = 6,
+) -> Model:  # fmt: skip
     """Refits `model` with `candidate` added, from `start` or where its sketch leads.
 
     Args:
         shooting: the problem.
         model: what to extend.
         candidate: the cause to add.
-        start: full vector to start from.
+        start: full vector to start from, or a sketch on the same segments.
         iterations: linearisations to spend.
     """
-    theta = sketch(shooting, model, candidate).theta if start is None else start
+    begun = sketch(shooting, model, candidate) if start is None else start
+    theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
     causes = (*model.causes, candidate)
-    return replace(fit_model(shooting, theta, causes, model.states, iterations, tolerance=0.2), worth=model.worth)
+    return replace(fit_model(shooting, theta, causes, states, iterations, tolerance=0.2), worth=model.worth)

@@ -13,7 +13,7 @@ from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.climb import LINEAR_MISFIT, Climb
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
-from quadid.diagnose.models import Model, extend, fit_model, sketch, thinned
+from quadid.diagnose.models import Model, Sketch, extend, fit_model, sketch, thinned
 from quadid.diagnose.screen import Score, screen
 from quadid.identify.shooting import Shooting
 
@@ -114,7 +114,7 @@ class _Draft:
 
     score: Score
     drop: float
-    start: FloatArray | None
+    start: FloatArray | Sketch | None
 
 
 def _drafts(
@@ -131,7 +131,8 @@ def _drafts(
             drafts.append(_Draft(score, score.drop, None))
         elif score.candidate.starts or far:
             drawn = sketch(thin, base, score.candidate, elsewhere if far else ())
-            drafts.append(_Draft(score, max(every * drawn.drop, score.drop) if far else drawn.drop, drawn.theta))
+            drop = max(every * drawn.drop, score.drop) if far else drawn.drop
+            drafts.append(_Draft(score, drop, drawn.theta if far else drawn))
         else:
             drafts.append(_Draft(score, score.drop, model.theta))
     drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)

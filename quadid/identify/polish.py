@@ -105,7 +105,7 @@ def robust_weights(shooting: Shooting, lin: Linearised) -> list[FloatArray]:
 
 def polish(
     shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, iterations: int = 12,
-    robust: bool = False, tolerance: float = 0.02,
+    robust: bool = False, tolerance: float = 0.02, settled: bool = False,
 ) -> Polished:  # fmt: skip
     """Refines `theta` to the local optimum.
 
@@ -117,6 +117,7 @@ def polish(
         iterations: most linearisations to spend.
         robust: down-weight outliers (weights are renewed after accepted steps until they stay).
         tolerance: stop when every step is below this fraction of the parameter's standard deviation.
+        settled: the initial states come from a fit, so that the first step may already be the last.
 
     Raises:
         NotIdentifiableError: the data lead to equations with infinite or missing entries.
@@ -126,7 +127,7 @@ def polish(
     if robust:
         shooting.robust = list(robust_weights(shooting, lin))
         lin = shooting.linearise(theta, free)
-    damping, spent, outcome, settled = 0.0, 1, Convergence.BUDGET, False
+    damping, spent, outcome = 0.0, 1, Convergence.BUDGET
     cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     while spent < iterations:
         precision, pull, _ = prior_terms(free, prior, theta)
