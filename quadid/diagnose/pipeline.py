@@ -15,6 +15,7 @@ from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
 from quadid.diagnose.foresight import POOR, refit_to_predict
 from quadid.diagnose.form import inconstant
+from quadid.diagnose.handover import sensor_errors
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
@@ -45,8 +46,6 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 NOISE_ROSE = 1.5
 """When it rises by more than this the flexible fit has lost its way, and the first estimate stands."""
-SENSOR_ERRORS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
-"""Effects whose size a data sheet bounds."""
 BELIEVABLE = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
 SHARE_TO_NAME = 0.8
@@ -218,15 +217,11 @@ def _usual_nominal(begun: _Begun, search: Search) -> Model:
 
 def _beyond_belief(shooting: Shooting, model: Model) -> list[str]:
     """Sentences about sensor errors so large that they must stand for something else."""
-    out = []
-    for e in shooting.free([n for c in model.causes if c.effect in SENSOR_ERRORS for n in c.names]).entries:
-        value = float(model.theta[e.index])
-        if abs(value - e.neutral) > BELIEVABLE * e.typical:
-            out.append(
-                f"{e.name} = {value:.3g} {e.unit} is more than a sensor that works can have "
-                f"({BELIEVABLE * e.typical:.3g} {e.unit}): it stands for something else, and no finding is confident"
-            )
-    return out
+    return [
+        f"{e.name} = {float(model.theta[e.index]):.3g} {e.unit} is more than a sensor that works can have "
+        f"({BELIEVABLE * e.typical:.3g} {e.unit}): it stands for something else, and no finding is confident"
+        for e in sensor_errors(shooting, model, BELIEVABLE)
+    ]
 
 
 def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:

@@ -13,6 +13,7 @@ from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.climb import LINEAR_MISFIT, Climb
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
+from quadid.diagnose.handover import hand_over
 from quadid.diagnose.models import Model, Sketch, extend, fit_model, sketch, thinned
 from quadid.diagnose.screen import Score, screen
 from quadid.identify.shooting import Shooting
@@ -105,6 +106,10 @@ def select(
     if compared != {c.label for c in climb.model.causes}:
         climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
         rounds += swaps
+    handed = hand_over(climb.shooting, climb.model, listed, tests)
+    if handed is not None and handed.accepted is not None:
+        climb.model = _prune(climb.shooting, handed.accepted.model, handed.accepted.candidate, climb.base, tests)
+        rounds.append(handed)
     return Search(climb.shooting, climb.nominal, climb.model, tuple(rounds), tests)
 
 
