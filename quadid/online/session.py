@@ -253,7 +253,7 @@ class Session:
             self._voice.act(request)
 
     def _fit(self, tick: float) -> Iterator[None]:
-        self._last_fit, wanted = tick, self.settings.window
+        wanted = self.settings.window
         if self._asked_now:
             self._asked_now, wanted = False, min(SHORT_WINDOW, wanted)
         start = max(tick - self.settings.window - LEAD, self._desk.learn_from)
@@ -269,7 +269,7 @@ class Session:
             self._voice.note(tick, phase, quality.fault or quality.grounded)
             return
         yield
-        self._number += 1
+        self._number, self._last_fit = self._number + 1, tick
         start = max(start, tick - self.settings.window)
         self._waiting = self._learner.request(self._number, self._cut.windows, start, tick)
         self._voice.act(self._waiting)
