@@ -37,9 +37,9 @@ def _estimate(r: Result) -> list[str]:
     lines = [
         f"{len(flights)} excited flights of {r['seconds']:.0f} s. First set published after {_median(first):.0f} s "
         f"(median; {len(first)} of {len(flights)} flights published). Goal: within 1 % of the offline batch.", "",
-        "The batch cuts its flight once, into segments of 1 s, and what happens across their borders is lost. Begun "
-        "half a second later, the same flight gives it other values; the last column says how far off, so that not all "
-        "of a difference is the online estimate's. The windows of the online fit overlap and are cut at many places.",
+        "The batch weighs two cuts of its flight into segments of 1 s, half a second apart; the windows of the online "
+        "fit overlap and are cut at many places. How far the batch moves when its flight begins half a second later "
+        "says the last column.",
         "",
         "| parameter | online to batch, RMS % | worst % | within 1 % | online to truth, RMS % | stated sigma % "
         "| batch to truth, RMS % | batch to itself, cut 0.5 s later, RMS % |", "|---|---|---|---|---|---|---|---|",
