@@ -22,6 +22,9 @@ NEAR = 0.4
 LEAST_GAIN = 15.0
 """Deviance that a gain on unseen blocks must exceed."""
 
+FAR_AHEAD = 5.0
+"""Standard errors by which one look-alike leads another that need not be compared again on longer segments."""
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -48,19 +51,28 @@ class Round:
     screened: tuple[Score, ...]
 
 
-def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> tuple[Model, list[Round]]:
+def swap_look_alikes(
+    shooting: Shooting, model: Model, listed: Sequence[Candidate], earlier: Sequence[Round] = ()
+) -> tuple[Model, list[Round]]:
     """Puts a look-alike in the place of a cause where that fits unseen blocks better.
 
     Which of two look-alikes was taken first may have been decided on segments too short to tell them apart, or before
     another cause was known.
 
+    Args:
+        shooting: the problem.
+        model: the selected model.
+        listed: the catalogue.
+        earlier: comparisons made before; a cause far ahead of its rivals then is not set beside them again.
+
     Returns:
         The better model, and for each cause what its rivals did in its place.
     """
     rounds = []
+    ahead = {r.accepted.candidate.label for r in earlier if r.accepted is not None and _far_ahead(r)}
     for cause in model.causes:
         rivals = _rivals(model, cause, listed)
-        if not rivals or any(c.requires == cause.effect for c in model.causes):
+        if not rivals or cause.label in ahead or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)
         sketches = sorted(((sketch(shooting, rest, r), r) for r in rivals), key=lambda pair: -pair[0].drop)
@@ -76,6 +88,14 @@ def swap_look_alikes(shooting: Shooting, model: Model, listed: Sequence[Candidat
         rounds.append(Round((holder, *trials), best if swapped else holder, ()))
         model = best.model if swapped else model
     return model, rounds
+
+
+def _far_ahead(comparison: Round) -> bool:
+    """Whether the accepted cause did better than every rival by far more than chance."""
+    assert comparison.accepted is not None
+    best = comparison.accepted
+    leads = [paired_gain(t.model.held_out, best.model.held_out) for t in comparison.trials if t is not best]
+    return all(lead.total > max(FAR_AHEAD * lead.error, LEAST_GAIN) for lead in leads)
 
 
 def _stand_in(rest: Model, model: Model, candidate: Candidate) -> Trial:

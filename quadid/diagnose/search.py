@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quadid.chi_square import exceeded, survival
 from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.climb import LINEAR_MISFIT, Climb
+from quadid.diagnose.climb import LINEAR_MISFIT, USUAL_SECONDS, Climb
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Round, Trial, split_causes, swap_look_alikes, without
 from quadid.diagnose.handover import hand_over
 from quadid.diagnose.models import Model, Sketch, extend, fit_model, sketch, thinned
@@ -83,6 +83,7 @@ def select(
     climb = Climb(ladder, theta, known)
     rounds: list[Round] = []
     compared: set[str] = set()
+    usual: list[Round] = []
     tests = len(listed)
     if known is not None:
         climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
@@ -100,7 +101,8 @@ def select(
         model = split_causes(replace(accepted.model, worth=worth))
         climb.model = _prune(shooting, model, accepted.candidate, climb.base, tests)
         if climb.up():
-            climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
+            climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed, usual)
+            usual = swaps if climb.shooting.seconds >= USUAL_SECONDS else []
             rounds += swaps
             compared = {c.label for c in climb.model.causes}
     if compared != {c.label for c in climb.model.causes}:
