@@ -123,8 +123,15 @@ def _quadid(
     """Identifies the parameters of a multirotor simulation from flight data, and names what it still gets wrong."""
 
 
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""What decides how many threads numpy's linear algebra takes.  Ours is of small matrices, and the simulation uses every
+core itself: more threads than one only wait for each other, on a busy machine for most of the time."""
+
+
 def app_main() -> int:
     """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer."""
+    for name in BLAS_THREADS:
+        os.environ.setdefault(name, "1")
     try:
         result = get_command(app).main(sys.argv[1:] or ["--help"], prog_name="quadid", standalone_mode=False)
         sys.stdout.flush()

@@ -27,6 +27,10 @@ FAR_SEGMENTS = 60
 FEWEST_REFITS, MOST_REFITS = 3, 7
 """Fewest and most candidates refitted in one round."""
 MOST_CAUSES = 12
+MOST_SECOND_THOUGHTS = 2
+"""Times a cause may give way to one it was once preferred to …"""
+CLOSE = 0.8
+"""… which then gained at least this share of what it did itself."""
 FALSE_ALARM = 1e-3
 """Chance that a model without any effect is extended at all, shared by all causes tried."""
 ERRORS = 2.0
@@ -82,11 +86,31 @@ def select(
     """
     climb = Climb(ladder, theta, known)
     rounds: list[Round] = []
+    if known is not None:
+        climb.model = _prune(climb.shooting, climb.model, None, climb.base, len(listed))
+    tests = _forwards(climb, rounds, listed, elsewhere, report)
+    for _ in range(MOST_SECOND_THOUGHTS):
+        doubt = _second_thought(climb, rounds, tests, elsewhere)
+        if doubt is None or doubt.accepted is None:
+            break
+        rounds.append(doubt)
+        climb = Climb(ladder, theta, doubt.accepted.model)
+        tests = _forwards(climb, rounds, listed, elsewhere, report)
+    handed = hand_over(climb.shooting, climb.model, listed, tests)
+    if handed is not None and handed.accepted is not None:
+        climb.model = _prune(climb.shooting, handed.accepted.model, handed.accepted.candidate, climb.base, tests)
+        rounds.append(handed)
+    return Search(climb.shooting, climb.nominal, climb.model, tuple(rounds), tests)
+
+
+def _forwards(
+    climb: Climb, rounds: list[Round], listed: Sequence[Candidate], elsewhere: Sequence[FloatArray],
+    report: Callable[[str, float], None],
+) -> int:  # fmt: skip
+    """Adds causes until none gains, look-alikes set beside each other; returns how many were looked at in one round."""
     compared: set[str] = set()
     usual: list[Round] = []
     tests = len(listed)
-    if known is not None:
-        climb.model = _prune(climb.shooting, climb.model, None, climb.base, tests)
     while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
         shooting, model = climb.shooting, climb.model
@@ -108,11 +132,47 @@ def select(
     if compared != {c.label for c in climb.model.causes}:
         climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
         rounds += swaps
-    handed = hand_over(climb.shooting, climb.model, listed, tests)
-    if handed is not None and handed.accepted is not None:
-        climb.model = _prune(climb.shooting, handed.accepted.model, handed.accepted.candidate, climb.base, tests)
-        rounds.append(handed)
-    return Search(climb.shooting, climb.nominal, climb.model, tuple(rounds), tests)
+    return tests
+
+
+def _second_thought(climb: Climb, rounds: Sequence[Round], tests: int, elsewhere: Sequence[FloatArray]) -> Round | None:
+    """Sets a cause beside those that were nearly as good when it was accepted, now that the others are known.
+
+    Two effects at once may look most like a third; look-alikes of its own family each cause has met already.
+
+    Returns:
+        The first comparison that another cause wins; None where all stay.
+    """
+    shooting, model = climb.shooting, climb.model
+    for cause in model.causes:
+        if any(c.requires == cause.effect for c in model.causes):
+            continue
+        rivals = [r for r in _close_seconds(rounds, cause) if r.label not in {c.label for c in model.causes}]
+        if not rivals:
+            continue
+        rest = without(shooting, model, cause)
+        rivals = [r for r in rivals if r.requires is None or r.requires in rest.effects]
+        drafts = _drafts(shooting, rest, screen(shooting, rest, rivals), tests, elsewhere)
+        trials = [_try(shooting, rest, d, tests) for d in drafts]
+        best = max(trials, key=lambda t: t.gain.total, default=None)
+        if best is None:
+            continue
+        lead = paired_gain(model.held_out, best.model.held_out)
+        if lead.total > LEAST_GAIN and lead.total > lead.error:
+            worth = {**best.model.worth, best.candidate.label: best.gain.total}
+            won = replace(best, model=split_causes(replace(best.model, worth=worth)))
+            return Round((won, *(t for t in trials if t is not best)), won, ())
+    return None
+
+
+def _close_seconds(rounds: Sequence[Round], cause: Candidate) -> list[Candidate]:
+    """Causes of other families that gained nearly as much when `cause` was accepted."""
+    out = []
+    for step in rounds:
+        if step.accepted is not None and step.accepted.candidate.label == cause.label:
+            near = [t for t in step.trials if t.gain.total > CLOSE * step.accepted.gain.total]
+            out += [t.candidate for t in near if t.candidate.family != cause.family]
+    return list(dict.fromkeys(out))
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
 import pytest
-from quadid_cli.main import COMMANDS
+from quadid_cli.main import BLAS_THREADS, COMMANDS
 
 from quadid import __version__
 from tests.cli.conftest import Cli, one_line
@@ -36,6 +37,19 @@ def test_start_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
+def test_linear_algebra_takes_one_thread_unless_told_otherwise(given: dict[str, str], used: str) -> None:
+    check = (
+        "import os, sys; sys.argv = ['quadid', '--version']; from quadid_cli.main import app_main; app_main(); "
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    unset = {n: v for n, v in os.environ.items() if n not in BLAS_THREADS}
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, check=True, env={**unset, **given}
+    )
+    assert done.stdout.split()[-1] == used
 
 
 def test_version(inside: Cli) -> None:

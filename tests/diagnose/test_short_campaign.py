@@ -51,6 +51,17 @@ def test_both_effects_of_a_pair_are_named() -> None:
     require_named(case, found)
 
 
+def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
+    """Mass dropped in flight while the battery fades: inflow wins the first round, before the battery is known."""
+    case = of_class("look_alike", 15)
+    assert set(case.expected) == {"mass_change", "battery_sag"}
+    found, workings = answer(case)
+    require_named(case, found)
+    first = workings.search.rounds[0].accepted
+    assert first is not None
+    assert first.candidate.label == "axial_inflow", "this case no longer asks for a second thought"
+
+
 def test_a_flight_without_effects_is_left_alone() -> None:
     found, workings = answer(of_class("null", 0))
     require_nothing(found)
