@@ -17,7 +17,7 @@ from quadid.identify.polish import Convergence, Polished, Prior, default_prior, 
 from quadid.identify.scale import with_uncertain_scale
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.swarm import Stop, Swarm, SwarmOptions
-from quadid.identify.two_cuts import LINEARISATIONS, with_second_cut
+from quadid.identify.two_cuts import with_second_cut
 from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
@@ -153,7 +153,8 @@ def fit(
     free = short.free(free_names)
     first = polish(short, theta, free, iterations=8)
     short.noise = residual_noise(short, first)
-    first = polish(short, first.theta, free, iterations=8)
+    first = polish(short, first.theta, free, iterations=10, robust=options.robust)
+    short.robust = [None] * len(short.rollouts)
     moments = _slow_moments(short, theta, first, free)
     aside: tuple[str, ...] = ()
     if moments is not None:
@@ -168,7 +169,7 @@ def fit(
         aside = _thinned(whole, final)
         result = polish(final, first.theta, final.free(free_names), robust=options.robust)
     if not np.isfinite(result.cost):
-        result = first
+        final, result = short, first
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
     found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust)
@@ -224,7 +225,7 @@ def _finish(
     lin = polished.lin if polished is not None else shooting.linearise(theta, free)
     unc = uncertainty(lin, free, prior, theta, None if both is None else both.information)
     if both is not None:
-        theta, evaluations = both.theta, evaluations + LINEARISATIONS * (len(free.entries) + 10)
+        theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)

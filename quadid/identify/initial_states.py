@@ -13,15 +13,34 @@ FloatArray = NDArray[np.float64]
 
 LEAK_SECONDS = 8.0
 """Time in which dead-reckoned velocity is forgotten."""
+SPIKE = 20.0
+"""Usual steps from one sample to the next by which a rate must be off its neighbours to be taken for a spike."""
 _BLOCK = 256
 
 
 def first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray:
-    """Measured initial states; where velocity is not measured, that of dead reckoning."""
+    """Measured initial states, rates without spikes; where velocity is not measured, that of dead reckoning."""
     x0 = rollout.initial_states(segments, n_pre)
+    if rollout.window.gyro is not None:
+        _without_spikes(x0, rollout.window.gyro, segments.starts - n_pre)
     if rollout.window.velocity is None:
         x0[:, 7:10] = dead_reckoning(rollout.window)[segments.starts - n_pre]
     return x0
+
+
+def _without_spikes(x0: FloatArray, gyro: FloatArray, rows: NDArray[np.int64]) -> None:
+    """Puts the median of five samples in place of an initial rate that is far from it, in place.
+
+    Everything a segment simulates follows from its initial state; one spoilt sample there is worth a second of flight.
+    """
+    values = gyro[np.clip(rows[:, None] + np.arange(-2, 3), 0, len(gyro) - 1)]
+    steps = np.abs(np.diff(gyro, axis=0))
+    steps = steps[np.isfinite(steps).all(axis=1)]
+    if not len(steps):
+        return
+    middle = np.median(values, axis=1)  # missing where any of the five is, and then nothing is replaced
+    far = np.abs(x0[:, 4:7] - middle) > SPIKE * np.median(steps, axis=0)
+    x0[:, 4:7] = np.where(far, middle, x0[:, 4:7])
 
 
 def dead_reckoning(window: Window) -> FloatArray:

@@ -125,9 +125,12 @@ def polish(
     prior = prior or default_prior(shooting, free)
     lin = shooting.linearise(theta, free)
     if robust:
-        shooting.robust = list(robust_weights(shooting, lin))
+        # Initial states as measured would let every sample of a segment look like an outlier.
+        still = np.zeros(len(free.entries))
+        shooting.adopt(theta, free, shooting.step_states(theta, free, lin, still))
+        shooting.robust = list(robust_weights(shooting, shooting.linearise(theta, free)))
         lin = shooting.linearise(theta, free)
-    damping, spent, outcome = 0.0, 1, Convergence.BUDGET
+    damping, spent, outcome = 0.0, 3 if robust else 1, Convergence.BUDGET
     cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     while spent < iterations:
         precision, pull, _ = prior_terms(free, prior, theta)

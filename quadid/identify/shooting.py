@@ -127,26 +127,31 @@ class Shooting:
         """Puts back what `snapshot` gave."""
         self._x0 = dict(kept)
 
-    def thinned(self, every: int, run: int = 1) -> Shooting:
-        """The same problem on every n-th segment of each window, the first included; states are its own copy.
+    def thinned(self, every: int) -> Shooting:
+        """The same problem on every n-th segment of each window, the first included."""
+        return self.taking([np.arange(0, len(s.starts), every) for s in self.segments])
 
-        With `run` two or more that follow each other are kept each time, and as many more left out.
+    def taking(self, kept: Sequence[NDArray[np.intp]]) -> Shooting:
+        """The same problem on some segments of each window, by their places; states are its own copy.
+
+        Windows of which none is kept are left out.
         """
-        kept = [np.flatnonzero(np.arange(len(s.starts)) % (every * run) < run) for s in self.segments]
-        thin = copy(self)
-        thin.segments = [s.at(k) for s, k in zip(self.segments, kept, strict=True)]
-        thin.robust = [None if r is None else r[k] for r, k in zip(self.robust, kept, strict=True)]
-        thin._x0 = {n: [x[k] for x, k in zip(states, kept, strict=True)] for n, states in self._x0.items()}
-        thin._reckoned = {n: [v[k] for v, k in zip(vs, kept, strict=True)] for n, vs in self._reckoned.items()}
-        return thin
+        windows = [i for i, k in enumerate(kept) if len(k)]
+        out = copy(self)
+        out.rollouts = [self.rollouts[i] for i in windows]
+        out.segments = [self.segments[i].at(kept[i]) for i in windows]
+        out.robust = [r if r is None else r[kept[i]] for i, r in enumerate(self.robust) if len(kept[i])]
+        out._x0 = {n: [x[i][kept[i]] for i in windows] for n, x in self._x0.items()}
+        out._reckoned = {n: [v[i][kept[i]] for i in windows] for n, v in self._reckoned.items()}
+        return out
 
     def on(self, windows: Sequence[Window]) -> Shooting:
         """The same problem on other data."""
         return Shooting(windows, self.vehicle, self.seconds, self.noise, self.layout)
 
-    def at_most(self, most: int, run: int = 1) -> Shooting:
-        """The same problem on at most about `most` segments, spread evenly; `run` as in `thinned`."""
-        return self.thinned(max(-(-self.count // most), 1), run)
+    def at_most(self, most: int) -> Shooting:
+        """The same problem on at most about `most` segments, spread evenly."""
+        return self.thinned(max(-(-self.count // most), 1))
 
     def between(self) -> Shooting:
         """The same problem cut half a segment later, so that borders lie where the middle of segments was.

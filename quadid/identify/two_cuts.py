@@ -8,22 +8,27 @@ Varin, Reid and Firth, Statistica Sinica 21 (2011) 5).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.polish import Polished, Prior, bounded_step, prior_terms, robust_weights
-from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.polish import Polished, Prior, polish, prior_terms, scaled_difference
+from quadid.identify.shooting import Free, Shooting
 
 FloatArray = NDArray[np.float64]
 
 FEWEST_SEGMENTS = 10
-"""Segments below which the second cut, which has fewer still, is not worth making."""
+"""Segments of the second cut below which it is not made."""
+LEAST_OF_FIRST = 0.9
+"""Share of the segments of the first cut that the second must have: many short windows lose more than is gained."""
+ITERATIONS = 8
+"""Linearisations the second cut may take; it begins at the optimum of the first."""
+WORSE = 1.2
+"""Cost per row of the second cut over that of the first beyond which it went astray: both see the same data."""
 MOST_COMPARED = 120
-"""Segments of each cut, spread evenly, that tell what both share."""
-LINEARISATIONS = 5
-"""Spent on it, over the whole flight."""
+"""Segments of the second cut, those that tell most, from which follows what both share."""
 SINGULAR = 1e-12
 """Share of information below which a direction counts as not known."""
 
@@ -35,14 +40,16 @@ class BothCuts:
     Attributes:
         theta: full parameter vector.
         information: of the data on the scaled parameters, shape (P, P).
+        iterations: linearisations spent on the second cut.
     """
 
     theta: FloatArray
     information: FloatArray
+    iterations: int
 
 
 def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prior, robust: bool) -> BothCuts | None:
-    """Takes one Gauss-Newton step from the optimum of one cut towards that of both.
+    """Fits the second cut from the optimum of the first, and goes where both together fit best.
 
     Args:
         shooting: the first cut.
@@ -52,74 +59,93 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
         robust: down-weight outliers of the second cut too.
 
     Returns:
-        None where there are too few segments, where moments were set aside, or without a finite fit.
+        None where there are too few segments, where moments were set aside, or one of the cuts has no good fit.
     """
     second = shooting.between()
-    if second.count < FEWEST_SEGMENTS or shooting.local or not np.isfinite(found.cost):
+    enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
+    if second.count < enough or shooting.local or not np.isfinite(found.cost):
         return None
-    other = _settled(second, found.theta, free, robust)
-    precision, pull, _ = prior_terms(free, prior, found.theta)
-    h = 0.5 * (found.lin.gram.sum(axis=0) + other.gram.sum(axis=0))
-    g = 0.5 * (found.lin.grad.sum(axis=0) + other.grad.sum(axis=0)) + pull
-    if not (np.isfinite(h).all() and np.isfinite(g).all()):
+    other = polish(second, found.theta, free, prior, ITERATIONS, robust)
+    if not other.cost / other.lin.rows.sum() < WORSE * found.cost / found.lin.rows.sum():
         return None
-    moved = free.move(found.theta, bounded_step(free, found.theta, h + np.diag(precision), g))
-    return BothCuts(moved, _information(h, *_shared(shooting, found.theta, free)))
+    precision = np.diag(prior_terms(free, prior, found.theta)[0])
+    h_one, h_other = found.lin.gram.sum(axis=0), other.lin.gram.sum(axis=0)
+    away = scaled_difference(free, found.theta, other.theta)
+    step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
+    h = 0.5 * (h_one + h_other)
+    information = _information(h, *_shared(shooting, second, other, free))
+    return BothCuts(free.move(found.theta, step), information, other.iterations)
 
 
-def _settled(second: Shooting, theta: FloatArray, free: Free, robust: bool) -> Linearised:
-    """The second cut at `theta`, its initial states at their best."""
-    lin = second.linearise(theta, free)
-    second.adopt(theta, free, second.step_states(theta, free, lin, np.zeros(len(free.entries))))
-    lin = second.linearise(theta, free)
-    if robust:
-        second.robust = list(robust_weights(second, lin))
-        lin = second.linearise(theta, free)
-    return lin
+def _shared(first: Shooting, second: Shooting, other: Polished, free: Free) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the score of the second cut, and of that with the score of the first, both (P, P).
+
+    From the segments that tell most; exact for white noise, and nearly for the slow noise of an attitude, whose
+    whitening begins anew with each segment.
+    """
+    p = len(free.entries)
+    own, cross = np.zeros((p, p)), np.zeros((p, p))
+    for one, later in _pairs(first, second, other):
+        (before,), (after,) = one.columns(other.theta, free), later.columns(other.theta, free)
+        a, b = before.projected, after.projected
+        place = {int(start): i for i, start in enumerate(before.rows[:, 0])}
+        half, length = a.shape[1] // 2, a.shape[1]
+        own += _products(b, b)
+        begin = [place[int(start) - half] for start in after.rows[:, 0]]
+        cross += _products(b[:, : length - half], a[begin, half:])
+        goes_on = [j for j, start in enumerate(after.rows[:, 0]) if int(start) + length - half in place]
+        end = [place[int(after.rows[j, 0]) + length - half] for j in goes_on]
+        cross += _products(b[goes_on, length - half :], a[end, :half])
+    return own, 0.5 * (cross + cross.T)
 
 
-def _shared(shooting: Shooting, theta: FloatArray, free: Free) -> tuple[FloatArray, FloatArray]:
-    """Covariance of the score of a segment, and of those of a segment of each cut, means over some; both (P, P)."""
-    some = shooting.at_most(MOST_COMPARED, run=2)
-    own, begins, ends = (_Products(len(free.entries)) for _ in range(3))
-    later = {id(c.window): c for c in some.between().columns(theta, free)}
-    for one in some.columns(theta, free):
-        if id(one.window) not in later:
+def _pairs(first: Shooting, second: Shooting, other: Polished) -> Iterator[tuple[Shooting, Shooting]]:
+    """Window by window the segments of the second cut that tell most, and those of the first that they overlap."""
+    told = np.diagonal(other.lin.gram, axis1=1, axis2=2)
+    total = told.sum(axis=0)
+    weight = np.sum(told / np.where(total > 0.0, total, 1.0), axis=1)
+    chosen = np.zeros(len(weight), dtype=bool)
+    chosen[np.argsort(-weight, kind="stable")[:MOST_COMPARED]] = True
+    for w, rollout in enumerate(second.rollouts):
+        places = np.flatnonzero(chosen[other.lin.window == w])
+        if not len(places):
             continue
-        first, second = one.projected, later[id(one.window)].projected
-        half = first.shape[1] // 2
-        own.add(first, first)
-        begins.add(first[: len(second), half:], second[:, : first.shape[1] - half])
-        followed = np.flatnonzero(one.rows[1:, 0] == one.rows[:-1, -1] + 1)
-        ends.add(first[followed + 1, :half], second[followed, -half:])
-    cross = begins.mean + ends.mean
-    return own.mean, 0.5 * (cross + cross.T)
+        v = next(i for i, r in enumerate(first.rollouts) if r is rollout)
+        both = np.union1d(places, places + 1)
+        none = np.zeros(0, dtype=np.intp)
+        yield (
+            first.taking([both[both < len(s.starts)] if i == v else none for i, s in enumerate(first.segments)]),
+            second.taking([places if i == w else none for i in range(len(second.rollouts))]),
+        )
 
 
-class _Products:
-    """Mean products (P, P) of the columns of segments, shape (segments, rows, channels, P)."""
-
-    def __init__(self, parameters: int) -> None:
-        self._sum, self._count = np.zeros((parameters, parameters)), 0
-
-    def add(self, a: FloatArray, b: FloatArray) -> None:
-        self._sum += a.reshape(-1, len(self._sum)).T @ b.reshape(-1, len(self._sum))
-        self._count += len(a)
-
-    @property
-    def mean(self) -> FloatArray:
-        return self._sum / max(self._count, 1)
+def _products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Sum of the products (P, P) of columns (segments, rows, channels, P)."""
+    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]))
 
 
 def _information(h: FloatArray, own: FloatArray, shared: FloatArray) -> FloatArray:
-    """Information (P, P) of the mean of both scores, given that of one cut, `h`, and what scores share."""
-    known = np.diag(own) > 0.0
-    scale = np.sqrt(np.where(known, np.diag(own), 1.0))
-    values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
-    root = np.sqrt(np.maximum(values, SINGULAR))
-    white = vectors / root / scale[:, None]
-    common, turn = np.linalg.eigh(white.T @ shared @ white)
-    share = 0.5 * (1.0 + np.clip(common, 0.0, 1.0))
-    size = np.sqrt(np.where(known, np.diag(h) / scale**2, 0.0))
-    out = size[:, None] * scale[:, None] * ((vectors * root) @ turn)
-    return np.asarray((out / share) @ out.T)
+    """Information (P, P) of the mean of both scores, given that of one cut, `h`: between once and twice as much.
+
+    Args:
+        h: information of one cut.
+        own: the part of it that was compared.
+        shared: what the other cut's score shares with that part.
+    """
+    size = _sizes(own)
+    white = _root(own / np.outer(size, size), -0.5)
+    common, turn = np.linalg.eigh(white @ (shared / np.outer(size, size)) @ white)
+    gain = 2.0 / (1.0 + np.clip(common, 0.0, 1.0))
+    size = _sizes(h)
+    root = size[:, None] * (_root(h / np.outer(size, size), 0.5) @ turn)
+    return np.asarray((root * gain) @ root.T)
+
+
+def _sizes(matrix: FloatArray) -> FloatArray:
+    return np.sqrt(np.where(np.diag(matrix) > 0.0, np.diag(matrix), 1.0))
+
+
+def _root(matrix: FloatArray, power: float) -> FloatArray:
+    """Symmetric power of a positive semi-definite matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, SINGULAR) ** power) @ vectors.T)

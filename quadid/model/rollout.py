@@ -72,7 +72,7 @@ class Segments:
 
     def every(self, n: int) -> Segments:
         """Returns every n-th segment, the first included."""
-        return Segments(self.length, self.lead, np.ascontiguousarray(self.starts[::n]))
+        return self.at(np.arange(0, len(self.starts), n))
 
     def at(self, places: NDArray[np.intp]) -> Segments:
         """Returns the segments at `places`."""
@@ -81,7 +81,7 @@ class Segments:
     def later(self, shift: int, rows: int) -> Segments:
         """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
         starts = self.starts + shift
-        return Segments(self.length, self.lead, np.ascontiguousarray(starts[starts < rows - self.length]))
+        return Segments(self.length, self.lead, starts[starts < rows - self.length])
 
 
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
