@@ -28,7 +28,7 @@ def flown(seconds: float, seed: int, profile: str = "excited", **effects: dict[s
 def against_batch(seeds: range) -> dict[str, Any]:
     """The last estimate of 60 s against `quadid.identify` on the same 60 s, and both against the truth.
 
-    How far the batch moves when its flight begins half a segment later tells what it leaves open itself.
+    How far the batch moves when its flight begins a quarter of a segment later tells what it leaves open itself.
     """
     rows = []
     for seed in seeds:
@@ -38,7 +38,7 @@ def against_batch(seeds: range) -> dict[str, Any]:
         every = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"]
         batch, later = (
             fit([flight.window.slice(first, round(SECONDS * 50))], PELICAN, FitOptions()).parameters
-            for first in (0, round(0.5 * FIT_SECONDS * 50))
+            for first in (0, round(0.24 * FIT_SECONDS * 50))
         )
         truth = flight.truth.parameters.as_dict()
         last = every[-1].parameters

@@ -63,7 +63,8 @@ def swap_look_alikes(
         shooting: the problem.
         model: the selected model.
         listed: the catalogue.
-        earlier: comparisons made before; a cause far ahead of its rivals then is not set beside them again.
+        earlier: comparisons made before; a cause far ahead of its rivals then is not set beside them again, unless one
+            of its family has come into the model since.
 
     Returns:
         The better model, and for each cause what its rivals did in its place.
@@ -72,7 +73,8 @@ def swap_look_alikes(
     ahead = {r.accepted.candidate.label for r in earlier if r.accepted is not None and _far_ahead(r)}
     for cause in model.causes:
         rivals = _rivals(model, cause, listed)
-        if not rivals or cause.label in ahead or any(c.requires == cause.effect for c in model.causes):
+        alone = not any(c.family == cause.family and c.label != cause.label for c in model.causes)
+        if not rivals or (cause.label in ahead and alone) or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)
         sketches = sorted(((sketch(shooting, rest, r), r) for r in rivals), key=lambda pair: -pair[0].drop)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from quadid.chi_square import exceeded, survival
 from quadid.diagnose.blocks import paired_gain
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.exchange import LEAST_GAIN, Round, Trial
+from quadid.diagnose.exchange import LEAST_GAIN, Round, Trial, split_causes
 from quadid.diagnose.models import Model, extend
 from quadid.diagnose.screen import screen
 from quadid.identify.shooting import Shooting
@@ -27,8 +27,8 @@ TAKEN_OVER = 0.5
 """Share of such an error that must be gone once the other cause is there."""
 FALSE_ALARM = 1e-3
 ERRORS = 2.0
-"""A gain on unseen blocks must exceed this many of its standard errors, however small it is: what the other cause
-stands for is large."""
+"""A gain on unseen blocks must exceed this many of its standard errors and `LEAST_GAIN`; the shares that an added
+cause must gain do not bind it, for what it stands in for is large."""
 MOST_REFITS = 4
 
 
@@ -48,12 +48,13 @@ def hand_over(shooting: Shooting, model: Model, listed: Sequence[Candidate], tes
     if not unlikely:
         return None
     trials = []
-    scores = [s for s in screen(shooting, model, list(listed)) if s.candidate.timed is None]
+    others = [c for c in listed if c.timed is None and c.effect not in SENSOR_ERRORS]
+    scores = screen(shooting, model, others)
     least = exceeded(FALSE_ALARM / tests, 1)
     for candidate in [s.candidate for s in scores if s.drop > 0.5 * least][:MOST_REFITS]:
         extended = extend(shooting, model, candidate)
         gain = paired_gain(model.held_out, extended.held_out)
-        extended = replace(extended, worth={**model.worth, candidate.label: gain.total})
+        extended = split_causes(replace(extended, worth={**model.worth, candidate.label: gain.total}))
         trials.append(Trial(candidate, extended, gain, model.deviance - extended.deviance, tests))
     good = [t for t in trials if _is_better(t) and _is_taken_over(t.model, model, unlikely)]
     return Round(tuple(trials), max(good, key=lambda t: t.gain.total, default=None), ())

@@ -25,7 +25,7 @@ class Columns:
         complete: channels of a segment that were measured throughout, shape (segments, channels).
         parameters: whitened directions of the free parameters, shape (segments, length * channels, P).
         base: residual predicted - measured in channel units, shape (segments, length, channels).
-        weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
+        weights: 1 where measured, 0 elsewhere, same shape.
         sigma: standard deviation of each channel, shape (channels,).
         coloured: channels to whiten, shape (channels,).
         whitener: shape (channels, length, length).

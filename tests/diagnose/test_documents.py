@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from quadid.diagnose import search
+from quadid.diagnose import acceptance
 from quadid.diagnose.blocks import BLOCK_SECONDS
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
@@ -29,10 +29,10 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
 @pytest.mark.parametrize(
     "words",
     [
-        f"{search.ERRORS:.0f} of its standard errors",
-        f"15, and {search.LEAST_SHARE} of the independent residuals",
-        f"{search.RELATIVE_GAIN:.4f} of all gains so far; {search.FAMILY_SHARE} of what its own family",
-        f"chi-square tail below {search.FALSE_ALARM} divided by",
+        f"{acceptance.ERRORS:.0f} of its standard errors",
+        f"15, and {acceptance.LEAST_SHARE} of the independent residuals",
+        f"{acceptance.RELATIVE_GAIN:.4f} of all gains so far; {acceptance.FAMILY_SHARE} of what its own family",
+        f"chi-square tail below {acceptance.FALSE_ALARM} divided by",
         f"blocks of {BLOCK_SECONDS:.0f} s",
         f"at least {100 * SHARE_TO_NAME:.0f} % of all structure",
     ],

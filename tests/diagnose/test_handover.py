@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import pytest
@@ -54,3 +55,19 @@ def test_likely_errors_are_believed_without_another_look(monkeypatch: pytest.Mon
     monkeypatch.setattr(handover, "LIKELY", 100.0)
     monkeypatch.setattr(handover, "screen", lambda *given: pytest.fail("looked"))
     assert hand_over(problem.shooting, model, problem.listed, TESTS) is None
+
+
+def test_what_takes_over_comes_in_parts_and_is_no_error_of_a_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every candidate counts as better and as taking over; one that stands for two causes is split."""
+    problem, model = blamed("thrust_curve")
+    monkeypatch.setattr(handover, "_is_better", lambda trial: True)
+    monkeypatch.setattr(handover, "_is_taken_over", lambda *given: True)
+    monkeypatch.setattr(handover, "MOST_REFITS", 100)
+    lag, delay = cause(problem, "motor_lag"), cause(problem, "command_delay")
+    joint = replace(lag, names=(*lag.names, *delay.names), starts=((0.01, 0.01),), label="both", split=(lag, delay))
+    monkeypatch.setattr(handover, "exceeded", lambda *given: -1e9)
+    tried = hand_over(problem.shooting, model, [joint, *problem.listed], TESTS)
+    assert tried is not None
+    assert not {t.candidate.effect for t in tried.trials} & set(handover.SENSOR_ERRORS)
+    (both,) = [t for t in tried.trials if t.candidate.label == "both"]
+    assert [c.label for c in both.model.causes] == ["accel_bias", "motor_lag", "command_delay"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from quadid.diagnose import pipeline, search
+from quadid.diagnose import acceptance, pipeline, search, trials
 from quadid.diagnose.candidates import Candidate, candidates
 from quadid.model.layout import Layout
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
@@ -37,11 +37,11 @@ def inverted(*arguments: Any) -> bool:
     return not RULE(*arguments)
 
 
-RULE = search._significant
+RULE = acceptance.significant
 
 
 def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "_significant", inverted)
+    monkeypatch.setattr(acceptance, "significant", inverted)
     case = single("motor_lag")
     found, _ = answer(case)
     with pytest.raises(AssertionError):
@@ -50,10 +50,10 @@ def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch:
 
 def test_with_the_decision_inverted_a_null_is_given_causes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only causes that promise something are refitted; on a null none does, so that check is taken out as well."""
-    monkeypatch.setattr(search, "_significant", inverted)
-    monkeypatch.setattr(search, "LEAST_GAIN", 0.0)
-    monkeypatch.setattr(search, "LEAST_SHARE", 0.0)
-    monkeypatch.setattr(search, "FALSE_ALARM", 1.0)
+    monkeypatch.setattr(acceptance, "significant", inverted)
+    monkeypatch.setattr(trials, "LEAST_GAIN", 0.0)
+    monkeypatch.setattr(trials, "LEAST_SHARE", 0.0)
+    monkeypatch.setattr(trials, "FALSE_ALARM", 1.0)
     monkeypatch.setattr(search, "MOST_CAUSES", 2)
     found, _ = answer(of_class("null", 0))
     assert found.findings
