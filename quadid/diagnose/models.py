@@ -100,7 +100,7 @@ def fit_model(
     if states is not None:
         shooting.restore(states)
     free = shooting.free(free_names(causes))
-    settled = states is not None
+    settled = bool(states)
     result = polish(shooting, theta, free, iterations=iterations, tolerance=tolerance, settled=settled)
     return as_model(shooting, result, free, causes)
 
@@ -195,10 +195,13 @@ def extend(
         shooting: the problem.
         model: what to extend.
         candidate: the cause to add.
-        start: full vector to start from, or a sketch on the same segments.
-        iterations: linearisations to spend.
+        start: full vector to start from, or a sketch on the same segments; one without states begins at measured ones.
+        iterations: linearisations to spend; four times as many from measured states.
     """
     begun = sketch(shooting, model, candidate) if start is None else start
     theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
     causes = (*model.causes, candidate)
-    return replace(fit_model(shooting, theta, causes, states, iterations, tolerance=0.2), worth=model.worth)
+    return replace(
+        fit_model(shooting, theta, causes, states, iterations if states else 4 * iterations, tolerance=0.2),
+        worth=model.worth,
+    )
