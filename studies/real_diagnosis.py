@@ -104,9 +104,9 @@ With the chirp drag, its moment and inflow are found with the numbers of the fli
 models, as shares of "no change", on the random flight: position is better than all of them, velocity between the third
 and the last, rate level with two of the four (1.02, where no change is 1); rotation is worse than all and than no
 change. On the square flight, six times livelier, position and velocity are behind and rotation and rate far ahead; on
-the chirp, which hardly turns, rotation and rate are worse than no change. Why: the rates of these files were low-passed
-after the fact, so that what drives the fastest rotation is not in them, and the refit weighs all flights alike, of which
-the liveliest holds most of the error. One rigid body with constants serves both kinds of flight only so far.""",
+the chirp, which hardly turns, rotation and rate are worse than no change. Why: the rates of these files were filtered
+after the fact, so that what drives the fastest rotation is not in them, and the refit weighs all flights alike, where
+the liveliest hold most of the error. One rigid body with constants serves both kinds of flight only so far.""",
         scored=SCORED,
     ),
     Flights(

@@ -52,7 +52,7 @@ def drafts_of(
         elif score.candidate.starts or far:
             drawn = sketch(thin, base, score.candidate, elsewhere if far else ())
             drop = max(every * drawn.drop, score.drop) if far else drawn.drop
-            # Far from the optimum of the model its initial states are as wrong as its parameters: begin at measured ones.
+            # Far from the optimum the model's initial states are as wrong as its parameters: begin at measured ones.
             drafts.append(Draft(score, drop, replace(drawn, states={}) if far else drawn))
         else:
             drafts.append(Draft(score, score.drop, model.theta))

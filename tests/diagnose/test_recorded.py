@@ -16,14 +16,13 @@ LAG = (0.030, 0.045)
 
 
 def windows_of(data: Path, vehicle: Vehicle, *names: str) -> list[Window]:
-    return [
-        w for n in names for w in to_windows(open_log(data / "crazyflie_rpm" / f"{n}.csv"), vehicle, rate=100.0)
-    ]  # fmt: skip
+    """All windows of some flights at 50 Hz."""
+    return [w for n in names for w in to_windows(open_log(data / "crazyflie_rpm" / f"{n}.csv"), vehicle)]
 
 
 def test_lag_drag_and_its_moment_of_a_crazyflie_seen_through_its_commands(data_dir: Path) -> None:
     vehicle = Vehicle.from_yaml((data_dir / "crazyflie_rpm" / "vehicle_pwm.yaml").read_text(encoding="utf-8"))
-    train = windows_of(data_dir, vehicle, "figure8_22_pwm", "figure8_27_pwm")
+    train = windows_of(data_dir, vehicle, "figure8_22_pwm")
     found, _ = diagnose(train, vehicle, windows_of(data_dir, vehicle, "figure8_35_pwm"))
     values = {f.effect: {p.name: p.value for p in f.parameters} for f in found.findings}
     assert {"rotor_drag", "rotor_drag_moment"} <= set(values), values
