@@ -68,7 +68,7 @@ def child(code: str, *arguments: str, environment: Mapping[str, str] | None = No
     wall, processor = time.perf_counter(), processor_seconds()
     done = subprocess.run(
         [sys.executable, "-c", wrapped, *arguments], capture_output=True, text=True, check=True,
-        env={**os.environ, **(environment or {})},
+        env={**_surroundings(), **(environment or {})},
     )  # fmt: skip
     lines = done.stdout.splitlines()
     told = json.loads(lines[-2]) if len(lines) > 1 else {}
@@ -80,7 +80,12 @@ def command(*arguments: str) -> None:
     """Runs `quadid` in a process of its own, quietly."""
     with tempfile.TemporaryFile() as nothing:
         launch = [str(Path(sys.executable).with_name("quadid")), *arguments]
-        subprocess.run(launch, stdout=nothing, stderr=nothing, check=True)
+        subprocess.run(launch, stdout=nothing, stderr=nothing, check=True, env=_surroundings())
+
+
+def _surroundings() -> dict[str, str]:
+    """Environment of a started process: that of a user, where Python keeps what it has compiled."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
 
 def machine() -> dict[str, Any]:

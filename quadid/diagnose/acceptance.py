@@ -27,6 +27,12 @@ FAMILY_SHARE = 0.01
 """… and, where a look-alike is already in the model, this share of what that one gained: the rest of a fading thrust
 that is not quite linear is no second cause."""
 
+CLOSE = 0.8
+"""Share of the gain of the best cause beyond which another, tried beside it, came close."""
+FAR_SURER = 5.0
+"""Times the evidence by which a cause that came close is preferred.  A gain whose parameter is hardly known is not the
+parameter's: inflow lets every segment find a vertical velocity that makes up for any thrust that is off in it."""
+
 
 @dataclass(frozen=True)
 class Context:
@@ -63,12 +69,15 @@ def context_of(model: Model, nominal: Model) -> Context:
 
 
 def choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
-    """The best trial, or a simpler one within one standard error of it; None when none is significant."""
+    """The best trial, a close one far surer, or a simpler one as good but for luck; None when none is significant."""
     context = context_of(model, nominal)
     good = [t for t in trials if significant(t.gain, t.evidence, t.candidate, t.tests, context)]
     if not good:
         return None
     best = max(good, key=lambda t: t.gain.total)
+    surer = [t for t in good if t.gain.total > CLOSE * best.gain.total and t.evidence > FAR_SURER * best.evidence]
+    if surer:
+        return max(surer, key=lambda t: t.evidence)
     for t in sorted(good, key=lambda t: (len(t.candidate.names), -t.gain.total)):
         if len(t.candidate.names) >= len(best.candidate.names):
             break

@@ -61,20 +61,26 @@ class Model:
         """Deviance per independent residual; 1 at the noise floor."""
         return float(self.lin.cost.sum()) / max(self.rows, 1.0)
 
-    def wald(self, cause: Candidate) -> float:
-        """Robust chi-square of the parameters of `cause` against neutral.
-
-        Their covariance is widened where segment scores are larger or more correlated than the noise model says.
-        """
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
         precision = 1.0 / self.prior.sigma**2
         covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(precision))
         meat, _ = score_products(self.lin)
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         widen = np.sqrt(np.maximum(ratio, 1.0))
-        covariance = covariance * np.outer(widen, widen)
+        return np.asarray(covariance * np.outer(widen, widen))
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the scaled parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def wald(self, cause: Candidate) -> float:
+        """Robust chi-square of the parameters of `cause` against neutral."""
+        z = self.free.from_neutral(self.theta)
         place = [self.free.names.index(n) for n in cause.names]
-        z = self.free.from_neutral(self.theta)[place]
-        return float(z @ np.linalg.solve(covariance[np.ix_(place, place)], z))
+        return float(z[place] @ np.linalg.solve(self.covariance[np.ix_(place, place)], z[place]))
 
     @property
     def finds_velocity(self) -> bool:
@@ -112,6 +118,24 @@ def as_model(
     prior = prior or default_prior(shooting, free)
     held_out = held_out_deviance(result.lin, 1.0 / prior.sigma**2, block_labels(result.lin))
     return Model(causes, free, prior, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
+
+
+def restore_settled(shooting: Shooting, model: Model, rounds: int = 2) -> None:
+    """Puts back the states of `model`, and fits those that a linearisation of the whole catalogue begins at to it.
+
+    Filters and delays begin before a segment, where no fit without them has been; from states as measured there, the
+    linear problem can promise more than there is to gain.
+
+    Args:
+        shooting: the problem.
+        model: whose parameters stay as they are.
+        rounds: Gauss-Newton steps on the initial states.
+    """
+    shooting.restore(model.states)
+    anything = shooting.free(["imu_lag.period", "rotor_drag.k_x"])  # what begins early, what needs velocity
+    for _ in range(rounds):
+        lin = shooting.linearise(model.theta, anything)
+        shooting.adopt(model.theta, anything, shooting.step_states(model.theta, anything, lin, np.zeros(2)))
 
 
 @dataclass(frozen=True)

@@ -9,19 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.backward import eliminate
+from quadid.diagnose.belief import beyond_belief
 from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.climb import LINEAR_MISFIT, is_long
 from quadid.diagnose.data_faults import data_faults, without_copies
 from quadid.diagnose.findings import describe
 from quadid.diagnose.foresight import POOR, refit_to_predict
 from quadid.diagnose.form import inconstant
-from quadid.diagnose.handover import sensor_errors
 from quadid.diagnose.models import Model, fit_model, free_names
 from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.search import Search, select
 from quadid.diagnose.validation import validate
 from quadid.diagnose.vehicle_file import extended_vehicle
+from quadid.diagnose.whole_rest import with_look_alike
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
 from quadid.identify.floor import flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise import NoiseModel
@@ -46,8 +47,6 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 NOISE_ROSE = 1.5
 """When it rises by more than this the flexible fit has lost its way, and the first estimate stands."""
-BELIEVABLE = 10.0
-"""Typical sizes beyond which an error of a sensor is not believed."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown` …"""
 SHARE_ALONE = 0.9
@@ -97,11 +96,12 @@ def diagnose(
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     search = _select(windows, begun, report)
     decisive = search.shooting
-    left = remainder(decisive, search.model, seed)
+    nominal = _usual_nominal(begun, search)
+    search, left = _with_rest(search, nominal, begun, seed)
     report("validation", 0.0)
     outcome, per_finding = validate(decisive, search, validation, begun.listed)
-    beyond, doubts = _beyond_belief(begun.short, search.model), dict(inconstant(search.model, left))
-    verdict = judge(_usual_nominal(begun, search), search.model, left)
+    beyond, doubts = beyond_belief(begun.short, search.model), dict(inconstant(search.model, left))
+    verdict = judge(nominal, search.model, left)
     saturated = any(f.kind == "saturated" for f in faults)
     if search.model.causes and (outcome.contradicted or beyond or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
@@ -215,13 +215,16 @@ def _usual_nominal(begun: _Begun, search: Search) -> Model:
     return fit_model(next(s for s in begun.ladder if not is_long(s)), search.nominal.theta, ())
 
 
-def _beyond_belief(shooting: Shooting, model: Model) -> list[str]:
-    """Sentences about sensor errors so large that they must stand for something else."""
-    return [
-        f"{e.name} = {float(model.theta[e.index]):.3g} {e.unit} is more than a sensor that works can have "
-        f"({BELIEVABLE * e.typical:.3g} {e.unit}): it stands for something else, and no finding is confident"
-        for e in sensor_errors(shooting, model, BELIEVABLE)
-    ]
+def _with_rest(search: Search, nominal: Model, begun: _Begun, seed: int) -> tuple[Search, Remainder]:
+    """What the selection leaves; with one more look-alike of its causes if that leaves nothing."""
+    left = remainder(search.shooting, search.model, seed)
+    if judge(nominal, search.model, left) in (Verdict.NOTHING_FOUND, Verdict.EXPLAINED) or not search.model.causes:
+        return search, left
+    fuller = with_look_alike(search, nominal, left, begun.listed)
+    if fuller is None:
+        return search, left
+    rest = remainder(fuller.shooting, fuller.model, seed)
+    return (fuller, rest) if judge(nominal, fuller.model, rest) is Verdict.EXPLAINED else (search, left)
 
 
 def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:

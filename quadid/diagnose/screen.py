@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate, all_names, unset_times
-from quadid.diagnose.models import Model
+from quadid.diagnose.models import Model, restore_settled
 from quadid.identify.polish import default_prior
 from quadid.identify.shooting import Linearised, Shooting
 
@@ -41,7 +41,7 @@ class Score:
 def linearise_all(shooting: Shooting, model: Model, listed: list[Candidate]) -> tuple[Linearised, list[str]]:
     """Linearises the current model with every candidate's entries free; returns it and the entry names."""
     names = list(dict.fromkeys([*model.free.names, *all_names(listed)]))
-    shooting.restore(model.states)
+    restore_settled(shooting, model)
     theta = unset_times(model.theta, model.effects)
     return shooting.linearise(theta, shooting.free(names)), names
 

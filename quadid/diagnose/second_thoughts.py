@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.acceptance import context_of, significant
+from quadid.diagnose.acceptance import CLOSE, context_of, significant
 from quadid.diagnose.blocks import paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.climb import Climb
@@ -22,9 +22,6 @@ from quadid.diagnose.screen import screen
 from quadid.diagnose.trials import drafts_of, tried
 
 FloatArray = NDArray[np.float64]
-
-CLOSE = 0.8
-"""Share of the gain of an accepted cause beyond which another, tried beside it, came close."""
 
 
 def second_thought(climb: Climb, rounds: Sequence[Round], tests: int, elsewhere: Sequence[FloatArray]) -> Round | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadid.diagnose.blocks import block_labels, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.clutter import clutter_names, without_in_clutter
-from quadid.diagnose.models import Model
+from quadid.diagnose.models import Model, restore_settled
 from quadid.diagnose.result import Benefit, Validation
 from quadid.diagnose.search import Search
 from quadid.effects import EFFECTS
@@ -65,7 +65,8 @@ def validate(
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
     if not model.causes:
         return {}
-    decisive.restore(model.states)
+    restore_settled(decisive, model)
+    model = replace(model, states=decisive.snapshot())
     everything = decisive.linearise(model.theta, decisive.free(clutter_names(model, listed)))
     out = {c.label: without_in_clutter(decisive, model, c, listed, everything) for c in model.causes}
     return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -26,10 +26,14 @@ class Convergence(StrEnum):
     CONVERGED = "the step fell below the statistical resolution"
     BUDGET = "the iteration limit was reached before the step was small"
     STUCK = "no step reduced the cost any further"
+    ASTRAY = "the initial states went where no linear step follows them"
 
 
 LONGEST_STEP = 3.0
 """No scaled parameter moves farther than this in one step."""
+_REFUSALS, _SETTLED = 3, 0.01
+"""Steps refused in a row after which initial states are looked at alone, and the share of the cost by which their own
+step may miss what it promised.  Beyond, they have gone where linearisation, and the cost it tells, is worth nothing."""
 _STEADY_WEIGHT = 0.01
 """Robust weights are renewed while any of them changes by more than this."""
 
@@ -107,7 +111,7 @@ def polish(
     shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, iterations: int = 12,
     robust: bool = False, tolerance: float = 0.02, settled: bool = False,
 ) -> Polished:  # fmt: skip
-    """Refines `theta` to the local optimum.
+    """Refines `theta` to the local optimum, once more from measured initial states where those at hand went astray.
 
     Args:
         shooting: the problem; its initial states are advanced.
@@ -123,6 +127,24 @@ def polish(
         NotIdentifiableError: the data lead to equations with infinite or missing entries.
     """
     prior = prior or default_prior(shooting, free)
+    settled = settled and shooting.has_states(theta, free)
+    first = _descend(shooting, theta, free, prior, iterations, robust, tolerance, settled)
+    if first.outcome is not Convergence.ASTRAY:
+        return first
+    kept = shooting.snapshot()
+    shooting.restore({})
+    again = _descend(shooting, first.theta, free, prior, iterations, robust, tolerance, False)
+    best = min(again, first, key=lambda p: p.cost)
+    if best is first:
+        shooting.restore(kept)
+    return replace(best, iterations=first.iterations + again.iterations)
+
+
+def _descend(
+    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior, iterations: int, robust: bool, tolerance: float,
+    settled: bool,
+) -> Polished:  # fmt: skip
+    """`polish` from the states as they are; gives up where these have gone astray."""
     lin = shooting.linearise(theta, free)
     if robust:
         # Initial states as measured would let every sample of a segment look like an outlier.
@@ -130,7 +152,7 @@ def polish(
         shooting.adopt(theta, free, shooting.step_states(theta, free, lin, still))
         shooting.robust = list(robust_weights(shooting, shooting.linearise(theta, free)))
         lin = shooting.linearise(theta, free)
-    damping, spent, outcome = 0.0, 3 if robust else 1, Convergence.BUDGET
+    damping, refused, spent, outcome = 0.0, 0, 3 if robust else 1, Convergence.BUDGET
     cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     while spent < iterations:
         precision, pull, _ = prior_terms(free, prior, theta)
@@ -148,14 +170,18 @@ def polish(
         # The first step also moves the initial states away from single noisy samples; it may cost a little.
         if not trial_cost <= cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9:
             shooting.restore(kept)
-            damping = max(4.0 * damping, 1e-2)
+            damping, refused = max(4.0 * damping, 1e-2), refused + 1
+            if refused == _REFUSALS and _astray(shooting, theta, free, lin):
+                outcome = Convergence.ASTRAY
+                break
             if damping > 1e6:
                 outcome = Convergence.STUCK
                 break
             continue
         gain, sigma = cost - trial_cost, 1.0 / np.sqrt(np.diag(h))
         small = bool(np.all(np.abs(actual) <= tolerance * sigma)) or 0.0 <= gain < tolerance**2
-        theta, lin, cost, damping = moved, trial, trial_cost, (damping * 0.2 if damping > 1e-4 else 0.0)
+        theta, lin, cost, refused = moved, trial, trial_cost, 0
+        damping = damping * 0.2 if damping > 1e-4 else 0.0
         if settled and small:
             outcome = Convergence.CONVERGED
             break
@@ -165,6 +191,15 @@ def polish(
             lin = shooting.linearise(theta, free)
             spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
+
+
+def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:
+    """Whether initial states, moved alone, miss the cost that their linearisation counts on."""
+    kept = shooting.snapshot()
+    shooting.adopt(theta, free, shooting.step_states(theta, free, lin, np.zeros(len(free.entries))))
+    reached = float(shooting.linearise(theta, free).cost.sum())
+    shooting.restore(kept)
+    return not reached <= (1.0 + _SETTLED) * float(lin.cost.sum())
 
 
 def _renewed(shooting: Shooting, lin: Linearised) -> bool:

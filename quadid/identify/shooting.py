@@ -91,12 +91,19 @@ class Shooting:
         return Free(tuple(self.layout.entry(n) for n in names))
 
     def states(self, n_pre: int) -> list[FloatArray]:
-        """Current initial states `n_pre` rows before the segments; measured ones at first."""
+        """Initial states `n_pre` rows before the segments; at first measured ones, with velocities found so far."""
         if n_pre not in self._x0:
             pairs = zip(self.rollouts, self.segments, strict=True)
-            self._x0[n_pre] = [first_states(r, s, n_pre) for r, s in pairs]
-            self._reckoned[n_pre] = [x[:, 7:10].copy() for x in self._x0[n_pre]]
+            measured = [first_states(r, s, n_pre) for r, s in pairs]
+            self._reckoned[n_pre] = [x[:, 7:10].copy() for x in measured]
+            for x, near, reckoned in zip(measured, self._x0.get(1, ()), self._reckoned.get(1, ()), strict=False):
+                x[:, 7:10] += near[:, 7:10] - reckoned
+            self._x0[n_pre] = measured
         return self._x0[n_pre]
+
+    def has_states(self, theta: FloatArray, free: Free) -> bool:
+        """Whether initial states are known as early as the model of `theta` and `free` begins."""
+        return self._shape(theta, free)[0] in self._x0
 
     def set_states(self, n_pre: int, states: list[FloatArray]) -> None:
         """Replaces the initial states."""

@@ -275,3 +275,17 @@ def test_hopeless_data_end_in_an_answer_or_an_error_of_ours(hopeless: str) -> No
         return
     assert np.isfinite(found.theta).all()
     assert np.isfinite(found.uncertainty.sigma).all()
+
+
+def test_initial_states_gone_astray_are_left_for_measured_ones() -> None:
+    """Ten radians a second off, no linear step keeps its promise, and each would be refused for ever."""
+    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    free = shooting.free([*NOMINAL_NAMES, "rotor_drag.k_x", "rotor_drag.k_y"])
+    start = free.move(at_truth(shooting, flown(3).truth.parameters), np.full(len(free.entries), 0.2))
+    wanted = polish(shooting, start, free, iterations=30)
+    shooting.restore({})
+    (states,) = [x.copy() for x in shooting.states(1)]
+    states[:, 4:7] += 10.0 * np.random.default_rng(1).standard_normal((len(states), 3))
+    shooting.set_states(1, [states])
+    found = polish(shooting, start, free, iterations=30, settled=True)
+    assert found.cost == pytest.approx(wanted.cost, rel=5e-3)
