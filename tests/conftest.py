@@ -12,6 +12,11 @@ from tests.faults.evidence import Collector
 from tests.faults.evidence import happened as happened  # a fixture for every folder
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+THIS_MACHINE = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "quadid_node" / "config" / "loopback.xml"),
+}
+"""Environment of ROS processes that meet within this machine alone, without shared memory."""
 
 # The first call of a numba kernel compiles it: an example's time says nothing. In CI every run draws the same examples.
 hypothesis.settings.register_profile("quadid", deadline=None, print_blob=True, derandomize=bool(os.environ.get("CI")))

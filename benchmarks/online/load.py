@@ -19,6 +19,11 @@ PAGE = os.sysconf("SC_PAGE_SIZE")
 START_LIMIT = 240.0
 WAYS = ("woken", "polled")
 """How a node gets its messages: a callback for each, or all that wait, every now and then."""
+THIS_MACHINE = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[2] / "quadid_node" / "config" / "loopback.xml"),
+}
+"""Environment of ROS processes that meet within this machine alone, without shared memory."""
 SETTLE = 2.0
 """Time after the first message before anything counts [s]."""
 
@@ -60,7 +65,7 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
         out = Path(folder) / "noted.json"
         environment = {
             **os.environ, "QUADID_PROBE_OUT": str(out), "PYTHONUNBUFFERED": "1", "AMENT_PREFIX_PATH": sys.prefix,
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), **THIS_MACHINE,
         }  # fmt: skip
         options = ["-p", f"history:={folder}/h.sqlite", *(["-p", f"record:={folder}/r.mcap"] if record else [])]
         node = _start(["benchmarks.online.probe_node", "--ros-args", *options], environment)
@@ -83,7 +88,7 @@ def bare(seconds: float, way: str) -> dict[str, float]:
     """A node that takes the same messages and does nothing with them: its share of a core; see `bare_node`."""
     environment = {
         **os.environ, "PYTHONUNBUFFERED": "1", "AMENT_PREFIX_PATH": sys.prefix,
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), **THIS_MACHINE,
     }  # fmt: skip
     node = _start(["benchmarks.online.bare_node", way], environment)
     try:

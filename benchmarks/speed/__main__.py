@@ -19,10 +19,11 @@ from typing import Any
 
 from benchmarks.speed import peers, whole
 from benchmarks.speed.assembly import instructions
-from benchmarks.speed.cases import kernel_table
+from benchmarks.speed.cases import effect_table, kernel_table
 from benchmarks.speed.page import page
 from benchmarks.speed.pieces import pieces
 from benchmarks.speed.plots import draw
+from benchmarks.speed.single import single
 from benchmarks.speed.timing import machine
 
 
@@ -31,6 +32,8 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
     few = max(rounds // 2, 1)
     return {
         "kernel": lambda: kernel_table(rounds),
+        "effects": lambda: effect_table(rounds),
+        "single": lambda: single(rounds),
         "instructions": instructions,
         "pieces": lambda: pieces(rounds),
         "objectives": lambda: peers.objectives(rounds),

@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.kernel import NOMINAL_OPERATIONS, Case, all_model_cases, numpy_case, particles, peak_case
+from benchmarks.kernel import (
+    NOMINAL_OPERATIONS,
+    Case,
+    all_model_cases,
+    free,
+    model_cases,
+    numpy_case,
+    particles,
+    peak_case,
+)  # fmt: skip
+from quadid.effects import EFFECTS
+from quadid.model.layout import Layout
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 
@@ -50,6 +61,26 @@ def kernel_table(rounds: int) -> dict[str, Any]:
         "gain_over_numpy": plainest / nominal,
         "extended_over_nominal": full / nominal,
         "every_over_nominal": _told(seen, model[5][0])["least"] / nominal,
+    }  # fmt: skip
+
+
+def effect_table(rounds: int) -> dict[str, Any]:
+    """The swarm's cost with each effect of the catalogue alone, of another size in every particle, over the nominal."""
+    vehicle = Vehicle.shipped("pelican")
+    nominal, entries = particles(vehicle, LANES), Layout(vehicle).entries.values()
+    vectors = {"nominal": nominal}
+    for effect in EFFECTS:
+        own = [e for e in entries if e.name.startswith(f"{effect}.") and not e.name.endswith(".time")]
+        vectors[effect] = free(nominal, *((e.index, e.typical) for e in own))
+    cases = {name: model_cases(name, vehicle, thetas, 9, True)[0] for name, thetas in vectors.items()}
+    least = dict.fromkeys(cases, np.inf)
+    for _ in range(TURNS * rounds):
+        for name, case in cases.items():
+            least[name] = min(least[name], 1e9 * _best(case, time.thread_time) / case.steps)
+    ratios = {name: ns / least["nominal"] for name, ns in least.items() if name != "nominal"}
+    return {
+        "ns": least, "ratios": ratios, "median": float(np.median(list(ratios.values()))),
+        "largest": max(ratios, key=lambda name: ratios[name]),
     }  # fmt: skip
 
 

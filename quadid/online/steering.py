@@ -32,7 +32,8 @@ FloatArray = NDArray[np.float64]
 NEEDED = ("attitude_reference", "attitude", "gyro")
 SOURCE = "references through the stabiliser"
 OLDEST = 1.0
-"""References and attitude older than this [s] are not steered by."""
+"""References and attitude older than this [s] are not steered by, nor those that miss so many of their periods that it
+is a gap: what the integrals took in meanwhile nobody knows."""
 CALM = 10.0
 """Flight from which the integrals are found [s]."""
 AIRBORNE = 0.5
@@ -100,8 +101,13 @@ class Steering:
         if last <= first:
             return
         t, period = gyro.t[first : last + 1], float(np.median(np.diff(gyro.t)))
-        if math.isfinite(self._newest) and t[0] - self._newest > GAP * period:
+        before = self._newest if math.isfinite(self._newest) else t[0]
+        torn = np.flatnonzero(np.diff(t, prepend=before) > GAP * period)
+        if len(torn):
             self.restart()
+            t = t[torn[-1] :]
+            if len(t) < 2:
+                return
         commands = self._run(lines, t, min(max(round(self._rate * period), 1), MOST_RUNS))
         if commands is None or (self._settled and np.mean(commands**2) * len(self._mixer) < LANDED * self._hover):
             self.restart()
@@ -112,7 +118,7 @@ class Steering:
             self._t = np.concatenate([self._t[keep], t[:-1]])
             self._commands = np.concatenate([self._commands[keep], commands])
         else:
-            self._settle(np.diff(t), commands, gyro.values[first : last + 1])
+            self._settle(np.diff(t), commands, gyro.values[last + 1 - len(t) : last + 1])
 
     def _run(self, lines: Mapping[str, Line], t: FloatArray, runs: int) -> FloatArray | None:
         """Commands from each of the times `t` to the next, shape (len(t) - 1, rotors); None: measured too long ago."""
@@ -120,8 +126,9 @@ class Steering:
         reference, attitude, gyro = (lines[name] for name in NEEDED)
         at = (t[:-1, None] + np.diff(t)[:, None] * (np.arange(runs) / runs)).ravel()
         held, nearest = (np.searchsorted(line.t, at + 1e-9, "right") - 1 for line in (reference, attitude))
-        if (at - reference.t[held] > OLDEST).any() or (at - attitude.t[nearest] > OLDEST).any():
-            return None
+        for line, before in ((reference, held), (attitude, nearest)):
+            if (at - line.t[before] > _oldest(line)).any():
+                return None
         commands = np.empty((len(at), len(self._mixer)))
         stabilise_rows(
             self._gains, self._mixer, np.ascontiguousarray(reference.values[held]), _turned(attitude, at),
@@ -158,6 +165,11 @@ class Steering:
             fix = "publish rotor speeds or motor commands; or keep flying, with references, attitude and rates"
             raise LogError(f"no rotor speeds, and none yet from references through the stabiliser ({have})", fix=fix)
         return RotorSignal(self._t[:count], self._commands[:count], "held", SOURCE)
+
+
+def _oldest(line: Line) -> float:
+    """Age of the newest sample of a channel beyond which it is not steered by [s]."""
+    return min(OLDEST, GAP * float(np.median(np.diff(line.t)))) if len(line.t) > 1 else OLDEST
 
 
 def _between(line: Line, at: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from quadid_node.stopping import Stop, end_middleware
+from quadid_node.transport import without_shared_memory
 
 if TYPE_CHECKING:
     from quadid_node.node import IdentifyNode
@@ -57,6 +58,7 @@ def _run(args: list[str] | None, stop: Stop) -> int:
     from quadid_node.node import IdentifyNode
 
     stop.opens()
+    without_shared_memory()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = IdentifyNode(stop)
     executor = EventsExecutor()

@@ -22,6 +22,7 @@ from quadid.window import Recording
 from quadid_node.convert import message_class
 from quadid_node.playback import base_seconds
 from quadid_node.stopping import Stop, end_middleware
+from quadid_node.transport import without_shared_memory
 
 QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CHECK_EVERY = 0.1
@@ -117,6 +118,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _play(recording: Recording, given: argparse.Namespace, args: list[str] | None, stop: Stop) -> None:
+    without_shared_memory()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = Node("quadid_replay")
     player = TopicPlayer(node, given.speed, stop)

@@ -18,6 +18,11 @@ from benchmarks.online.load import _resident, _wait_for, _worker_of
 from studies.soak.node import OUT
 
 WHERE = ("--ros-args", "-r", "__ns:=/soak")
+THIS_MACHINE = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[2] / "quadid_node" / "config" / "loopback.xml"),
+}
+"""Environment of ROS processes that meet within this machine alone, without shared memory."""
 WATCH = 60.0
 
 
@@ -28,7 +33,7 @@ def hour(seconds: float, tell: Callable[[str], None]) -> dict[str, Any]:
         kept.mkdir()
         environment = {
             **os.environ, OUT: f"{folder}/counts.jsonl", "PYTHONUNBUFFERED": "1", "AMENT_PREFIX_PATH": sys.prefix,
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), **THIS_MACHINE,
             "ROS_LOG_DIR": f"{kept}/log",
         }  # fmt: skip
         said = (Path(folder) / "said.txt").open("w+")

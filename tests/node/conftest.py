@@ -12,7 +12,7 @@ import pytest
 
 from quadid.online.fitting import warm_up
 from quadid.vehicle import Vehicle
-from tests.conftest import absent
+from tests.conftest import THIS_MACHINE, absent
 from tests.node.peers import Ear
 
 HERE = Path(__file__).resolve().parent
@@ -39,7 +39,8 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
             absent(f"{module} is not installed in {sys.prefix}: run 'make messages'")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(1 + (os.getpid() + 50) % 100))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        for name, value in THIS_MACHINE.items():
+            patch.setenv(name, value)
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
         patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
         patch.delenv("RMW_IMPLEMENTATION", raising=False)

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("ros")
 def test_a_set_comes_from_references_through_the_stabiliser(tmp_path: Path, ear: Ear) -> None:
     from quadid_msgs.msg import FitStatus, ParameterSet
 
-    flight = fly(STEERED, seconds=30.0, seed=5, profile="excited")
+    flight = fly(STEERED, seconds=60.0, seed=5, profile="excited")
     log, vehicle = tmp_path / "flight.mcap", tmp_path / "steered.yaml"
     write_mcap(log, without_rotors(flight.recording))
     vehicle.write_text(STEERED.to_yaml())

@@ -9,7 +9,7 @@ import pytest
 
 from quadid.flight import fly
 from quadid.flight.stabiliser import default_gains
-from quadid.online import Publish, Session, SessionSettings
+from quadid.online import GateSettings, Publish, Session, SessionSettings
 from quadid.online.buffer import Buffer
 from quadid.online.records import Phase, SetState
 from quadid.online.steering import SOURCE
@@ -59,6 +59,20 @@ def test_a_session_identifies_from_references_alone() -> None:
     truth = flight.truth.parameters.as_dict()
     for name in ("b", "J_xx", "J_yy"):
         assert sets[-1].parameters[name].value == pytest.approx(truth[name], rel=0.02)
+
+
+@pytest.mark.parametrize(("lost", "until"), [("gyro", 3.1), ("attitude_reference", 3.5), ("attitude", 3.5)])
+def test_what_is_lost_on_the_way_costs_time_but_does_not_spoil_what_follows(lost: str, until: float) -> None:
+    flight = fly(STEERED, seconds=30.0, seed=5, profile="excited")
+    stream = [s for s in samples(without_rotors(flight.recording)) if s.channel != lost or not 3.0 <= s.t < until]
+    gate = GateSettings(windows=2, width=0.08, yaw_width=0.6)
+    session = Session(STEERED, SessionSettings(diagnose=0.0, window=5.0, gate=gate))
+    actions = list(drive(session, stream))
+    sets = [a.item for a in actions if isinstance(a, Publish) and a.topic == "parameters"]
+    assert sets
+    truth = flight.truth.parameters.as_dict()
+    for name in ("b", "J_xx", "J_yy"):
+        assert sets[-1].parameters[name].value == pytest.approx(truth[name], rel=0.03)
 
 
 def test_without_the_gains_it_is_refused_with_the_fix() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import absent
+from tests.conftest import THIS_MACHINE, absent
 
 HERE = Path(__file__).resolve().parent
 
@@ -31,7 +31,8 @@ def ros_environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
             absent(f"{module} is not installed in {sys.prefix}: run 'make messages'")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # above 101 the ports may be taken by clients
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        for name, value in THIS_MACHINE.items():
+            patch.setenv(name, value)
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
         patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
         patch.delenv("RMW_IMPLEMENTATION", raising=False)  # naming an absent one ends the process without a word

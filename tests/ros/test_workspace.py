@@ -37,7 +37,7 @@ def assert_layout(prefix: Path, package: Path) -> None:
     for executable in ("identify", "replay"):
         assert os.access(prefix / "lib/quadid_node" / executable, os.X_OK)
     for folder in ("launch", "config"):
-        expected = {path.name for path in (package / folder).iterdir() if path.suffix in (".py", ".yaml")}
+        expected = {path.name for path in (package / folder).iterdir() if path.suffix in (".py", ".yaml", ".xml")}
         assert expected
         assert {path.name for path in (prefix / "share/quadid_node" / folder).iterdir()} == expected
 
