@@ -89,6 +89,17 @@ class Climb:
                 return True
         return False
 
+    def farthest(self) -> tuple[Shooting, Model] | None:
+        """The longest segments, and the model fitted on them; None where it does not follow them or they decide."""
+        if self._rung == 0 or not is_long(self._ladder[0]):
+            return None
+        model = self._refitted(0, self.model)
+        return (self._ladder[0], model) if self._follows(0, model) else None
+
+    def go_far(self, model: Model) -> None:
+        """Goes to the longest segments, with a model found on them."""
+        self._rung, self.model = 0, model
+
     def _longest(self, model: Model) -> int:
         """Rung of the longest segments that may decide about a model."""
         return 0 if model.finds_velocity else self._usual

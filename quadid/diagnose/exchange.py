@@ -54,7 +54,7 @@ class Round:
 def swap_look_alikes(
     shooting: Shooting, model: Model, listed: Sequence[Candidate], earlier: Sequence[Round] = ()
 ) -> tuple[Model, list[Round]]:
-    """Puts a look-alike in the place of a cause where that fits unseen blocks better.
+    """Puts a look-alike in the place of a cause where that fits unseen blocks better, or as well with fewer numbers.
 
     Which of two look-alikes was taken first may have been decided on segments too short to tell them apart, or before
     another cause was known.
@@ -86,7 +86,8 @@ def swap_look_alikes(
         holder = _stand_in(rest, model, cause)
         best = max(trials, key=lambda t: t.gain.total)
         gain = paired_gain(model.held_out, best.model.held_out)
-        swapped = gain.total > LEAST_GAIN and gain.total > gain.error
+        simpler = len(best.candidate.names) < len(cause.names) and gain.total > 0.0
+        swapped = simpler or (gain.total > LEAST_GAIN and gain.total > gain.error)
         rounds.append(Round((holder, *trials), best if swapped else holder, ()))
         model = best.model if swapped else model
     return model, rounds

@@ -99,7 +99,11 @@ def _forwards(
         accepted = choose(trials, model, climb.base)
         rounds.append(Round(tuple(trials), accepted, tuple(scores)))
         if accepted is None:
-            break
+            farther = _far_look(climb, listed, tests, elsewhere)
+            rounds += farther
+            if not farther or farther[0].accepted is None:
+                break
+            accepted, shooting = farther[0].accepted, climb.shooting
         worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
         model = split_causes(replace(accepted.model, worth=worth))
         climb.model = prune(shooting, model, accepted.candidate, climb.base, tests)
@@ -112,3 +116,24 @@ def _forwards(
         climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed)
         rounds += swaps
     return tests
+
+
+def _far_look(
+    climb: Climb, listed: Sequence[Candidate], tests: int, elsewhere: Sequence[FloatArray]
+) -> list[Round]:  # fmt: skip
+    """Looks on the longest segments for causes to which an unmeasured airspeed matters; goes there if one is found.
+
+    On usual ones each segment finds a velocity of its own, which makes up for most of what a small drag or inflow does.
+    Only where nothing is named yet: a small cause does not decide on which segments larger ones are judged.
+    """
+    far = None if climb.model.causes else climb.farthest()
+    if far is None:
+        return []
+    shooting, model = far
+    airborne = [c for c in listed if shooting.finds_velocity(c.names)]
+    scores = screen(shooting, model, airborne)
+    trials = [tried(shooting, model, d, tests) for d in drafts_of(shooting, model, scores, tests, elsewhere)]
+    accepted = choose(trials, model, climb.base)
+    if accepted is not None:
+        climb.go_far(accepted.model)
+    return [Round(tuple(trials), accepted, tuple(scores))]

@@ -116,6 +116,10 @@ class Shooting:
         tangents = {9: 9 if moves else 6, 12: 9, 15: 12}[self.channels]
         return (self.lead if warm else 1), tangents
 
+    def finds_velocity(self, names: Sequence[str]) -> bool:
+        """Whether initial velocities are found with the parameters `names`: airspeed matters and is not measured."""
+        return not self.has_velocity and any(n.startswith(_VELOCITY_NAMES) for n in names)
+
     @property
     def has_velocity(self) -> bool:
         """True when velocity or position is measured in every window."""

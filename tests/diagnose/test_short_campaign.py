@@ -62,6 +62,23 @@ def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
     assert first.candidate.label == "axial_inflow", "this case no longer asks for a second thought"
 
 
+def test_inflow_too_small_for_segments_of_a_second_is_found_on_longer_ones() -> None:
+    case = of_class("single", 1083, 120.0)
+    assert case.expected == ("axial_inflow",)
+    found, workings = answer(case)
+    require_named(case, found)
+    first, second, *_ = workings.search.rounds
+    assert first.accepted is None, "this case no longer asks for a look on longer segments"
+    assert second.accepted is not None
+    assert abs(number(found, "axial_inflow", "k_z") - case.hidden["axial_inflow"]["k_z"]) < 0.03
+
+
+def test_of_two_kinds_of_drag_that_fit_alike_the_one_with_fewer_numbers_is_named() -> None:
+    case = of_class("single", 1055, 120.0)
+    assert case.expected == ("parasitic_drag",)
+    require_named(case, answer(case)[0])
+
+
 def test_a_flight_without_effects_is_left_alone() -> None:
     found, workings = answer(of_class("null", 0))
     require_nothing(found)
