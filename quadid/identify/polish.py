@@ -168,7 +168,8 @@ def _descend(
         spent += 1
         trial_cost = float(trial.cost.sum()) + prior_terms(free, prior, moved)[2]
         # The first step also moves the initial states away from single noisy samples; it may cost a little.
-        if not trial_cost <= cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9:
+        least = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
+        if not (trial_cost <= least and _leads_on(trial)):
             shooting.restore(kept)
             damping, refused = max(4.0 * damping, 1e-2), refused + 1
             if refused == _REFUSALS and _astray(shooting, theta, free, lin):
@@ -191,6 +192,12 @@ def _descend(
             lin = shooting.linearise(theta, free)
             spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
+
+
+def _leads_on(lin: Linearised) -> bool:
+    """Whether a next step can be worked out: a simulation that runs away leaves slopes beyond the digits of a float."""
+    gram = lin.gram.sum(axis=0)
+    return bool(np.isfinite(gram).all() and np.isfinite(lin.grad).all() and (np.diag(gram) >= 0.0).all())
 
 
 def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:

@@ -171,18 +171,25 @@ class Cliff(Shooting):
     """A problem whose simulation runs away where J_xx is above `edge`."""
 
     edge = np.inf
+    sign = "cost"
 
     def linearise(self, theta: FloatArray, free: Free) -> Linearised:
         lin = super().linearise(theta, free)
         if theta[LAYOUT.entry("J_xx").index] > self.edge:
-            lin.cost[:] = np.inf
+            if self.sign == "cost":
+                lin.cost[:] = np.inf
+            elif self.sign == "slopes":
+                lin.gram[:] = np.inf
+            else:
+                lin.gram[:] *= -1.0
         return lin
 
 
-def test_a_simulation_that_runs_away_is_stepped_back_from(optimum: Polished) -> None:
+@pytest.mark.parametrize("sign", ["cost", "slopes", "digits"])
+def test_a_simulation_that_runs_away_is_stepped_back_from(optimum: Polished, sign: str) -> None:
     index = LAYOUT.entry("J_xx").index
     shooting = Cliff([flown(3).window], PELICAN, 1.0)
-    shooting.edge = 0.97 * optimum.theta[index]
+    shooting.edge, shooting.sign = 0.97 * optimum.theta[index], sign
     free = shooting.free(NOMINAL_NAMES)
     start = optimum.theta.copy()
     start[index] *= 0.7
