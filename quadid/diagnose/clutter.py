@@ -27,8 +27,9 @@ FloatArray = NDArray[np.float64]
 
 UNTIDY = 0.2
 """How far, in typical sizes, each effect may be from neutral, or from its found value, on any vehicle."""
-TAKES_UP = 0.02
-"""Entries that would move by less than this many typical sizes are left where they are."""
+TAKES_UP = 0.001
+"""Entries that would move by less than this many typical sizes are left where they are, but for what acts through
+another effect (a moment through drag): while that one is at neutral, a linear problem does not see it."""
 _ITERATIONS = 4
 
 
@@ -56,7 +57,8 @@ def without_in_clutter(
     gone = [n for n in free_names(model.causes) if n not in free_names(causes)]
     free = _boxed(shooting, [n for n in names if n not in gone], theta)
     step = _predicted(shooting, model, names, free, gone, theta, everything)
-    takes_up = [abs(z) > TAKES_UP or e.name in NOMINAL_NAMES for z, e in zip(step, free.entries, strict=True)]
+    always = {*NOMINAL_NAMES, *untidy_names([c for c in listed if c.requires])}
+    takes_up = [abs(z) > TAKES_UP or e.name in always for z, e in zip(step, free.entries, strict=True)]
     used = Free(tuple(e for e, keep in zip(free.entries, takes_up, strict=True) if keep))
     shooting.restore(model.states)
     start = used.move(theta, step[np.array(takes_up)])

@@ -67,3 +67,9 @@ def test_changes_at_a_moment_wind_and_ground_are_no_clutter() -> None:
     assert len(names) == len(set(names))
     assert not [n for n in names if n.startswith(("mass_change", "thrust_drop", "wind", "ground_effect"))]
     assert np.isfinite(model.theta).all()
+
+
+def test_what_acts_through_another_effect_may_take_up_too() -> None:
+    """The moment of drag has no slope where drag is neutral, as it is in the model; with drag it imitates damping."""
+    free = refitted("weak_rotor 2").free.names
+    assert {"rotor_drag.k_x", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y"} <= set(free)
