@@ -30,7 +30,7 @@ UNTIDY = 0.2
 TAKES_UP = 0.001
 """Entries that would move by less than this many typical sizes are left where they are, but for what acts through
 another effect (a moment through drag): while that one is at neutral, a linear problem does not see it."""
-_ITERATIONS = 8
+_ITERATIONS = 4
 
 
 def untidy_names(listed: Sequence[Candidate]) -> list[str]:
