@@ -93,17 +93,16 @@ def _forwards(
     while len(climb.model.causes) < MOST_CAUSES:
         report("search", len(rounds) / (len(rounds) + 2.0))
         shooting, model = climb.shooting, climb.model
-        scores = screen(shooting, model, list(listed))
-        tests = len(scores)
-        trials = [tried(shooting, model, d, tests) for d in drafts_of(shooting, model, scores, tests, elsewhere)]
-        accepted = choose(trials, model, climb.base)
-        rounds.append(Round(tuple(trials), accepted, tuple(scores)))
-        if accepted is None:
+        rounds.append(_round(shooting, model, listed, climb.base, elsewhere))
+        tests = len(rounds[-1].screened)
+        if rounds[-1].accepted is None:
             farther = _far_look(climb, listed, tests, elsewhere)
-            rounds += farther
-            if not farther or farther[0].accepted is None:
-                break
-            accepted, shooting = farther[0].accepted, climb.shooting
+            if farther is not None:
+                rounds.append(farther)
+            shooting = climb.shooting
+        accepted = rounds[-1].accepted
+        if accepted is None:
+            break
         worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
         model = split_causes(replace(accepted.model, worth=worth))
         climb.model = prune(shooting, model, accepted.candidate, climb.base, tests)
@@ -118,9 +117,20 @@ def _forwards(
     return tests
 
 
+def _round(
+    shooting: Shooting, model: Model, listed: Sequence[Candidate], base: Model, elsewhere: Sequence[FloatArray],
+    tests: int | None = None,
+) -> Round:  # fmt: skip
+    """Screens causes, refits the promising and chooses one; `tests` alternatives count, by default all screened."""
+    scores = screen(shooting, model, list(listed))
+    count = len(scores) if tests is None else tests
+    trials = [tried(shooting, model, d, count) for d in drafts_of(shooting, model, scores, count, elsewhere)]
+    return Round(tuple(trials), choose(trials, model, base), tuple(scores))
+
+
 def _far_look(
     climb: Climb, listed: Sequence[Candidate], tests: int, elsewhere: Sequence[FloatArray]
-) -> list[Round]:  # fmt: skip
+) -> Round | None:  # fmt: skip
     """Looks on the longest segments for causes to which an unmeasured airspeed matters; goes there if one is found.
 
     On usual ones each segment finds a velocity of its own, which makes up for most of what a small drag or inflow does.
@@ -128,12 +138,10 @@ def _far_look(
     """
     far = None if climb.model.causes else climb.farthest()
     if far is None:
-        return []
+        return None
     shooting, model = far
     airborne = [c for c in listed if shooting.finds_velocity(c.names)]
-    scores = screen(shooting, model, airborne)
-    trials = [tried(shooting, model, d, tests) for d in drafts_of(shooting, model, scores, tests, elsewhere)]
-    accepted = choose(trials, model, climb.base)
-    if accepted is not None:
-        climb.go_far(accepted.model)
-    return [Round(tuple(trials), accepted, tuple(scores))]
+    looked = _round(shooting, model, airborne, climb.base, elsewhere, tests)
+    if looked.accepted is not None:
+        climb.go_far(looked.accepted.model)
+    return looked

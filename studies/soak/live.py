@@ -14,15 +14,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online.load import _resident, _wait_for, _worker_of
+from benchmarks.online.load import THIS_MACHINE, _resident, _wait_for, _worker_of
 from studies.soak.node import OUT
 
 WHERE = ("--ros-args", "-r", "__ns:=/soak")
-THIS_MACHINE = {
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[2] / "quadid_node" / "config" / "loopback.xml"),
-}
-"""Environment of ROS processes that meet within this machine alone, without shared memory."""
 WATCH = 60.0
 
 
