@@ -66,6 +66,13 @@ def without_in_clutter(
     return replace(as_model(shooting, result, used, causes), worth=model.worth)
 
 
+def ordinary(shooting: Shooting, model: Model, cause: Candidate, listed: Sequence[Candidate]) -> bool:
+    """Whether `cause` is no larger in `model` than it may be on any vehicle."""
+    entries = shooting.free(cause.names)
+    near = np.abs(entries.from_neutral(model.theta)) <= UNTIDY
+    return bool(near.all()) and set(cause.names) <= set(untidy_names(listed))
+
+
 def clutter_names(model: Model, listed: Sequence[Candidate]) -> list[str]:
     """Entries of the model and of the untidy rest."""
     return list(dict.fromkeys([*model.free.names, *untidy_names(listed)]))

@@ -52,6 +52,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         alternatives=_alternatives(search, cause, benefit.mse_after),
         evidence=evidence(cause.effect, values, benefit.mse_before, benefit.mse_after),
         per_log=EFFECTS[cause.effect].per_log,
+        ordinary=worth.ordinary,
     )
 
 

@@ -70,6 +70,7 @@ class Finding:
         alternatives: look-alikes refitted in its place, best first.
         evidence: one sentence a pilot understands.
         per_log: its values belong to the flight, not the vehicle.
+        ordinary: no larger than it may be on any vehicle (`diagnose.clutter`); such come after all others.
     """
 
     effect: str
@@ -80,6 +81,7 @@ class Finding:
     alternatives: tuple[Alternative, ...]
     evidence: str
     per_log: bool = False
+    ordinary: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data of contract form."""
@@ -98,6 +100,7 @@ class Finding:
             "alternatives": [{"effect": a.effect, "mse_after": a.mse_after} for a in self.alternatives],
             "evidence": self.evidence,
             "per_log": self.per_log,
+            "ordinary": self.ordinary,
         }
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, paired_gain
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.clutter import clutter_names, without_in_clutter
+from quadid.diagnose.clutter import clutter_names, ordinary, without_in_clutter
 from quadid.diagnose.models import Model, restore_settled
 from quadid.diagnose.result import Benefit, Validation
 from quadid.diagnose.search import Search
@@ -34,12 +34,16 @@ _ALL = ""
 
 @dataclass(frozen=True)
 class Worth:
-    """Benefit of one cause given all others, and its uncorrected p-value."""
+    """Benefit of one cause given all others, and its uncorrected p-value.
+
+    `ordinary` ones are no larger than on any vehicle.
+    """
 
     cause: Candidate
     benefit: Benefit
     p_value: float
     deviance: float
+    ordinary: bool = False
 
 
 def validate(
@@ -54,12 +58,12 @@ def validate(
         listed: the catalogue.
 
     Returns:
-        The overall figures, and the worth of each cause, most valuable first.
+        The overall figures, and the worth of each cause: what is larger than on any vehicle first, then by gain.
     """
     rest = _each_left_out(decisive, search.model, listed)
-    if not logs:
-        return _on_blocks(search, rest)
-    return _on_logs(decisive, search, rest, logs)
+    figures, worth = _on_logs(decisive, search, rest, logs) if logs else _on_blocks(search, rest)
+    told = [replace(w, ordinary=ordinary(decisive, search.model, w.cause, listed)) for w in worth]
+    return figures, tuple(sorted(told, key=lambda w: (w.ordinary, -w.deviance)))
 
 
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
@@ -72,13 +76,12 @@ def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]
     return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}
 
 
-def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, tuple[Worth, ...]]:
+def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, list[Worth]]:
     rows = search.model.rows
     figures = Validation(
         float(search.nominal.held_out.sum()) / rows, float(search.model.held_out.sum()) / rows, "held-out blocks"
     )
-    worth = [_block_worth(c, search, rest) for c in search.model.causes]
-    return figures, tuple(sorted(worth, key=lambda w: -w.deviance))
+    return figures, [_block_worth(c, search, rest) for c in search.model.causes]
 
 
 def _block_worth(cause: Candidate, search: Search, rest: dict[str, Model]) -> Worth:
@@ -104,7 +107,7 @@ def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, 
 
 def _on_logs(
     decisive: Shooting, search: Search, rest: dict[str, Model], logs: Sequence[Window]
-) -> tuple[Validation, tuple[Worth, ...]]:
+) -> tuple[Validation, list[Worth]]:
     scorer = decisive.on(logs)
     nominal, rows = block_deviance(scorer, search.nominal)
     extended, _ = block_deviance(scorer, search.model)
@@ -126,7 +129,7 @@ def _on_logs(
     before, after = (nominal, extended) if halves is None else (halves.nominal, halves.refitted)
     events = any(c.timed is not None for c in search.model.causes)
     contradicted = bool(search.model.causes) and not events and paired_gain(before, after).total < 0.0
-    return replace(figures, contradicted=contradicted), tuple(sorted(worth, key=lambda w: -w.deviance))
+    return replace(figures, contradicted=contradicted), worth
 
 
 def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = None) -> tuple[FloatArray, float]:

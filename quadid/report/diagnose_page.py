@@ -108,6 +108,12 @@ def diagnosis_part(
     }
 
 
+_REMARKS = {
+    "per_log": "It belongs to this flight, not to the vehicle: another flight has its own.",
+    "ordinary": "It is no larger than on most vehicles, and so comes after what is, whatever it costs.",
+}
+
+
 def finding_part(finding: JsonDict, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
     """One cause: its picture, its worth with interval, the look-alikes that lost.
 
@@ -135,8 +141,7 @@ def finding_part(finding: JsonDict, floor: float, identifier: str, seen: Residua
         "noise": _noise_sentence(gain, floor, name),
         "rivals": f"Look-alikes in its place, which lost, with the error they leave: {', '.join(rivals)}."
         if rivals else "No other cause of the catalogue came near it.",
-        "carry": "It belongs to this flight, not to the vehicle: another flight has its own." if finding.get("per_log")
-        else "",
+        "remarks": " ".join(text for key, text in _REMARKS.items() if finding.get(key)),
         "figures": [
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
             gain_figure(finding, floor, f"{identifier}-gain"),

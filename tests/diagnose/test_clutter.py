@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+import pytest
 
-from quadid.diagnose.clutter import UNTIDY, clutter_names, untidy_names, without_in_clutter
+from quadid.diagnose.clutter import UNTIDY, clutter_names, ordinary, untidy_names, without_in_clutter
 from quadid.diagnose.models import Model, extend
 from quadid.identify.linearised import Linearised
 from quadid.parameters import NOMINAL_NAMES
@@ -58,6 +60,24 @@ def test_a_true_cause_is_worth_far_more_than_clutter_can_imitate() -> None:
     without, tidied = refitted("weak_rotor 2"), refitted(None)
     assert not without.causes
     assert float(without.held_out.sum() - tidied.held_out.sum()) > 0.05 * model.rows
+
+
+@pytest.mark.parametrize(
+    ("label", "name", "size", "expected"),
+    [
+        ("weak_rotor 2", "weak_rotor.loss_2", 0.08, False),
+        ("weak_rotor 2", "weak_rotor.loss_2", -0.08, False),
+        ("weak_rotor 2", "weak_rotor.loss_2", 0.005, True),
+        ("cg_offset", "cg_offset.y", -0.0006, True),
+        ("cg_offset", "cg_offset.y", -0.002, False),
+        ("mass_change", "mass_change.fraction", 0.005, False),
+    ],
+)
+def test_a_cause_is_ordinary_up_to_the_size_of_clutter(label: str, name: str, size: float, expected: bool) -> None:
+    problem, model, _ = untidy()
+    theta = problem.nominal.theta.copy()
+    theta[problem.shooting.layout.entry(name).index] = size
+    assert ordinary(problem.shooting, replace(model, theta=theta), cause(problem, label), problem.listed) is expected
 
 
 def test_changes_at_a_moment_wind_and_ground_are_no_clutter() -> None:
