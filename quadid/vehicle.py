@@ -11,8 +11,8 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from quadid.effects import EFFECTS
-from quadid.errors import VehicleError, nearest
+from quadid.effects import EFFECTS, known_keys, rotor_losses
+from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.plain import LONGEST_NAME
 
@@ -23,6 +23,7 @@ STAND_ERROR = 0.02
 """Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
 DEFAULT_BOUND_FACTOR = 4.0
 """A bare initial guess may be wrong by this factor each way."""
+MOST_ROTORS = 16
 
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -149,7 +150,7 @@ class Vehicle(_Strict):
     mass_sigma: Spread = 0.0
     arm_sigma: Spread = 0.0
     thrust_stand: tuple[ThrustPoint, ...] = ()
-    rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=16)
+    rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=MOST_ROTORS)
     command: Command = Command()
     parameters: dict[str, ParameterPrior]
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
@@ -177,7 +178,7 @@ class Vehicle(_Strict):
         for name, numbers in (value or {}).items():
             if name not in EFFECTS:
                 raise ValueError(f"unknown effect '{name}'; {nearest(str(name), EFFECTS)}")
-            known = [p.name for p in EFFECTS[name].parameters]
+            known = known_keys(name, MOST_ROTORS)
             if not isinstance(numbers, dict):
                 raise ValueError(f"effect '{name}' needs its parameters, for example {{{known[0]}: ...}}")
             for key, number in numbers.items():
@@ -189,6 +190,10 @@ class Vehicle(_Strict):
 
     @model_validator(mode="after")
     def _physical(self) -> Vehicle:
+        try:
+            rotor_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
+        except ParameterError as error:
+            raise ValueError(str(error)) from error
         diagonal = [self.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")]
         why = impossible_inertia(diagonal)
         if why:

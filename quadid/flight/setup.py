@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS
+from quadid.effects import EFFECTS, known_keys, rotor_losses
 from quadid.errors import ParameterError, nearest
 from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.loop import NO_TIME, Events, OnBoard
@@ -40,20 +40,19 @@ def check_effects(effects: Effects, rotors: int) -> dict[str, dict[str, float]]:
     for name, given in effects.items():
         if name not in EFFECTS:
             raise ParameterError(f"unknown effect '{name}'", fix=nearest(name, EFFECTS))
-        known = [p.name for p in EFFECTS[name].parameters]
+        known = known_keys(name, rotors)
         for key, value in given.items():
             if key not in known:
                 raise ParameterError(f"effect '{name}' has no parameter '{key}'", ", ".join(known), nearest(key, known))
             if np.isnan(value):
                 raise ParameterError(f"{name}.{key} is not a number", "a number")
-        values = {p.name: float(given.get(p.name, p.neutral)) for p in EFFECTS[name].parameters}
-        for p in EFFECTS[name].parameters:
-            if values[p.name] != p.neutral and not p.lower <= values[p.name] <= p.upper:
-                raise ParameterError(f"{name}.{p.name} = {values[p.name]:g} {p.unit}", f"{p.lower:g} to {p.upper:g}")
+        values = {p.name: p.neutral for p in EFFECTS[name].parameters} | {k: float(v) for k, v in given.items()}
+        for key, value in values.items():
+            p = EFFECTS[name].parameter("loss" if key.startswith("loss_") else key)
+            if value != p.neutral and not p.lower <= value <= p.upper:
+                raise ParameterError(f"{name}.{key} = {value:g} {p.unit}", f"{p.lower:g} to {p.upper:g}")
         complete[name] = values
-    rotor = complete.get("weak_rotor", {}).get("rotor", 0.0)
-    if rotor != int(rotor) or rotor > rotors:
-        raise ParameterError(f"weak_rotor.rotor = {rotor:g}", f"a whole number from 1 to {rotors}")
+    rotor_losses(complete.get("weak_rotor", {}), rotors)
     return complete
 
 
@@ -209,10 +208,8 @@ def prepare(
     n = len(vehicle.rotors)
     complete = check_effects(effects, n)
     value = _Lookup(complete)
-    efficiency = np.ones((n, 2))
-    weak = int(value("weak_rotor", "rotor"))
-    if weak > 0:
-        efficiency[weak - 1] = 1.0 - value("weak_rotor", "loss")
+    losses = rotor_losses(complete.get("weak_rotor", {}), n)
+    efficiency = np.repeat(1.0 - np.array(losses)[:, None], 2, axis=1)
     mounting = small_rotation(value.vector("imu_misalignment", "x y z"))
     on_board = OnBoard(
         gyro_matrix=np.ascontiguousarray(np.diag(1.0 + value.vector("gyro_scale", "x y z")) @ mounting),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS
+from quadid.effects import EFFECTS, rotor_losses
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.vehicle import Vehicle
@@ -147,10 +147,7 @@ class Layout:
         """Writes effects, as in a vehicle file, into `theta` in place; missing numbers stay neutral."""
         for name, numbers in effects.items():
             if name == "weak_rotor":
-                rotor = int(numbers.get("rotor", 1))
-                if not 1 <= rotor <= self.rotors:
-                    raise ParameterError(f"weak_rotor: rotor {rotor}", f"1 to {self.rotors}")
-                theta[LOSS + rotor - 1] = numbers.get("loss", 0.0)
+                theta[LOSS : LOSS + self.rotors] = rotor_losses(numbers, self.rotors)
             elif name == "imu_lag":
                 cutoff = numbers.get("cutoff", math.inf)
                 if not cutoff > 0.0:
@@ -161,9 +158,11 @@ class Layout:
                     theta[self.entry(f"{name}.{key}").index] = min(value, NEVER)
 
     def read_effect(self, theta: FloatArray, name: str) -> dict[str, float]:
-        """Reads one effect back in the vehicle file's form (cutoff in Hz, rotor number from 1)."""
+        """Reads one effect back in the vehicle file's form (cutoff in Hz, rotors numbered from 1)."""
         if name == "weak_rotor":
             losses = theta[LOSS : LOSS + self.rotors]
+            if np.count_nonzero(losses) > 1:
+                return {f"loss_{i + 1}": float(losses[i]) for i in np.flatnonzero(losses)}
             rotor = int(np.argmax(np.abs(losses)))
             return {"rotor": rotor + 1, "loss": float(losses[rotor])}
         if name == "imu_lag":

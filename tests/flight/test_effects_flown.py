@@ -73,6 +73,8 @@ def test_wrong_effects_are_named() -> None:
         check_effects({"motor_lag": {"taw": 0.1}}, 4)
     with pytest.raises(ParameterError, match="1 to 4"):
         check_effects({"weak_rotor": {"rotor": 5.0, "loss": 0.1}}, 4)
+    with pytest.raises(ParameterError, match="weak_rotor.loss_2 = 0.9 ; allowed: -0.6 to 0.6"):
+        check_effects({"weak_rotor": {"loss_2": 0.9}}, 4)
     with pytest.raises(ParameterError, match="0 to 0.3"):
         check_effects({"motor_lag": {"tau": 3.0}}, 4)
 
@@ -120,6 +122,12 @@ def test_weak_rotor_one_of_the_pelican_is_the_rear_one() -> None:
     lost = 0.1 * p.b * HOVER**2
     np.testing.assert_allclose(got[2], lost / p.mass, rtol=1e-12)
     np.testing.assert_allclose(got[3:], [0.0, 0.21 * lost / p.J_yy, 0.1 * p.d * HOVER**2 / p.J_zz], atol=1e-9)
+
+
+def test_several_weak_rotors_add_up() -> None:
+    first, third = (acceleration({"weak_rotor": {"rotor": n, "loss": 0.1}}) for n in (1.0, 3.0))
+    both, none = acceleration({"weak_rotor": {"loss_1": 0.1, "loss_3": 0.1}}), acceleration({})
+    np.testing.assert_allclose(both - none, first + third - 2.0 * none, atol=1e-9)
 
 
 def test_cg_ahead_of_the_centre_drops_the_nose() -> None:

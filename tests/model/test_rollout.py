@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from quadid.errors import WindowError
+from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments, shared_rollout
@@ -148,6 +148,34 @@ def test_layout_reads_and_writes_vehicle_files() -> None:
     for name, numbers in effects.items():
         assert layout.read_effect(theta, name) == pytest.approx(numbers)
     assert layout.read_effect(layout.neutral(), "imu_lag") == {"cutoff": np.inf}
+
+
+def test_several_weak_rotors_are_kept() -> None:
+    layout = Layout(VEHICLE)
+    losses = {"loss_2": 0.05, "loss_3": -0.02}
+    theta = layout.neutral()
+    layout.write_effects(theta, {"weak_rotor": losses})
+    assert theta[[ix.LOSS, ix.LOSS + 1, ix.LOSS + 2, ix.LOSS + 3]].tolist() == [0.0, 0.05, -0.02, 0.0]
+    assert layout.read_effect(theta, "weak_rotor") == losses
+    file = VEHICLE.model_copy(update={"effects": {"weak_rotor": losses}}).to_yaml()
+    assert np.array_equal(layout.initial(Vehicle.from_yaml(file))[ix.LOSS :][:4], theta[ix.LOSS :][:4])
+
+
+@pytest.mark.parametrize(
+    ("numbers", "reason"),
+    [
+        ({"rotor": 5, "loss": 0.1}, "rotor 5; allowed: a whole number from 1 to 4"),
+        ({"rotor": 1.5, "loss": 0.1}, "rotor 1.5"),
+        ({"loss": 0.1}, "rotor 0"),
+        ({"loss_5": 0.1}, "loss_5"),
+        ({"rotor": 2, "loss": 0.1, "loss_3": 0.1}, "rotor 2 beside loss_3"),
+        ({"loss_x": 0.1}, "no parameter 'loss_x'"),
+    ],
+)
+def test_weak_rotors_that_are_not_there_are_refused(numbers: dict[str, float], reason: str) -> None:
+    text = VEHICLE.model_copy(update={"effects": {"weak_rotor": numbers}}).to_yaml()
+    with pytest.raises(VehicleError, match=reason):
+        Vehicle.from_yaml(text)
 
 
 def test_a_second_start_compiles_nothing() -> None:

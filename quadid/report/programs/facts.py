@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.effects import rotor_losses
 from quadid.parameters import NOMINAL_UNITS
 from quadid.plain import LONGEST_LINE, plain
 from quadid.vehicle import GRAVITY, Vehicle
@@ -63,11 +64,8 @@ class Facts:
     @cached_property
     def thrust(self) -> FloatArray:
         """Thrust coefficient of every rotor [N s^2/rad^2], shape (rotors,)."""
-        b = np.full(len(self.vehicle.rotors), self.value("b"))
-        weak = int(self.effect("weak_rotor", "rotor"))
-        if weak > 0:
-            b[weak - 1] *= 1.0 - self.effect("weak_rotor", "loss")
-        return b
+        losses = rotor_losses(self.vehicle.effects.get("weak_rotor", {}), len(self.vehicle.rotors))
+        return self.value("b") * (1.0 - np.array(losses))
 
     @property
     def torque_per_thrust(self) -> float:
