@@ -17,13 +17,13 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import numpy as np
 from quadid_cli.identify import GRID
 from quadid_cli.loading import load_logs, load_vehicle
 
 from quadid.diagnose import Diagnosis, Workings, diagnose
 from quadid.errors import QuadidError
-from quadid.identify.horizon import QUANTITIES, horizon_scores
+from quadid.identify.horizon import horizon_scores
+from quadid.identify.open_loop import QUANTITIES, no_change
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -197,7 +197,7 @@ def scores(found: Diagnosis, vehicle: Vehicle, names: Sequence[str], data: Path)
     shares = []
     for name in names:
         (log,) = load_logs([str(data / name)], vehicle, None)
-        still = {h: no_change(log.windows, h) for h in HORIZONS}
+        still = {h: list(no_change(log.windows, vehicle, h).values()) for h in HORIZONS}
         rows += [_score_row(Path(name).stem, "no change", h, still[h]) for h in HORIZONS]
         for label, model in models:
             pooled, _ = horizon_scores([log.windows], model, Layout(model).initial(model), HORIZONS)
@@ -209,21 +209,6 @@ def scores(found: Diagnosis, vehicle: Vehicle, names: Sequence[str], data: Path)
 
 def _score_row(flight: str, model: str, horizon: int, errors: Sequence[float]) -> str:
     return f"| {flight} | {model} | {horizon} | " + " | ".join(f"{e:.4f}" for e in errors) + " |"
-
-
-def no_change(flight: Sequence[Window], horizon: int) -> list[float]:
-    """Mean error of assuming that nothing changes for `horizon` samples, by quantity; measured states needed."""
-    errors: list[list[float]] = [[] for _ in QUANTITIES]
-    for w in flight:
-        assert w.position is not None
-        assert w.velocity is not None
-        assert w.attitude is not None
-        assert w.gyro is not None
-        for kept, x in zip((0, 1, 3), (w.position, w.velocity, w.gyro), strict=True):
-            errors[kept] += np.linalg.norm(x[horizon:] - x[:-horizon], axis=1).tolist()
-        cosine = np.abs(np.sum(w.attitude[horizon:] * w.attitude[:-horizon], axis=1))
-        errors[2] += (2.0 * np.arccos(np.minimum(cosine, 1.0))).tolist()
-    return [float(np.nanmean(e)) for e in errors]
 
 
 PUBLISHED = {

@@ -96,7 +96,7 @@ def print_horizons(console: Console, result: JsonDict) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from quadid.identify.horizon import QUANTITIES
+    from quadid.identify.open_loop import QUANTITIES
 
     table = Table(title=f"Open-loop prediction error of '{result['vehicle']}', mean over {result['samples']} starts")
     table.add_column("log")

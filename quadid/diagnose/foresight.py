@@ -2,27 +2,28 @@
 
 Where much stays unexplained, the most likely parameters of the findings are those of the fastest motion, which the
 model follows best, and a simulation half a second ahead may be worse than none.  Who needs a prediction all the same is
-better served by effects of the catalogue as stand-ins for what is not known, fitted on segments as long as the
-prediction, with all that is left counted as noise, flight by flight.  Such numbers are no physics, and no findings.
+better served by effects of the catalogue as stand-ins for what is not known, fitted to miss by as little as possible up
+to half a second ahead (`identify.ahead`).  Such numbers are no physics, and no findings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.models import Model, as_model
+from quadid.diagnose.models import Model
+from quadid.diagnose.vehicle_file import Fitted
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
+from quadid.identify.ahead import fit_ahead
 from quadid.identify.floor import FLEXIBLE_DRAG
+from quadid.identify.free import Free
 from quadid.identify.horizon import horizon_scores
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import Polished, polish
-from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.shooting import Shooting
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -36,19 +37,12 @@ STAND_INS = (
 """Effects that may stand for forces and moments nobody has named."""
 POOR = 2.0
 """Deviance per row above which an unexplained flight is predicted poorly enough to refit."""
-LENGTHS = (0.2, 0.4, 0.7)
-"""Segments [s], short ones first: on them even a poor start is nearly linear."""
-MOST_SEGMENTS = 500
-"""Of longer logs every n-th segment."""
-ROUNDS = 2
-"""Fits on each length; after each the noise of every flight is what the fit left of it."""
-ITERATIONS = 4
 AHEAD = 0.5
 """How far ahead [s] predictions are judged."""
 BETTER = 0.9
 """The refitted parameters are kept when their error is below this share of that of the findings' own."""
-_EXPECTED = np.array([0.3] * 3 + [0.05] * 3 + [1.0] * 3 + [0.1] * 3 + [0.03] * 3)
-"""What such a prediction typically misses by: rad/s, rad, m/s^2, m/s, m."""
+FREER = 20.0
+"""Factor each way that nominal parameters may lie from their guess, where the vehicle file gives no bounds."""
 MOTIONLESS = (
     "gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment", "imu_lever_arm", "imu_lag", "attitude_delay",
     "ahrs_acceleration_error",
@@ -61,15 +55,14 @@ class Foresight:
     """Model refitted to predict.
 
     Attributes:
-        model, shooting: the refitted model and the problem it was fitted on.
+        fitted: what was refitted to predict, stand-ins included.
         stand_ins: effects in it that are not findings.
         on: ``validation logs`` or ``training logs``, where the errors were taken.
         diagnosed: mean error after `AHEAD` of the findings' own parameters, by quantity.
         refitted: likewise of the refitted ones.
     """
 
-    model: Model
-    shooting: Shooting
+    fitted: Fitted
     stand_ins: tuple[str, ...]
     on: str
     diagnosed: dict[str, float]
@@ -99,7 +92,7 @@ def refit_to_predict(
 ) -> Foresight | None:  # fmt: skip
     """Refits nominal parameters and stand-ins for prediction; None where that predicts no better.
 
-    Which length of segments serves best is decided on `windows`; `validation` only measures.
+    Whether it does is decided on `windows`; `validation` only measures.
 
     Args:
         windows: training flights.
@@ -110,25 +103,30 @@ def refit_to_predict(
         validation: unseen flights, or none.
     """
     causes = _causes(found, listed)
-    best, least = None, np.log(BETTER)
+    free = _freer(vehicle, decisive.free([*NOMINAL_NAMES, *(n for c in causes if _moves(c) for n in c.names)]))
     try:
-        before = _errors(windows, vehicle, found.theta)
-        for fitted in _stages(windows, vehicle, decisive, causes, _start(vehicle, decisive, found)):
-            ratio = _relative(_errors(windows, vehicle, fitted[1].theta), before)
-            if ratio < least:
-                best, least = fitted, ratio
-        if best is None:
+        ahead = fit_ahead(windows, vehicle, free, [found.theta, _start(vehicle, decisive, found)])
+        if _relative(*(_errors(windows, vehicle, theta) for theta in (ahead.theta, found.theta))) > np.log(BETTER):
             return None
         seen = list(validation) or windows
-        diagnosed, refitted = (_errors(seen, vehicle, theta) for theta in (found.theta, best[1].theta))
+        diagnosed, refitted = (_errors(seen, vehicle, theta) for theta in (found.theta, ahead.theta))
     except NotIdentifiableError:  # no run of that length fits into any flight
         return None
-    shooting, result, free = best
     named = {c.effect for c in found.causes}
+    sigma = (ahead.sigma * free.jacobian(ahead.theta)).tolist()
     return Foresight(
-        as_model(shooting, result, free, causes), shooting, tuple(e for e in STAND_INS if e not in named),
-        "validation logs" if validation else "training logs", diagnosed, refitted,
+        Fitted(ahead.theta, dict(zip(free.names, sigma, strict=True)), causes),
+        tuple(e for e in STAND_INS if e not in named), "validation logs" if validation else "training logs",
+        diagnosed, refitted,
     )  # fmt: skip
+
+
+def _freer(vehicle: Vehicle, free: Free) -> Free:
+    """Lets nominal parameters whose bounds are mere defaults stand in too: such an inertia is none any more."""
+    bounds = {n: (p.initial / FREER, p.initial * FREER) for n, p in vehicle.parameters.items() if p.bounds is None}
+    return Free(tuple(
+        replace(e, lower=bounds[e.name][0], upper=bounds[e.name][1]) if e.name in bounds else e for e in free.entries
+    ))  # fmt: skip
 
 
 def _causes(found: Model, listed: Sequence[Candidate]) -> tuple[Candidate, ...]:
@@ -137,10 +135,11 @@ def _causes(found: Model, listed: Sequence[Candidate]) -> tuple[Candidate, ...]:
 
 
 def _start(vehicle: Vehicle, decisive: Shooting, found: Model) -> FloatArray:
-    """Sensors as found; the motion as in the vehicle file, with some drag: the findings may lie in the wrong basin."""
+    """What is not refitted as found; the rest as in the vehicle file, with some drag: the findings may be far off."""
     out = decisive.layout.initial(vehicle)
-    sensors = decisive.free([n for c in found.causes if not _moves(c) for n in c.names]).index
-    out[sensors] = found.theta[sensors]
+    kept = [c for c in found.causes if not _moves(c)]
+    places = [*decisive.free([n for c in kept for n in c.names]).index, *(c.timed for c in kept if c.timed is not None)]
+    out[places] = found.theta[places]
     out[decisive.free(["rotor_drag.k_x", "rotor_drag.k_y"]).index] = FLEXIBLE_DRAG
     return out
 
@@ -148,46 +147,6 @@ def _start(vehicle: Vehicle, decisive: Shooting, found: Model) -> FloatArray:
 def _moves(cause: Candidate) -> bool:
     """Whether a cause is refitted: it acts on the motion, all the time, and is the same in every flight."""
     return cause.effect not in MOTIONLESS and cause.timed is None and not EFFECTS[cause.effect].per_log
-
-
-def _stages(
-    windows: Sequence[Window], vehicle: Vehicle, decisive: Shooting, causes: Sequence[Candidate], start: FloatArray
-) -> Iterator[tuple[Shooting, Polished, Free]]:
-    """Yields problem, polish and free parameters of each length, each begun where the one before ended."""
-    names = [n for c in causes if _moves(c) for n in c.names]
-    sigma: FloatArray | None = None
-    for seconds in LENGTHS:
-        shooting = Shooting(windows, vehicle, seconds, None, decisive.layout)
-        shooting = shooting.thinned(max(shooting.count // MOST_SEGMENTS, 1))
-        free = shooting.free([*NOMINAL_NAMES, *names])
-        for _ in range(ROUNDS):
-            _weigh(shooting, sigma)
-            result = polish(shooting, start, free, iterations=ITERATIONS)
-            sigma, start = _left(result.lin, len(shooting.rollouts)), result.theta
-        yield shooting, result, free
-
-
-def _weigh(shooting: Shooting, sigma: FloatArray | None) -> None:
-    """Counts `sigma`, shape (windows, channels), as the noise of each flight; None: the same for all."""
-    noise = _EXPECTED[: shooting.channels] if sigma is None else np.exp(np.mean(np.log(sigma), axis=0))
-    shooting.noise = NoiseModel(noise, np.zeros(shooting.channels))
-    if sigma is not None:
-        shooting.robust = [
-            np.broadcast_to(noise / own, (len(s.starts), s.length, shooting.channels)).copy()
-            for own, s in zip(sigma, shooting.segments, strict=True)
-        ]
-
-
-def _left(lin: Linearised, windows: int) -> FloatArray:
-    """Root mean square residual of each flight and channel; where nothing was measured, what is typical."""
-    out = np.tile(_EXPECTED[: lin.residuals.shape[2]], (windows, 1))
-    for i in range(windows):
-        used = lin.weights[lin.window == i] > 0.0
-        square = np.where(used, lin.residuals[lin.window == i], 0.0) ** 2
-        count = used.sum(axis=(0, 1))
-        mean = square.sum(axis=(0, 1)) / np.maximum(count, 1)
-        out[i] = np.where((count > 0) & (mean > 0.0), np.sqrt(mean), out[i])
-    return out
 
 
 def _errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray) -> dict[str, float]:

@@ -21,7 +21,7 @@ from quadid.diagnose.remainder import Remainder, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.search import Search, select
 from quadid.diagnose.validation import validate
-from quadid.diagnose.vehicle_file import extended_vehicle
+from quadid.diagnose.vehicle_file import Fitted, extended_vehicle
 from quadid.diagnose.whole_rest import with_look_alike
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
 from quadid.identify.floor import flexible_fit, noise_floor, residual_noise
@@ -111,8 +111,8 @@ def diagnose(
     if verdict is Verdict.UNKNOWN and search.model.misfit > POOR:
         report("prediction", 0.0)
         foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
-    fitted = (decisive, search.model) if foresight is None else (foresight.shooting, foresight.model)
-    text = extended_vehicle(vehicle, *fitted)
+    fitted = Fitted.of(search.model) if foresight is None else foresight.fitted
+    text = extended_vehicle(vehicle, decisive.layout, fitted)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
     warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *([foresight.sentence] if foresight else []))

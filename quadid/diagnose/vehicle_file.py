@@ -3,28 +3,52 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
-from quadid.identify.shooting import Shooting
 from quadid.identify.uncertainty import uncertainty
+from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 
 
-def extended_vehicle(vehicle: Vehicle, shooting: Shooting, model: Model) -> str:
-    """Returns the YAML of `vehicle` with fitted parameters (with sigma) and the effects of `model`."""
-    unc = uncertainty(model.lin, model.free, model.prior, model.theta)
-    sigma = dict(zip(model.free.names, unc.sigma * model.free.jacobian(model.theta), strict=True))
+@dataclass(frozen=True)
+class Fitted:
+    """What goes into the file.
+
+    Attributes:
+        theta: full vector.
+        sigma: standard deviation of each fitted entry, in its own unit.
+        causes: whose effects it holds.
+    """
+
+    theta: NDArray[np.float64]
+    sigma: dict[str, float]
+    causes: tuple[Candidate, ...]
+
+    @classmethod
+    def of(cls, model: Model) -> Fitted:
+        """The parameters of a model, with the deviations that its data tell."""
+        sigma = uncertainty(model.lin, model.free, model.prior, model.theta).sigma * model.free.jacobian(model.theta)
+        return cls(model.theta, dict(zip(model.free.names, sigma.tolist(), strict=True)), model.causes)
+
+
+def extended_vehicle(vehicle: Vehicle, layout: Layout, fitted: Fitted) -> str:
+    """Returns the YAML of `vehicle` with fitted parameters (with sigma) and effects."""
     priors = {}
     for name in NOMINAL_NAMES:
-        value = float(model.theta[shooting.layout.entry(name).index])
+        value = float(fitted.theta[layout.entry(name).index])
         low, high = vehicle.parameters[name].limits
         priors[name] = ParameterPrior(
-            initial=value, bounds=(min(low, value), max(high, value)), sigma=float(sigma[name])
+            initial=value, bounds=(min(low, value), max(high, value)), sigma=fitted.sigma[name]
         )
     effects = {k: dict(v) for k, v in vehicle.effects.items()}
-    for cause in model.causes:
+    for cause in fitted.causes:
         effects[cause.effect] = {
-            k: v for k, v in shooting.layout.read_effect(model.theta, cause.effect).items() if math.isfinite(v)
+            k: v for k, v in layout.read_effect(fitted.theta, cause.effect).items() if math.isfinite(v)
         }
     return vehicle.model_copy(update={"parameters": priors, "effects": effects}).to_yaml()

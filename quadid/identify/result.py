@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from quadid.identify.fit import Fit
-from quadid.identify.horizon import QUANTITIES, HorizonScore
+from quadid.identify.horizon import HorizonScore
+from quadid.identify.open_loop import QUANTITIES
 from quadid.identify.score import SetScore
 from quadid.identify.uncertainty import Z95
 from quadid.model.layout import Layout

@@ -1,0 +1,197 @@
+"""Open-loop runs of the simulation, each from a measured state, driven by the logged rotor speeds.
+
+Rotor speeds are held over each sample; runs never cross a gap.  Rates are compared as the gyro would read them: bias,
+scale and misalignment of the model are taken off the measured rate at the start and put on the predicted one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.model import layout as ix
+from quadid.model.kernel import LANES, N_STATE
+from quadid.model.rollout import Rollout, Segments
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}
+"""What is predicted, with units."""
+_PLACES = (12, 9, 3, 0)
+"""First of the three residual channels of each quantity."""
+_CHUNK = 256
+"""Runs rolled at once; keeps the residuals of a chunk in cache."""
+
+
+class OpenLoop:
+    """Runs of one window, from every n-th row with a measured rate.
+
+    Attributes:
+        window: the data.
+        longest: samples of a run.
+        rows: where runs start, shape (starts,).
+    """
+
+    def __init__(self, window: Window, vehicle: Vehicle, longest: int, every: int = 1) -> None:
+        """Finds the starts; raises WindowError when rotor columns do not match the vehicle."""
+        self.window, self.longest = window, longest
+        self._known = _finite(window)
+        self._rollout = Rollout(_padded(window), vehicle)
+        self.rows = np.flatnonzero(self._known["gyro"][: max(len(window) - longest, 0)])[::every]
+
+    def runs(self, theta: FloatArray) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
+        """Yields rows of starts and residuals predicted - measured, shape (vectors, rows, longest, channels), in turns.
+
+        Args:
+            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the gyro of the first
+                tells.
+        """
+        states = initial_states(self.window, theta[0], self._known)
+        step = max(_CHUNK // len(theta), LANES)
+        for first in range(0, len(self.rows), step):
+            rows = self.rows[first : first + step]
+            segments = Segments(self.longest, 1, (rows + 1).astype(np.int64))
+            blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
+            yield rows, np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
+
+    def counted(self, rows: NDArray[np.intp], at: NDArray[np.intp]) -> Mask:
+        """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
+
+        A quantity counts where it was measured at the target and the start was known well enough: a velocity needs
+        attitude and velocity at the start, a position its own start too.
+        """
+        attitude = self._known["attitude"][rows]
+        velocity = attitude & self._known["velocity"][rows]
+        position = velocity & self._known["position"][rows]
+        starts = (position, velocity, attitude, self._known["gyro"][rows])
+        valid, target = self._rollout.valid, rows[:, None] + at
+        out = np.zeros((*target.shape, 4), dtype=bool)
+        for i, (place, started) in enumerate(zip(_PLACES, starts, strict=True)):
+            if place < valid.shape[1]:
+                out[..., i] = valid[:, place][target] & started[:, None]
+        return out
+
+    def misses(self, theta: FloatArray, at: NDArray[np.intp]) -> FloatArray:
+        """Predicted - measured of each quantity `at` samples after every start, shape (vectors, starts, at, 4, 3).
+
+        A rotation is its axis times twice the sine of half its angle.  What is not measured is NaN, what ran away
+        infinite.
+
+        Args:
+            theta: full parameter vectors, shape (vectors, size), as in `runs`.
+            at: samples after the start, 1 to `longest`.
+        """
+        parts = [np.full((len(theta), 0, len(at), 4, 3), np.nan)]
+        for rows, residual in self.runs(theta):
+            part = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
+            ran = np.nan_to_num(part, nan=np.inf, posinf=np.inf, neginf=np.inf)
+            parts.append(np.where(self.counted(rows, at)[..., None], ran, np.nan))
+        return np.concatenate(parts, axis=1)
+
+    def no_change(self, at: NDArray[np.intp]) -> FloatArray:
+        """Errors of predicting that nothing changes, shape (starts, at, 4); NaN for what is not measured."""
+        target = self.rows[:, None] + at
+        out = np.full((*target.shape, 4), np.nan)
+        w = self.window
+        for i, values in ((0, w.position), (1, w.velocity), (3, w.gyro)):
+            if values is not None:
+                out[..., i] = np.linalg.norm(values[target] - values[self.rows][:, None], axis=2)
+        if w.attitude is not None:
+            cosine = np.abs(np.sum(w.attitude[target] * w.attitude[self.rows][:, None], axis=2))
+            out[..., 2] = 2.0 * np.arccos(np.minimum(cosine, 1.0))
+        return np.where(self.counted(self.rows, at), out, np.nan)
+
+
+def lengths(residual: FloatArray) -> FloatArray:
+    """Errors of the four quantities out of residuals (..., channels): Euclidean, the rotation's as its angle; (..., 4).
+
+    What the log lacks is zero.
+    """
+    out = np.stack([np.linalg.norm(_three(residual, place), axis=-1) for place in _PLACES], axis=-1)
+    out[..., 2] = 2.0 * np.arcsin(np.minimum(0.5 * out[..., 2], 1.0))
+    return out
+
+
+def _three(residual: FloatArray, place: int) -> FloatArray:
+    """Three channels of a residual from `place` on; zeros where it has none."""
+    if place < residual.shape[-1]:
+        return residual[..., place : place + 3]
+    return np.zeros((*residual.shape[:-1], 3))
+
+
+def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict[str, float]:
+    """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack."""
+    at = np.array([samples])
+    parts = [OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows]
+    errors = np.concatenate(parts) if parts else np.zeros((0, 4))
+    return dict(zip(QUANTITIES, mean_of_known(errors).tolist(), strict=True))
+
+
+def mean_of_known(errors: FloatArray) -> FloatArray:
+    """Mean over the first axis of what is not NaN; NaN where nothing is."""
+    known = ~np.isnan(errors)
+    total, count = np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
+    mean: FloatArray = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return mean
+
+
+def _padded(window: Window) -> Window:
+    """The window as held, with one more row, which the simulation rolls into but nothing is compared with."""
+
+    def extended(values: FloatArray | None, fill: float | None = np.nan) -> FloatArray | None:
+        if values is None:
+            return None
+        last = values[-1:] if fill is None else np.full_like(values[-1:], fill)
+        return np.concatenate([values, last])
+
+    rotor = extended(window.rotor_speed, None)
+    assert rotor is not None
+    return replace(
+        window,
+        rotor_speed=rotor,
+        gyro=extended(window.gyro),
+        attitude=extended(window.attitude),
+        accel=None,
+        velocity=extended(window.velocity),
+        position=extended(window.position),
+        battery=None,
+        attitude_reference=None,
+        sampling="held",
+    )
+
+
+def _finite(window: Window) -> dict[str, Mask]:
+    """Rows at which each channel was measured."""
+    out = {}
+    for name in ("gyro", "attitude", "velocity", "position"):
+        values = getattr(window, name)
+        out[name] = np.zeros(len(window), dtype=bool) if values is None else np.isfinite(values).all(axis=1)
+    return out
+
+
+def initial_states(window: Window, theta: FloatArray, known: dict[str, Mask]) -> FloatArray:
+    """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown."""
+    x = np.zeros((len(window), N_STATE))
+    x[:, 0] = 1.0
+    for name, place in (("attitude", 0), ("velocity", 7), ("position", 10)):
+        values = getattr(window, name)
+        if values is not None:
+            x[known[name], place : place + values.shape[1]] = values[known[name]]
+    if window.gyro is not None:
+        x[known["gyro"], 4:7] = true_rate(window.gyro[known["gyro"]], theta)
+    return x
+
+
+def true_rate(measured: FloatArray, theta: FloatArray) -> FloatArray:
+    """Undoes the model's gyro: measured = (1 + s) exp([m]x) rate + bias, element by element in s; shapes (n, 3)."""
+    m = theta[[ix.MAX_, ix.MAY, ix.MAZ]]
+    cross = np.array([[0.0, -m[2], m[1]], [m[2], 0.0, -m[0]], [-m[1], m[0], 0.0]])
+    mounting = np.eye(3) + cross + 0.5 * cross @ cross  # to second order, as the kernel has it
+    sensor = (measured - theta[[ix.GBX, ix.GBY, ix.GBZ]]) / (1.0 + theta[[ix.GSX, ix.GSY, ix.GSZ]])
+    return np.asarray(np.linalg.solve(mounting, sensor.T).T)
