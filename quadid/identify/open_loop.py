@@ -1,7 +1,8 @@
 """Open-loop runs of the simulation, each from a measured state, driven by the logged rotor speeds.
 
 Rotor speeds are held over each sample; runs never cross a gap.  Rates are compared as the gyro would read them: bias,
-scale and misalignment of the model are taken off the measured rate at the start and put on the predicted one.
+scale and misalignment of the model are taken off the measured rate at the start and put on the predicted one; a delay
+of the attitude likewise.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.initial_states import retract
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES, N_STATE
 from quadid.model.rollout import Rollout, Segments
@@ -176,7 +178,10 @@ def _finite(window: Window) -> dict[str, Mask]:
 
 
 def initial_states(window: Window, theta: FloatArray, known: dict[str, Mask]) -> FloatArray:
-    """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown."""
+    """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown.
+
+    The model's gyro is undone, and an attitude that is late by the model is turned on by the rate.
+    """
     x = np.zeros((len(window), N_STATE))
     x[:, 0] = 1.0
     for name, place in (("attitude", 0), ("velocity", 7), ("position", 10)):
@@ -185,7 +190,21 @@ def initial_states(window: Window, theta: FloatArray, known: dict[str, Mask]) ->
             x[known[name], place : place + values.shape[1]] = values[known[name]]
     if window.gyro is not None:
         x[known["gyro"], 4:7] = true_rate(window.gyro[known["gyro"]], theta)
+        delay = float(theta[ix.ATT_DELAY])
+        if delay:
+            late = known["gyro"] & known["attitude"]
+            x[late] = retract(x[late], delay * _rate_before(x, known["gyro"], late, 0.5 * delay / window.dt))
     return x
+
+
+def _rate_before(x: FloatArray, known: Mask, rows: Mask, samples: float) -> FloatArray:
+    """Rates `samples` before some rows, between two measured ones; where one of those is missing, the row's own."""
+    at = np.maximum(np.flatnonzero(rows) - samples, 0.0)
+    first = at.astype(int)
+    second = np.minimum(first + 1, len(x) - 1)
+    share = (at - first)[:, None]
+    between = (1.0 - share) * x[first, 4:7] + share * x[second, 4:7]
+    return np.where((known[first] & known[second])[:, None], between, x[rows, 4:7])
 
 
 def true_rate(measured: FloatArray, theta: FloatArray) -> FloatArray:

@@ -116,6 +116,17 @@ def test_gyro_errors_of_the_model_are_undone_at_the_start() -> None:
     np.testing.assert_allclose(true_rate(quiet.window.gyro, theta), quiet.truth.rates, atol=2e-4)
 
 
+def test_a_late_attitude_of_the_model_is_turned_on_at_the_start() -> None:
+    effects = {"attitude_delay": {"delay": 0.05}}
+    quiet = fly(PELICAN, seconds=20.0, seed=34, noise_scale=0.0, effects=effects, extras=("velocity", "position"))
+    theta = true_theta(quiet)
+    ignored, _ = horizon_scores([[quiet.window]], PELICAN, theta)
+    Layout(PELICAN).write_effects(theta, effects)
+    known, _ = horizon_scores([[quiet.window]], PELICAN, theta)
+    for samples in (10, 50):
+        assert known.at(samples)["rotation"] < 0.1 * ignored.at(samples)["rotation"]
+
+
 def test_windows_and_files_pool_by_starts(flight: Flight) -> None:
     w = flight.window
     parts = [[w.slice(0, 300), w.slice(400, 500)], [w.slice(600, 1200)], [w.slice(0, 40)]]
