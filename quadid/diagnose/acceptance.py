@@ -87,6 +87,11 @@ def choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
     return best
 
 
+def doubtful(model: Model, tests: int) -> bool:
+    """Whether a cause of `model` has numbers that chance alone would bring."""
+    return any(survival(model.wald(c), len(c.names)) * tests > FALSE_ALARM for c in model.causes)
+
+
 def prune(shooting: Shooting, model: Model, newest: Candidate | None, nominal: Model, tests: int) -> Model:
     """Drops causes that the newest one, or a better noise model, made superfluous."""
     for cause in [c for c in model.causes if newest is None or c.label != newest.label]:

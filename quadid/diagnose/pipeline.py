@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.diagnose.acceptance import doubtful, prune
 from quadid.diagnose.backward import eliminate
 from quadid.diagnose.belief import beyond_belief
 from quadid.diagnose.candidates import Candidate, candidates
@@ -188,6 +189,9 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Searc
             break
         again = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
+    if doubtful(search.model, search.tests):
+        # Refitted on longer segments or under less noise, a cause may be nothing any more.
+        search = replace(search, model=prune(search.shooting, search.model, None, search.nominal, search.tests))
     return search
 
 

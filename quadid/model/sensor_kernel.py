@@ -148,7 +148,8 @@ def step_tilt_error(dt: float, s: FloatArray) -> None:
 
     The filter adds k n x d to its body rate, n being down as the accelerometer sees it and d as the filter does
     (Mahony, Hamel & Pflimlin 2008, doi:10.1109/TAC.2008.923738).  Seen from the world, where its own turning drops
-    out, the error turns by that, taken at the middle of the step, where the mean of the step's force belongs.
+    out, the error turns by that, taken at the middle of the step, where the mean of the step's force belongs.  As the
+    pull fades while it turns, it turns by 1 - exp(-k dt), here to second order, instead of k dt.
     """
     lane_kernel()
     for lane in range(LANES):
@@ -161,7 +162,8 @@ def step_tilt_error(dt: float, s: FloatArray) -> None:
         nx = -0.5 * (s[F1_X + lane] + s[F2_X + lane])
         ny = -0.5 * (s[F1_X + Y1 + lane] + s[F2_X + Y1 + lane])
         nz = -0.5 * (s[F1_X + Y2 + lane] + s[F2_X + Y2 + lane])
-        k = dt * s[C_AHRS + lane] / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-9)
+        k = dt * s[C_AHRS + lane]
+        k = k * (1.0 - 0.5 * k) / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-9)
         x, y, z = k * (ny * dz - nz * dy), k * (nz * dx - nx * dz), k * (nx * dy - ny * dx)
         a, b, c = 2.0 * (q2 * z - q3 * y), 2.0 * (q3 * x - q1 * z), 2.0 * (q1 * y - q2 * x)
         x, y, z = x + q0 * a + q2 * c - q3 * b, y + q0 * b + q3 * a - q1 * c, z + q0 * c + q1 * b - q2 * a

@@ -116,7 +116,7 @@ def test_small_misalignments_are_smooth() -> None:
     assert np.abs(below - above).max() < 1e-9
 
 
-@pytest.mark.parametrize(("k", "share"), [(0.3, 2e-3), (2.0, 1e-2)])
+@pytest.mark.parametrize(("k", "share"), [(0.3, 3e-4), (2.0, 5e-4)])
 def test_ahrs_acceleration_error_is_a_complementary_filter(k: float, share: float) -> None:
     """Mahony's filter: q' = q (nu + k n x d) / 2, n = -f / |f|, d the filter's down; right at the first scored row."""
     t = flight().given.t
