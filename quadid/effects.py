@@ -149,6 +149,8 @@ def rotor_losses(numbers: Mapping[str, float], rotors: int) -> list[float]:
     absent = [key for key in several if key not in known_keys("weak_rotor", rotors)]
     if absent:
         raise ParameterError(f"weak_rotor: {absent[0]}", f"loss_1 to loss_{rotors}")
-    if rotor not in range(rotors + 1) or (loss and not rotor):
+    if loss and not rotor:
+        raise ParameterError(f"weak_rotor: loss {loss:g} of no rotor", "rotor beside it", f"say which, 1 to {rotors}")
+    if rotor not in range(rotors + 1):
         raise ParameterError(f"weak_rotor: rotor {rotor:g}", f"a whole number from 1 to {rotors}")
     return [numbers.get(f"loss_{i + 1}", loss if rotor == i + 1 else 0.0) for i in range(rotors)]

@@ -103,10 +103,10 @@ explains nearly as well. The file is refitted to predict: its inertias are no in
         """\
 With the chirp drag, its moment and inflow are found with the numbers of the flights without it. Beside the published
 models, as shares of "no change", all four errors on the random flight (0.13, 0.25, 0.50, 0.58) and on the chirp are
-better than those of every one of them. On the square flight, three to six times livelier, position and velocity are
-behind and rate is far ahead: what drives the fastest rotation was filtered out of these files after the fact, so half a
-second ahead the slow flights are predicted best as if rotors hardly turned the vehicle, and the square ones are not.
-The file has to choose; every run counts in shares of the motion of its own flight.""",
+better than those of every one of them. On the square flight, six to eight times livelier, only the rate is: what drives
+the fastest rotation was filtered out of these files after the fact, so half a second ahead the slow flights are
+predicted best as if rotors hardly turned the vehicle, and the square ones are not. The file has to choose; every run
+counts in shares of the motion of its own flight.""",
         scored=SCORED,
     ),
     Flights(
@@ -197,7 +197,7 @@ def scores(found: Diagnosis, vehicle: Vehicle, names: Sequence[str], data: Path)
     shares = []
     for name in names:
         (log,) = load_logs([str(data / name)], vehicle, None)
-        still = {h: list(no_change(log.windows, vehicle, h).values()) for h in HORIZONS}
+        still = {h: list(no_change(log.windows, vehicle, h, HORIZONS[-1]).values()) for h in HORIZONS}
         rows += [_score_row(Path(name).stem, "no change", h, still[h]) for h in HORIZONS]
         for label, model in models:
             pooled, _ = horizon_scores([log.windows], model, Layout(model).initial(model), HORIZONS)
@@ -249,8 +249,8 @@ def learnt_from(data: Path) -> str:
     still = {name: no_change(flight, vehicle, last) for name, flight in held.items()}
     out = [
         "## Nano-drone: which flights to learn from", "",
-        f"Every file is that of a diagnosis of the flights on the left. Errors after {last} samples of the flights on "
-        "the right,", "which none of them saw, as shares of those of no change: position, velocity, rotation, rate.", "",
+        f"Every file is that of a diagnosis of the flights on the left. Errors after {last} samples of the flights on",
+        "the right, which none of them saw, as shares of those of no change: position, velocity, rotation, rate.", "",
         "| diagnosed | verdict | " + " | ".join(held) + " |", "|---|---|" + "---|" * len(held),
     ]  # fmt: skip
     for names in LEARNT_FROM:
@@ -267,10 +267,10 @@ def learnt_from(data: Path) -> str:
 
 
 LEARNT_REMARK = """\
-On the random flight all four errors are smaller than those of every published model on its own (0.16, 0.38, 0.75, 0.68),
-whatever holds a random or a chirp flight was learnt from; on the chirp as well, but for position (0.17) from the first
-and fourth set and rotation (0.81) from the fourth. Square flights alone teach nothing about the others, and the others
-little about them."""
+On the random flight all four errors are smaller than those of every published model on its own (0.16, 0.38, 0.75,
+0.68), whatever holds a random or a chirp flight was learnt from; on the chirp as well, but for position (0.17) from the
+first and fourth set and rotation (0.81) from the fourth. Square flights alone teach nothing about the others, and the
+others little about them."""
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from quadid.chi_square import survival
@@ -87,14 +88,19 @@ def choose(trials: list[Trial], model: Model, nominal: Model) -> Trial | None:
     return best
 
 
-def doubtful(model: Model, tests: int) -> bool:
-    """Whether a cause of `model` has numbers that chance alone would bring."""
-    return any(survival(model.wald(c), len(c.names)) * tests > FALSE_ALARM for c in model.causes)
+def doubtful(model: Model, tests: int) -> list[Candidate]:
+    """Causes of `model` whose numbers chance alone would bring."""
+    return [c for c in model.causes if survival(model.wald(c), len(c.names)) * tests > FALSE_ALARM]
 
 
-def prune(shooting: Shooting, model: Model, newest: Candidate | None, nominal: Model, tests: int) -> Model:
-    """Drops causes that the newest one, or a better noise model, made superfluous."""
-    for cause in [c for c in model.causes if newest is None or c.label != newest.label]:
+def others(model: Model, newest: Candidate) -> list[Candidate]:
+    """Causes of `model` but the newest."""
+    return [c for c in model.causes if c.label != newest.label]
+
+
+def prune(shooting: Shooting, model: Model, suspects: Sequence[Candidate], nominal: Model, tests: int) -> Model:
+    """Drops those of the suspects that are superfluous; what another cause requires stays."""
+    for cause in suspects:
         if cause.label not in {c.label for c in model.causes} or any(c.requires == cause.effect for c in model.causes):
             continue
         rest = without(shooting, model, cause)

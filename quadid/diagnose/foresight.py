@@ -18,11 +18,10 @@ from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
 from quadid.diagnose.vehicle_file import Fitted
 from quadid.effects import EFFECTS
-from quadid.errors import NotIdentifiableError
 from quadid.identify.ahead import fit_ahead
 from quadid.identify.floor import FLEXIBLE_DRAG
 from quadid.identify.free import Free
-from quadid.identify.horizon import horizon_scores
+from quadid.identify.open_loop import mean_errors
 from quadid.identify.shooting import Shooting
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
@@ -48,6 +47,10 @@ MOTIONLESS = (
     "ahrs_acceleration_error",
 )  # fmt: skip
 """Effects that do not move the vehicle."""
+FORCES = (
+    "rotor_drag", "rotor_drag_moment", "parasitic_drag", "axial_inflow", "thrust_curve", "ground_effect",
+)  # fmt: skip
+"""Effects that runs tell only where velocity was measured."""
 
 
 @dataclass(frozen=True)
@@ -100,62 +103,71 @@ def refit_to_predict(
         decisive: problem on which `found` was fitted.
         found: the findings' model.
         listed: the catalogue.
-        validation: unseen flights, or none.
+        validation: unseen flights, or none; `windows` measure where no run fits into them.
+
+    Raises:
+        NotIdentifiableError: no run of that length fits into any training flight, or all run away.
     """
-    causes = _causes(found, listed)
-    free = _freer(vehicle, decisive.free([*NOMINAL_NAMES, *(n for c in causes if _moves(c) for n in c.names)]))
-    try:
-        ahead = fit_ahead(windows, vehicle, free, [found.theta, _start(vehicle, decisive, found)])
-        if _relative(*(_errors(windows, vehicle, theta) for theta in (ahead.theta, found.theta))) > np.log(BETTER):
-            return None
-        seen = list(validation) or windows
-        diagnosed, refitted = (_errors(seen, vehicle, theta) for theta in (found.theta, ahead.theta))
-    except NotIdentifiableError:  # no run of that length fits into any flight
+    flown = any(w.velocity is not None for w in windows)
+    causes = _causes(found, listed, flown)
+    free = _free(vehicle, decisive, causes, flown)
+    ahead = fit_ahead(windows, vehicle, free, [found.theta, _start(vehicle, decisive, found, free)])
+    if _relative(*(_errors(windows, vehicle, theta) for theta in (ahead.theta, found.theta))) > np.log(BETTER):
         return None
-    named = {c.effect for c in found.causes}
-    sigma = (ahead.sigma * free.jacobian(ahead.theta)).tolist()
-    return Foresight(
-        Fitted(ahead.theta, dict(zip(free.names, sigma, strict=True)), causes),
-        tuple(e for e in STAND_INS if e not in named), "validation logs" if validation else "training logs",
-        diagnosed, refitted,
-    )  # fmt: skip
+    seen, on = validation, "validation logs"
+    if not any(np.isfinite(e) for e in _errors(validation, vehicle, ahead.theta).values()):
+        seen, on = windows, "training logs"
+    diagnosed, refitted = (_errors(seen, vehicle, theta) for theta in (found.theta, ahead.theta))
+    stand_ins = tuple(dict.fromkeys(c.effect for c in causes if c not in found.causes))
+    return Foresight(Fitted(ahead.theta, {}, causes), stand_ins, on, diagnosed, refitted)
 
 
-def _freer(vehicle: Vehicle, free: Free) -> Free:
-    """Lets nominal parameters whose bounds are mere defaults stand in too: such an inertia is none any more."""
-    bounds = {n: (p.initial / FREER, p.initial * FREER) for n, p in vehicle.parameters.items() if p.bounds is None}
+def _causes(found: Model, listed: Sequence[Candidate], flown: bool) -> tuple[Candidate, ...]:
+    """Findings, and the stand-ins that are none."""
+    present = {c.label for c in found.causes}
+    others = [c for c in listed if c.label in STAND_INS and c.label not in present and not c.split]
+    return (*found.causes, *(c for c in others if _refitted(c, flown)))
+
+
+def _refitted(cause: Candidate, flown: bool) -> bool:
+    """Whether a cause acts on the motion, all the time, the same in every flight, and shows where it was measured."""
+    moves = cause.effect not in MOTIONLESS and cause.timed is None and not EFFECTS[cause.effect].per_log
+    return moves and (flown or cause.effect not in FORCES)
+
+
+def _free(vehicle: Vehicle, decisive: Shooting, causes: Sequence[Candidate], flown: bool) -> Free:
+    """What is refitted; nominal parameters whose bounds are mere defaults may leave them: they stand in too.
+
+    Without a measured velocity the runs tell ratios to thrust only, so b stays as found.
+    """
+    nominal = [n for n in NOMINAL_NAMES if flown or n != "b"]
+    free = decisive.free([*nominal, *(n for c in causes if _refitted(c, flown) for n in c.names)])
+    guessed = {n: p.initial for n, p in vehicle.parameters.items() if p.bounds is None and p.sigma is None}
+    if vehicle.stand_thrust is not None:
+        guessed.pop("b", None)
     return Free(tuple(
-        replace(e, lower=bounds[e.name][0], upper=bounds[e.name][1]) if e.name in bounds else e for e in free.entries
+        replace(e, lower=guessed[e.name] / FREER, upper=guessed[e.name] * FREER) if e.name in guessed else e
+        for e in free.entries
     ))  # fmt: skip
 
 
-def _causes(found: Model, listed: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    present = {c.label for c in found.causes}
-    return (*found.causes, *(c for c in listed if c.label in STAND_INS and c.label not in present and not c.split))
-
-
-def _start(vehicle: Vehicle, decisive: Shooting, found: Model) -> FloatArray:
-    """What is not refitted as found; the rest as in the vehicle file, with some drag: the findings may be far off."""
-    out = decisive.layout.initial(vehicle)
-    kept = [c for c in found.causes if not _moves(c)]
-    places = [*decisive.free([n for c in kept for n in c.names]).index, *(c.timed for c in kept if c.timed is not None)]
-    out[places] = found.theta[places]
-    out[decisive.free(["rotor_drag.k_x", "rotor_drag.k_y"]).index] = FLEXIBLE_DRAG
+def _start(vehicle: Vehicle, decisive: Shooting, found: Model, free: Free) -> FloatArray:
+    """What is refitted as in the vehicle file, with some drag: the findings may lie in the wrong basin."""
+    out = found.theta.copy()
+    out[free.index] = decisive.layout.initial(vehicle)[free.index]
+    out[[e.index for e in free.entries if e.name in ("rotor_drag.k_x", "rotor_drag.k_y")]] = FLEXIBLE_DRAG
     return out
-
-
-def _moves(cause: Candidate) -> bool:
-    """Whether a cause is refitted: it acts on the motion, all the time, and is the same in every flight."""
-    return cause.effect not in MOTIONLESS and cause.timed is None and not EFFECTS[cause.effect].per_log
 
 
 def _errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray) -> dict[str, float]:
     """Mean error over all starts after `AHEAD`, by quantity; NaN for what the flights lack."""
-    steps = max(round(AHEAD / windows[0].dt), 1)
-    return horizon_scores([[w] for w in windows], vehicle, theta, (steps,))[0].at(steps)
+    steps = max(round(AHEAD / windows[0].dt), 1) if windows else 1
+    return mean_errors(windows, vehicle, theta, steps)
 
 
 def _relative(errors: dict[str, float], before: dict[str, float]) -> float:
-    """Mean logarithm of the ratio; infinite when a prediction ran away."""
-    ratios = np.array([errors[q] / e for q, e in before.items() if np.isfinite(e)])
-    return float(np.mean(np.log(ratios))) if ratios.size and np.isfinite(ratios).all() else np.inf
+    """Mean logarithm of the ratio; infinite when a prediction ran away, minus infinite when only the one before did."""
+    known = [(errors[q], e) for q, e in before.items() if not np.isnan(e)]
+    if not all(np.isfinite(e) for e, _ in known):
+        return np.inf
+    return float(np.mean([np.log(e / b) if np.isfinite(b) else -np.inf for e, b in known]))

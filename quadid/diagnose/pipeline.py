@@ -24,6 +24,7 @@ from quadid.diagnose.search import Search, select
 from quadid.diagnose.validation import validate
 from quadid.diagnose.vehicle_file import Fitted, extended_vehicle
 from quadid.diagnose.whole_rest import with_look_alike
+from quadid.errors import NotIdentifiableError
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
 from quadid.identify.floor import flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise import NoiseModel
@@ -108,15 +109,20 @@ def diagnose(
         verdict = Verdict.UNKNOWN
     believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
     findings = describe(decisive, search, per_finding, believed)
-    foresight = None
+    foresight, said = None, []
     if verdict is Verdict.UNKNOWN and search.model.misfit > POOR:
         report("prediction", 0.0)
-        foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
+        try:
+            foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
+        except NotIdentifiableError as error:
+            said.append(f"the extended vehicle file could not be refitted to predict: {error}")
+    if foresight is not None:
+        said.append(foresight.sentence)
     fitted = Fitted.of(search.model) if foresight is None else foresight.fitted
     text = extended_vehicle(vehicle, decisive.layout, fitted)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
-    warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *([foresight.sentence] if foresight else []))
+    warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *said)
     result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, foresight)
     return result, Workings(search, begun.short, decisive, left)
 
@@ -189,10 +195,9 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Searc
             break
         again = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    if doubtful(search.model, search.tests):
-        # Refitted on longer segments or under less noise, a cause may be nothing any more.
-        search = replace(search, model=prune(search.shooting, search.model, None, search.nominal, search.tests))
-    return search
+    # Refitted on longer segments or under less noise, a cause may be nothing any more.
+    suspects = doubtful(search.model, search.tests)
+    return replace(search, model=prune(search.shooting, search.model, suspects, search.nominal, search.tests))
 
 
 def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.acceptance import choose, prune
+from quadid.diagnose.acceptance import choose, others, prune
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.climb import USUAL_SECONDS, Climb
 from quadid.diagnose.exchange import Round, split_causes, swap_look_alikes
@@ -65,7 +65,7 @@ def select(
     climb = Climb(ladder, theta, known)
     rounds: list[Round] = []
     if known is not None:
-        climb.model = prune(climb.shooting, climb.model, None, climb.base, len(listed))
+        climb.model = prune(climb.shooting, climb.model, climb.model.causes, climb.base, len(listed))
     tests = _forwards(climb, rounds, listed, elsewhere, report)
     for _ in range(MOST_SECOND_THOUGHTS):
         doubt = second_thought(climb, rounds, tests, elsewhere)
@@ -73,11 +73,13 @@ def select(
             break
         rounds.append(doubt)
         climb = Climb(ladder, theta, doubt.accepted.model)
-        climb.model = prune(climb.shooting, climb.model, doubt.accepted.candidate, climb.base, tests)
+        suspects = others(climb.model, doubt.accepted.candidate)
+        climb.model = prune(climb.shooting, climb.model, suspects, climb.base, tests)
         tests = _forwards(climb, rounds, listed, elsewhere, report)
     handed = hand_over(climb.shooting, climb.model, listed, tests)
     if handed is not None and handed.accepted is not None:
-        climb.model = prune(climb.shooting, handed.accepted.model, handed.accepted.candidate, climb.base, tests)
+        suspects = others(handed.accepted.model, handed.accepted.candidate)
+        climb.model = prune(climb.shooting, handed.accepted.model, suspects, climb.base, tests)
         rounds.append(handed)
     return Search(climb.shooting, climb.nominal, climb.model, tuple(rounds), tests)
 
@@ -105,7 +107,7 @@ def _forwards(
             break
         worth = {**accepted.model.worth, accepted.candidate.label: accepted.gain.total}
         model = split_causes(replace(accepted.model, worth=worth))
-        climb.model = prune(shooting, model, accepted.candidate, climb.base, tests)
+        climb.model = prune(shooting, model, others(model, accepted.candidate), climb.base, tests)
         if climb.up():
             climb.model, swaps = swap_look_alikes(climb.shooting, climb.model, listed, usual)
             usual += swaps if climb.shooting.seconds >= USUAL_SECONDS else []

@@ -22,7 +22,7 @@ class Fitted:
 
     Attributes:
         theta: full vector.
-        sigma: standard deviation of each fitted entry, in its own unit.
+        sigma: standard deviation of fitted entries, in their own unit; those left out have none that means anything.
         causes: whose effects it holds.
     """
 
@@ -38,13 +38,13 @@ class Fitted:
 
 
 def extended_vehicle(vehicle: Vehicle, layout: Layout, fitted: Fitted) -> str:
-    """Returns the YAML of `vehicle` with fitted parameters (with sigma) and effects."""
+    """Returns the YAML of `vehicle` with fitted parameters, their sigma where it is known, and effects."""
     priors = {}
     for name in NOMINAL_NAMES:
         value = float(fitted.theta[layout.entry(name).index])
         low, high = vehicle.parameters[name].limits
         priors[name] = ParameterPrior(
-            initial=value, bounds=(min(low, value), max(high, value)), sigma=fitted.sigma[name]
+            initial=value, bounds=(min(low, value), max(high, value)), sigma=fitted.sigma.get(name)
         )
     effects = {k: dict(v) for k, v in vehicle.effects.items()}
     for cause in fitted.causes:

@@ -137,9 +137,9 @@ def rate_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, 
 
 def _window_tally(window: Window, vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
     loop, at, tally = OpenLoop(window, vehicle, longest), 1 + np.arange(longest), _empty(longest)
-    for rows, residual in loop.runs(theta[None]):
-        counts = loop.counted(rows, at)
-        # A run that overflowed has an infinite error, not none.
-        errors = np.where(counts, np.nan_to_num(lengths(residual[0]), nan=np.inf, posinf=np.inf), 0.0)
-        tally = tally + _Tally(errors.sum(axis=0), counts.sum(axis=0).astype(np.float64), len(rows))
+    for rows, misses in loop.parts(theta[None], at):
+        errors = lengths(misses[0])
+        known = ~np.isnan(errors)
+        total = np.where(known, errors, 0.0).sum(axis=0)
+        tally = tally + _Tally(total, known.sum(axis=0).astype(np.float64), len(rows))
     return tally

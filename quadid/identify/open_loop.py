@@ -79,22 +79,28 @@ class OpenLoop:
                 out[..., i] = valid[:, place][target] & started[:, None]
         return out
 
-    def misses(self, theta: FloatArray, at: NDArray[np.intp]) -> FloatArray:
-        """Predicted - measured of each quantity `at` samples after every start, shape (vectors, starts, at, 4, 3).
-
-        A rotation is its axis times twice the sine of half its angle.  What is not measured is NaN, what ran away
-        infinite.
+    def parts(
+        self, theta: FloatArray, at: NDArray[np.intp]
+    ) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:  # fmt: skip
+        """Yields rows of starts and what runs from them miss by, in turns.
 
         Args:
             theta: full parameter vectors, shape (vectors, size), as in `runs`.
             at: samples after the start, 1 to `longest`.
+
+        Yields:
+            Rows, and predicted - measured of each quantity, shape (vectors, rows, at, 4, 3).  A rotation is its axis
+            times twice the sine of half its angle.  What is not measured is NaN, what ran away infinite.
         """
-        parts = [np.full((len(theta), 0, len(at), 4, 3), np.nan)]
         for rows, residual in self.runs(theta):
-            part = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
-            ran = np.nan_to_num(part, nan=np.inf, posinf=np.inf, neginf=np.inf)
-            parts.append(np.where(self.counted(rows, at)[..., None], ran, np.nan))
-        return np.concatenate(parts, axis=1)
+            found = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
+            ran = np.nan_to_num(found, nan=np.inf, posinf=np.inf, neginf=np.inf)
+            yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
+
+    def misses(self, theta: FloatArray, at: NDArray[np.intp]) -> FloatArray:
+        """What all runs miss by, shape (vectors, starts, at, 4, 3); see `parts`."""
+        none = np.full((len(theta), 0, len(at), 4, 3), np.nan)
+        return np.concatenate([none, *(misses for _, misses in self.parts(theta, at))], axis=1)
 
     def no_change(self, at: NDArray[np.intp]) -> FloatArray:
         """Errors of predicting that nothing changes, shape (starts, at, 4); NaN for what is not measured."""
@@ -110,13 +116,11 @@ class OpenLoop:
         return np.where(self.counted(self.rows, at), out, np.nan)
 
 
-def lengths(residual: FloatArray) -> FloatArray:
-    """Errors of the four quantities out of residuals (..., channels): Euclidean, the rotation's as its angle; (..., 4).
-
-    What the log lacks is zero.
-    """
-    out = np.stack([np.linalg.norm(_three(residual, place), axis=-1) for place in _PLACES], axis=-1)
-    out[..., 2] = 2.0 * np.arcsin(np.minimum(0.5 * out[..., 2], 1.0))
+def lengths(misses: FloatArray) -> FloatArray:
+    """Errors (..., 4) out of misses (..., 4, 3): Euclidean, the rotation's as its angle."""
+    out: FloatArray = np.linalg.norm(misses, axis=-1)
+    half = 0.5 * out[..., 2]
+    out[..., 2] = np.where(np.isinf(half), np.inf, 2.0 * np.arcsin(np.minimum(half, 1.0)))
     return out
 
 
@@ -127,12 +131,36 @@ def _three(residual: FloatArray, place: int) -> FloatArray:
     return np.zeros((*residual.shape[:-1], 3))
 
 
-def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict[str, float]:
-    """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack."""
+def mean_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> dict[str, float]:
+    """Mean error `samples` after every start, by quantity; NaN for what the logs lack, infinite where a run went away.
+
+    Args:
+        windows: of one or more files, on one grid.
+        vehicle: geometry and mass.
+        theta: full parameter vector, shape (size,).
+        samples: after the start.
+    """
     at = np.array([samples])
-    parts = [OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows]
-    errors = np.concatenate(parts) if parts else np.zeros((0, 4))
-    return dict(zip(QUANTITIES, mean_of_known(errors).tolist(), strict=True))
+    return _by_quantity([lengths(OpenLoop(w, vehicle, samples).misses(theta[None], at)[0, :, 0]) for w in windows])
+
+
+def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int, longest: int = 0) -> dict[str, float]:
+    """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack.
+
+    Args:
+        windows: of one or more files, on one grid.
+        vehicle: geometry and mass.
+        samples: after the start.
+        longest: counts only starts of runs of so many samples; by default of `samples`.
+    """
+    at = np.array([samples])
+    return _by_quantity([OpenLoop(w, vehicle, max(samples, longest)).no_change(at)[:, 0] for w in windows])
+
+
+def _by_quantity(errors: Sequence[FloatArray]) -> dict[str, float]:
+    """Means over all starts of errors (starts, 4)."""
+    mean = mean_of_known(np.concatenate([np.zeros((0, 4)), *errors]))
+    return dict(zip(QUANTITIES, mean.tolist(), strict=True))
 
 
 def mean_of_known(errors: FloatArray) -> FloatArray:
@@ -157,6 +185,7 @@ def _padded(window: Window) -> Window:
     return replace(
         window,
         rotor_speed=rotor,
+        rotor_slope=None,
         gyro=extended(window.gyro),
         attitude=extended(window.attitude),
         accel=None,

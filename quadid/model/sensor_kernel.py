@@ -61,7 +61,8 @@ def sensor_constants(theta: FloatArray, dt: float, s: FloatArray) -> None:
         for row, h in ((C_EC, dt), (C_EC2, 0.5 * dt)):
             s[row + lane] = math.exp(-sigma * h) * math.cos(sigma * h)
             s[row + C_ES - C_EC + lane] = math.exp(-sigma * h) * math.sin(sigma * h)
-        s[C_AHRS + lane], s[C_ATT_DELAY + lane] = th[ix.AHRS_K], max(th[ix.ATT_DELAY], 0.0) / dt
+        s[C_AHRS + lane] = -math.expm1(-dt * th[ix.AHRS_K])
+        s[C_ATT_DELAY + lane] = max(th[ix.ATT_DELAY], 0.0) / dt
         for i in range(3):
             s[C_GB + i * LANES + lane], s[C_AB + i * LANES + lane] = th[ix.GBX + i], th[ix.ABX + i]
             s[C_GS + i * LANES + lane] = 1.0 + th[ix.GSX + i]
@@ -148,8 +149,8 @@ def step_tilt_error(dt: float, s: FloatArray) -> None:
 
     The filter adds k n x d to its body rate, n being down as the accelerometer sees it and d as the filter does
     (Mahony, Hamel & Pflimlin 2008, doi:10.1109/TAC.2008.923738).  Seen from the world, where its own turning drops
-    out, the error turns by that, taken at the middle of the step, where the mean of the step's force belongs.  As the
-    pull fades while it turns, it turns by 1 - exp(-k dt), here to second order, instead of k dt.
+    out, the error turns by that, taken at the middle of the step, where the mean of the step's force belongs.  The
+    pull fades while it turns, so the step's share is 1 - exp(-k dt) instead of k dt.
     """
     lane_kernel()
     for lane in range(LANES):
@@ -162,8 +163,7 @@ def step_tilt_error(dt: float, s: FloatArray) -> None:
         nx = -0.5 * (s[F1_X + lane] + s[F2_X + lane])
         ny = -0.5 * (s[F1_X + Y1 + lane] + s[F2_X + Y1 + lane])
         nz = -0.5 * (s[F1_X + Y2 + lane] + s[F2_X + Y2 + lane])
-        k = dt * s[C_AHRS + lane]
-        k = k * (1.0 - 0.5 * k) / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-9)
+        k = s[C_AHRS + lane] / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-9)
         x, y, z = k * (ny * dz - nz * dy), k * (nz * dx - nx * dz), k * (nx * dy - ny * dx)
         a, b, c = 2.0 * (q2 * z - q3 * y), 2.0 * (q3 * x - q1 * z), 2.0 * (q1 * y - q2 * x)
         x, y, z = x + q0 * a + q2 * c - q3 * b, y + q0 * b + q3 * a - q1 * c, z + q0 * c + q1 * b - q2 * a

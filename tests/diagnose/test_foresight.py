@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,15 @@ import pytest
 from quadid_replay import open_log
 
 from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose.foresight import AHEAD, BETTER
+from quadid.diagnose.candidates import candidates
+from quadid.diagnose.foresight import AHEAD, BETTER, STAND_INS, Foresight, _relative, refit_to_predict
+from quadid.diagnose.models import Model, fit_model
+from quadid.diagnose.vehicle_file import extended_vehicle
 from quadid.flight import draw_truth, fly
 from quadid.grid import to_windows
 from quadid.identify.horizon import horizon_scores
+from quadid.identify.shooting import Shooting
+from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -80,3 +86,62 @@ def test_an_explained_flight_keeps_its_most_likely_parameters() -> None:
     assert found.verdict.value == "explained"
     assert found.foresight is None
     assert found.to_dict()["prediction"] is None
+
+
+def refitted(
+    data_dir: Path, validation: list[Window], velocity: bool = True
+) -> tuple[Foresight, Vehicle, Model]:  # fmt: skip
+    """The refit after a diagnosis that found nothing, of one recorded flight with or without its velocity."""
+    vehicle = Vehicle.from_yaml((data_dir / "nanodrone" / "vehicle.yaml").read_text(encoding="utf-8"))
+    window = recorded(data_dir, "random_run1", vehicle)
+    if not velocity:
+        window = replace(window, velocity=None, position=None)
+    effects = {"motor_lag": {"tau": 0.01}, "rotor_drag": {"k_x": 0.4, "k_y": 0.4}}
+    vehicle = vehicle.model_copy(update={"effects": effects})
+    shooting = Shooting([window], vehicle, 0.5)
+    found = fit_model(shooting, shooting.layout.initial(vehicle), ())
+    listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
+    listed = [c for c in listed if c.effect not in vehicle.effects]
+    foresight = refit_to_predict([window], vehicle, shooting, found, listed, validation)
+    assert foresight is not None
+    return foresight, vehicle, found
+
+
+def test_effects_of_the_vehicle_file_are_no_stand_ins_and_stay(data_dir: Path) -> None:
+    foresight, vehicle, _ = refitted(data_dir, [])
+    assert set(foresight.stand_ins) == set(STAND_INS) - set(vehicle.effects)
+    layout = Layout(vehicle)
+    written = Vehicle.from_yaml(extended_vehicle(vehicle, layout, foresight.fitted))
+    assert written.effects["rotor_drag"] == {"k_x": 0.4, "k_y": 0.4}
+    np.testing.assert_allclose(Layout(written).initial(written), foresight.fitted.theta, rtol=1e-12)
+    assert {p.sigma for p in written.parameters.values()} == {None}, "its numbers are no physics"
+
+
+def test_without_velocity_thrust_stays_as_found(data_dir: Path) -> None:
+    """Runs of rate and attitude tell thrust only relative to inertia, and no force at all."""
+    foresight, _, found = refitted(data_dir, [], velocity=False)
+    assert foresight.fitted.theta[ix.B] == found.theta[ix.B]
+    assert foresight.fitted.theta[ix.KZ] == 0.0
+    assert set(foresight.stand_ins) == {"rate_damping", "cg_offset", "rotor_spin_up"}
+
+
+def test_a_validation_flight_into_which_no_run_fits_does_not_measure(data_dir: Path) -> None:
+    _, vehicle, _ = refitted(data_dir, [])
+    short = recorded(data_dir, "random_run3", vehicle).slice(0, 20)
+    assert refitted(data_dir, [short])[0].on == "training logs"
+    assert refitted(data_dir, [recorded(data_dir, "random_run3", vehicle)])[0].on == "validation logs"
+
+
+@pytest.mark.parametrize(
+    ("after", "before", "expected"),
+    [
+        ({"rate": 0.5, "velocity": np.nan}, {"rate": 1.0, "velocity": np.nan}, np.log(0.5)),
+        ({"rate": 0.5}, {"rate": np.inf}, -np.inf),
+        ({"rate": np.inf}, {"rate": np.inf}, np.inf),
+        ({"rate": np.inf}, {"rate": 1.0}, np.inf),
+    ],
+)
+def test_a_prediction_that_ran_away_is_worse_than_any(
+    after: dict[str, float], before: dict[str, float], expected: float
+) -> None:
+    assert _relative(after, before) == pytest.approx(expected)

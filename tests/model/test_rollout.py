@@ -166,7 +166,7 @@ def test_several_weak_rotors_are_kept() -> None:
     [
         ({"rotor": 5, "loss": 0.1}, "rotor 5; allowed: a whole number from 1 to 4"),
         ({"rotor": 1.5, "loss": 0.1}, "rotor 1.5"),
-        ({"loss": 0.1}, "rotor 0"),
+        ({"loss": 0.1}, "loss 0.1 of no rotor"),
         ({"loss_5": 0.1}, "loss_5"),
         ({"rotor": 2, "loss": 0.1, "loss_3": 0.1}, "rotor 2 beside loss_3"),
         ({"loss_x": 0.1}, "no parameter 'loss_x'"),
