@@ -102,7 +102,7 @@ explains nearly as well. The file is refitted to predict: its inertias are no in
         "nanodrone/vehicle.yaml",
         """\
 With the chirp drag, its moment and inflow are found with the numbers of the flights without it. Beside the published
-models, as shares of "no change", all four errors on the random flight (0.13, 0.25, 0.50, 0.58) and on the chirp are
+models, as shares of "no change", all four errors on the random flight (0.13, 0.25, 0.50, 0.59) and on the chirp are
 better than those of every one of them. On the square flight, six to eight times livelier, only the rate is: what drives
 the fastest rotation was filtered out of these files after the fact, so half a second ahead the slow flights are
 predicted best as if rotors hardly turned the vehicle, and the square ones are not. The file has to choose; every run
