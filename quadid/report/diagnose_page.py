@@ -33,11 +33,13 @@ _SENTENCES = {
 
 def diagnose_verdict(result: JsonDict) -> Verdict:
     """Judges a result of the form ``quadid.diagnose/1``."""
-    named = [f["effect"].replace("_", " ") for f in result["findings"] if f["confident"]]
+    large, small = _named(result)
     verdict = result["verdict"]
     headline = _SENTENCES[verdict]
-    if named and verdict != "unknown":
-        headline = f"Found: {', '.join(named)}. {headline}"
+    if (large or small) and verdict != "unknown":
+        found = [", ".join(large)] if large else []
+        found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []
+        headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
     error = f"Error on data the fit did not see, in noise variances (1 is the noise floor): {_short(v['mse_nominal'])}"
     gained = f" without and {_short(v['mse_extended'])} with what was found" if result["findings"] else ""
@@ -53,8 +55,17 @@ def _short(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
 
+def _named(result: JsonDict) -> tuple[list[str], list[str]]:
+    """Confident findings by name: those to do something about, and those no larger than on most vehicles."""
+    sure = [f for f in result["findings"] if f["confident"]]
+    large = [f["effect"].replace("_", " ") for f in sure if not f.get("ordinary")]
+    small = [f["effect"].replace("_", " ") for f in sure if f.get("ordinary")]
+    return large, small
+
+
 def _next_steps(result: JsonDict) -> tuple[str, ...]:
-    named = [f["effect"] for f in result["findings"] if f["confident"] and f["effect"] in ADVICE][:3]
+    sure = [f for f in result["findings"] if f["confident"] and not f.get("ordinary")]
+    named = [f["effect"] for f in sure if f["effect"] in ADVICE][:3]
     out = [
         f"{effect.replace('_', ' ').capitalize()}: {ADVICE[effect][0].lower()}{ADVICE[effect][1:]}" for effect in named
     ]

@@ -8,6 +8,7 @@ import pytest
 
 from quadid.effects import EFFECTS
 from quadid.report.advice import ADVICE
+from quadid.report.diagnose_page import diagnose_verdict
 from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason
 
 
@@ -102,3 +103,18 @@ def test_every_effect_has_advice() -> None:
 def test_digits_show_the_width_of_an_interval(low: float | None, high: float, expected: int) -> None:
     value = high if low is None else 0.5 * (low + high)
     assert digits({"value": value, "ci95": [low, high]}) == expected
+
+
+def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mending() -> None:
+    findings = [
+        {"effect": "parasitic_drag", "confident": True, "ordinary": False},
+        {"effect": "cg_offset", "confident": True, "ordinary": True},
+        {"effect": "weak_rotor", "confident": False, "ordinary": False},
+    ]
+    validation = {"mse_nominal": 9.0, "mse_extended": 1.0}
+    result = {"verdict": "explained", "findings": findings, "validation": validation, "unexplained": {}}
+    verdict = diagnose_verdict(result)
+    assert verdict.headline.startswith("Found: parasitic drag; no larger than on most vehicles: cg offset. ")
+    assert [step.split(":")[0] for step in verdict.next_steps if ":" in step] == ["Parasitic drag"]
+    alone = diagnose_verdict({**result, "findings": findings[1:2]})
+    assert alone.headline.startswith("Found: no larger than on most vehicles: cg offset. ")
