@@ -125,6 +125,12 @@ _REMARKS = {
 }
 
 
+def _advice(finding: JsonDict) -> str:
+    """What to do about a cause, and what sets it apart."""
+    parts = [] if finding.get("ordinary") else [ADVICE.get(finding["effect"], "")]
+    return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
+
+
 def finding_part(finding: JsonDict, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
     """One cause: its picture, its worth with interval, the look-alikes that lost.
 
@@ -147,12 +153,11 @@ def finding_part(finding: JsonDict, floor: float, identifier: str, seen: Residua
     return {
         **finding,
         "title": name,
-        "advice": ADVICE.get(finding["effect"], ""),
+        "advice": _advice(finding),
         "worth": "".join(worth) + ".",
         "noise": _noise_sentence(gain, floor, name),
         "rivals": f"Look-alikes in its place, which lost, with the error they leave: {', '.join(rivals)}."
         if rivals else "No other cause of the catalogue came near it.",
-        "remarks": " ".join(text for key, text in _REMARKS.items() if finding.get(key)),
         "figures": [
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
             gain_figure(finding, floor, f"{identifier}-gain"),
