@@ -49,7 +49,9 @@ NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 NOISE_ROSE = 1.5
 """When it rises by more than this, and all together more than they fall, the flexible fit has lost its way, and the
-first estimate stands."""
+first estimate stands; likewise …"""
+NOISE_LOST = 3.0
+"""… when one rises by more than this, whatever the others do."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown` …"""
 SHARE_ALONE = 0.9
@@ -190,7 +192,7 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Searc
         before = search.shooting.noise.variance
         noise = _noise_around(windows, short, search.model)
         growth = noise.variance / before
-        if np.any(growth > NOISE_ROSE) and np.mean(np.log(growth)) > 0.0:
+        if np.any(growth > NOISE_LOST) or (np.any(growth > NOISE_ROSE) and np.mean(np.log(growth)) > 0.0):
             break
         search = _with_noise(noise, ladder, search)
         if np.all(noise.variance > NOISE_FELL * before):
