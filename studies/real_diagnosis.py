@@ -24,7 +24,7 @@ from quadid_cli.loading import load_logs, load_vehicle
 from quadid.diagnose import Diagnosis, Workings, diagnose
 from quadid.errors import QuadidError
 from quadid.identify.horizon import horizon_scores
-from quadid.identify.open_loop import QUANTITIES, no_change
+from quadid.identify.open_loop import QUANTITIES, mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -258,7 +258,7 @@ def learnt_from(data: Path) -> str:
         extended = Vehicle.from_yaml(found.vehicle_yaml)
         theta, cells = Layout(extended).initial(extended), []
         for name, flight in held.items():
-            errors = horizon_scores([flight], extended, theta, (last,))[0].at(last)
+            errors = mean_errors(flight, extended, theta, last)
             cells.append(", ".join(f"{errors[q] / still[name][q]:.2f}" for q in QUANTITIES))
         row = f"| {' '.join(names)} | {found.verdict.value} | {' | '.join(cells)} |"
         print(row, flush=True)

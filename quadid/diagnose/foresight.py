@@ -18,7 +18,7 @@ from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
 from quadid.diagnose.vehicle_file import Fitted
 from quadid.effects import EFFECTS
-from quadid.identify.ahead import fit_ahead
+from quadid.identify.ahead import STAGES, fit_ahead
 from quadid.identify.floor import FLEXIBLE_DRAG
 from quadid.identify.free import Free
 from quadid.identify.open_loop import mean_errors
@@ -36,7 +36,7 @@ STAND_INS = (
 """Effects that may stand for forces and moments nobody has named."""
 POOR = 2.0
 """Deviance per row above which an unexplained flight is predicted poorly enough to refit."""
-AHEAD = 0.5
+AHEAD = STAGES[-1][-1]
 """How far ahead [s] predictions are judged."""
 BETTER = 0.9
 """The refitted parameters are kept when their error is below this share of that of the findings' own."""
@@ -112,12 +112,13 @@ def refit_to_predict(
     causes = _causes(found, listed, flown)
     free = _free(vehicle, decisive, causes, flown)
     ahead = fit_ahead(windows, vehicle, free, [found.theta, _start(vehicle, decisive, found, free)])
-    if _relative(*(_errors(windows, vehicle, theta) for theta in (ahead.theta, found.theta))) > np.log(BETTER):
+    diagnosed, refitted = (_errors(windows, vehicle, theta) for theta in (found.theta, ahead.theta))
+    if _relative(refitted, diagnosed) > np.log(BETTER):
         return None
-    seen, on = validation, "validation logs"
-    if not any(np.isfinite(e) for e in _errors(validation, vehicle, ahead.theta).values()):
-        seen, on = windows, "training logs"
-    diagnosed, refitted = (_errors(seen, vehicle, theta) for theta in (found.theta, ahead.theta))
+    on = "training logs"
+    unseen = _errors(validation, vehicle, ahead.theta)
+    if any(np.isfinite(e) for e in unseen.values()):
+        diagnosed, refitted, on = _errors(validation, vehicle, found.theta), unseen, "validation logs"
     stand_ins = tuple(dict.fromkeys(c.effect for c in causes if c not in found.causes))
     return Foresight(Fitted(ahead.theta, {}, causes), stand_ins, on, diagnosed, refitted)
 

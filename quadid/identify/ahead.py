@@ -101,7 +101,8 @@ class _Problem:
     def descend(self, theta: FloatArray) -> tuple[FloatArray, float]:
         """Gauss-Newton steps on reweighted errors, damped until each lowers their mean; the end, and the mean there."""
         share = self.share(theta)
-        damping, least, most = _DAMPING
+        first, least, most = _DAMPING
+        damping = first
         for _ in range(ITERATIONS):
             h, g = self.equations(theta)
             moved, lower = theta, np.inf
@@ -111,7 +112,7 @@ class _Problem:
                 lower = self.share(moved)
                 if lower < share:
                     break
-                damping = max(10.0 * damping, _DAMPING[0])
+                damping = max(10.0 * damping, first)
             if not lower < share:
                 break
             done = share - lower < _ENOUGH * share
@@ -124,7 +125,10 @@ class _Problem:
         """Mean error as a share of no change; infinite where a run went away or no rigid body has such inertias."""
         if impossible_inertia(theta[[ix.JXX, ix.JYY, ix.JZZ]].tolist()):
             return np.inf
-        shares = [lengths(loop.misses(theta[None], self.at)[0]) / self.scales[_flight(loop)] for loop in self.loops]
+        shares = [
+            lengths(loop.misses(theta[None], self.at)[0]) / scale
+            for loop, scale in zip(self.loops, self.scales, strict=True)
+        ]
         return float(np.mean(mean_of_known(np.concatenate(shares))[self.counts > 0]))
 
     def equations(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,8 +142,8 @@ class _Problem:
         ends = np.stack([theta, *(self.free.move(theta, z) for z in (*scaled, *-scaled))])
         widths = np.array([scaled_difference(self.free, ends[1 + p + i], ends[1 + i])[i] for i in range(p)])
         h, g = np.zeros((p, p)), np.zeros(p)
-        for loop in self.loops:
-            misses, scale = loop.misses(ends, self.at), self.scales[_flight(loop)]
+        for loop, scale in zip(self.loops, self.scales, strict=True):
+            misses = loop.misses(ends, self.at)
             usable = np.asarray(np.isfinite(misses).all(axis=(0, 4)))
             share = lengths(misses[0]) / scale
             weight = np.where(usable, 1.0 / np.maximum(share, _NEAR), 0.0) / np.maximum(self.counts, 1)
@@ -152,16 +156,14 @@ class _Problem:
         return h, g
 
 
-def _flight(loop: OpenLoop) -> tuple[str, tuple[float, float]]:
-    """What tells the windows of one log from those of another."""
-    return loop.window.name, loop.window.log_span
-
-
-def _scales(loops: Sequence[OpenLoop], at: NDArray[np.intp]) -> dict[tuple[str, tuple[float, float]], FloatArray]:
-    """What no change misses by in each flight, shape (at, 4)."""
-    still: dict[tuple[str, tuple[float, float]], list[FloatArray]] = {}
-    for loop in loops:
-        still.setdefault(_flight(loop), []).append(loop.no_change(at))
-    everywhere = mean_of_known(np.concatenate([e for errors in still.values() for e in errors]))
+def _scales(loops: Sequence[OpenLoop], at: NDArray[np.intp]) -> list[FloatArray]:
+    """What no change misses by in the flight of each loop, shape (at, 4)."""
+    flights = [(loop.window.name, loop.window.log_span) for loop in loops]
+    still = [loop.no_change(at) for loop in loops]
+    everywhere = mean_of_known(np.concatenate(still))
     floor = np.where(everywhere > 0.0, everywhere, 1.0) * _CALM
-    return {flight: np.fmax(mean_of_known(np.concatenate(errors)), floor) for flight, errors in still.items()}
+    means = {
+        flight: mean_of_known(np.concatenate([e for e, own in zip(still, flights, strict=True) if own == flight]))
+        for flight in set(flights)
+    }
+    return [np.fmax(means[flight], floor) for flight in flights]

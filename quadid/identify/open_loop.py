@@ -47,21 +47,6 @@ class OpenLoop:
         self._rollout = Rollout(_padded(window), vehicle)
         self.rows = np.flatnonzero(self._known["gyro"][: max(len(window) - longest, 0)])[::every]
 
-    def runs(self, theta: FloatArray) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
-        """Yields rows of starts and residuals predicted - measured, shape (vectors, rows, longest, channels), in turns.
-
-        Args:
-            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the gyro of the first
-                tells.
-        """
-        states = initial_states(self.window, theta[0], self._known)
-        step = max(_CHUNK // len(theta), LANES)
-        for first in range(0, len(self.rows), step):
-            rows = self.rows[first : first + step]
-            segments = Segments(self.longest, 1, (rows + 1).astype(np.int64))
-            blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
-            yield rows, np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
-
     def counted(self, rows: NDArray[np.intp], at: NDArray[np.intp]) -> Mask:
         """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
 
@@ -79,20 +64,25 @@ class OpenLoop:
                 out[..., i] = valid[:, place][target] & started[:, None]
         return out
 
-    def parts(
-        self, theta: FloatArray, at: NDArray[np.intp]
-    ) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:  # fmt: skip
+    def parts(self, theta: FloatArray, at: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
         """Yields rows of starts and what runs from them miss by, in turns.
 
         Args:
-            theta: full parameter vectors, shape (vectors, size), as in `runs`.
+            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the gyro of the first
+                tells.
             at: samples after the start, 1 to `longest`.
 
         Yields:
             Rows, and predicted - measured of each quantity, shape (vectors, rows, at, 4, 3).  A rotation is its axis
             times twice the sine of half its angle.  What is not measured is NaN, what ran away infinite.
         """
-        for rows, residual in self.runs(theta):
+        states = initial_states(self.window, theta[0], self._known)
+        step = max(_CHUNK // len(theta), LANES)
+        for first in range(0, len(self.rows), step):
+            rows = self.rows[first : first + step]
+            segments = Segments(self.longest, 1, (rows + 1).astype(np.int64))
+            blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
+            residual = np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
             found = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
             ran = np.nan_to_num(found, nan=np.inf, posinf=np.inf, neginf=np.inf)
             yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)

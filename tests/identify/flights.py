@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from quadid.flight import Flight, TruthParameters, draw_truth, fly
 from quadid.identify.shooting import Shooting
+from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
@@ -29,6 +30,13 @@ def flown(seed: int, profile: str = "excited", seconds: float = SECONDS, noise_s
 def values_of(truth: TruthParameters) -> FloatArray:
     """The six true parameters, shape (6,)."""
     return np.array([truth.as_dict()[n] for n in NOMINAL_NAMES])
+
+
+def true_theta(flight: Flight) -> FloatArray:
+    """The full parameter vector that was flown, without effects."""
+    theta = Layout(PELICAN).initial(PELICAN)
+    theta[: len(NOMINAL_NAMES)] = values_of(flight.truth.parameters)
+    return theta
 
 
 def guessed(truth: TruthParameters, seed: int = 0, spread: float = 0.3) -> Vehicle:

@@ -15,10 +15,9 @@ from quadid.identify.horizon import horizon_scores
 from quadid.identify.open_loop import OpenLoop, mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
 from quadid.window import Window
+from tests.identify.flights import PELICAN, true_theta
 
-PELICAN = Vehicle.shipped("pelican")
 LAYOUT = Layout(PELICAN)
 
 
@@ -30,9 +29,8 @@ def flight() -> Flight:
 
 
 def truth(flight: Flight) -> np.ndarray:
-    theta = LAYOUT.initial(PELICAN)
-    theta[:6] = [flight.truth.parameters.as_dict()[n] for n in NOMINAL_NAMES]
-    LAYOUT.write_effects(theta, {"rotor_drag": {"k_x": 0.3, "k_y": 0.25}})
+    theta = true_theta(flight)
+    LAYOUT.write_effects(theta, flight.truth.effects)
     return theta
 
 

@@ -13,24 +13,14 @@ from quadid.identify.open_loop import true_rate
 from quadid.identify.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
-from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import euler
-from quadid.vehicle import Vehicle
-
-PELICAN = Vehicle.shipped("pelican")
+from tests.identify.flights import PELICAN, true_theta
 
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     """A lively flight with velocity and position."""
     return fly(PELICAN, seconds=60.0, seed=31, extras=("velocity", "position"))
-
-
-def true_theta(flight: Flight) -> np.ndarray:
-    """The full parameter vector that was flown."""
-    theta = Layout(PELICAN).initial(PELICAN)
-    theta[:6] = [flight.truth.parameters.as_dict()[n] for n in NOMINAL_NAMES]
-    return theta
 
 
 def true_noise() -> NoiseModel:
