@@ -107,9 +107,9 @@ def hover_after_flight(seconds: float, seed: int) -> dict[str, Any]:
     first, quiet = flown(SECONDS, seed), flown(seconds, seed, "hover")
     session = Session(PELICAN)
     list(drive(session, samples(first.recording)))
-    before = session.ledger.in_force
+    before = session.active_set.in_force
     later = list(drive(session, samples(quiet.recording, SECONDS + 3.0)))
-    after = session.ledger.in_force
+    after = session.active_set.in_force
     same = (
         before is not None and after is not None and np.array_equal(before.parameters.values, after.parameters.values)
     )

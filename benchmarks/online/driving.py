@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from quadid.online import FitRequest, Session, fit_window
-from quadid.online.changes import ChangeRequest, explain_change
-from quadid.online.voice import Action
+from quadid.online.fault_isolation import ChangeRequest, isolate_fault
+from quadid.online.outbox import Action
 from quadid.window import Recording, Sample
 
 Fit = Callable[[FitRequest], Any]
@@ -33,7 +33,7 @@ def drive(session: Session, stream: Iterable[Sample], fit: Fit = fit_window) -> 
             yield from session.poll()
             request = session.running
             if isinstance(request, ChangeRequest):
-                session.deliver(explain_change(request))
+                session.deliver(isolate_fault(request))
             elif request is not None:
                 session.deliver(fit(request))
             else:

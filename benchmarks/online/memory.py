@@ -16,7 +16,7 @@ from quadid_node.worker import InlineWorker
 from benchmarks.online.accuracy import PELICAN, flown
 from benchmarks.online.driving import samples
 from quadid.online import FitRequest, SessionSettings, fit_window
-from quadid.online.voice import Action
+from quadid.online.outbox import Action
 from quadid.window import Sample
 
 LOOP, PAUSE = 120.0, 5.0

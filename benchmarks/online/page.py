@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS
 
-from quadid.online.buffer import SETTLE
+from quadid.online.resampler import SETTLE
 from quadid.parameters import NOMINAL_NAMES
 
 Result = Mapping[str, Any]

@@ -18,7 +18,7 @@ from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.swarm import SwarmOptions
 from quadid.model.layout import Layout
-from quadid.online.fitting import FitRequest, fit_window
+from quadid.online.window_fit import FitRequest, fit_window
 from quadid.vehicle import Vehicle
 
 FULL = FitOptions(64, 100, SwarmOptions(tolerance=0.0, patience=None), seed=1)

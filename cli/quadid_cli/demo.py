@@ -76,7 +76,7 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     from multiprocessing import get_context
 
     from quadid.flight import TruthParameters
-    from quadid.online.fitting import warm_up
+    from quadid.online.window_fit import warm_up
     from quadid_cli.loading import load_vehicle
     from quadid_cli.output import out_folder
 

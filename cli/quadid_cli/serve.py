@@ -149,7 +149,7 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
     from quadid_node.codec import set_to_dict, status_to_dict
 
     health, traffic = service.health(), link.traffic()
-    force = service.session.ledger.in_force
+    force = service.session.active_set.in_force
     return {
         "schema": "quadid.serve/1",
         "vehicle": name,

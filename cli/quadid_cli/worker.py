@@ -26,7 +26,7 @@ def worker(
     stop = Stop()
     from quadid_node.ground import work
 
-    from quadid.online.fitting import warm_up
+    from quadid.online.window_fit import warm_up
     from quadid.vehicle import Vehicle
     from quadid_cli import output, terminal
 

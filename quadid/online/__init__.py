@@ -8,7 +8,6 @@ session.deliver(fit_window(request))        the answer to a `FitRequest`
 The same samples, commands and seed give the same actions bit for bit, however `push` and `poll` are interleaved.
 """
 
-from quadid.online.fitting import FitReply, FitRequest, fit_window
 from quadid.online.gate import GateSettings
 from quadid.online.records import (
     Diagnosed,
@@ -21,6 +20,7 @@ from quadid.online.records import (
 from quadid.online.session import Session
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
+from quadid.online.window_fit import FitReply, FitRequest, fit_window
 
 __all__ = [
     "Diagnosed",

@@ -3,7 +3,7 @@
     push(sample)            buffer it
     poll() -> actions       every tick of the data's own time, in order:
         watch for sudden changes                -> ChangeRequest, Diagnosed
-        diagnose the last minute, now and then  -> StudyRequest, Diagnosed; nothing waits for it
+        diagnose the last minute, now and then  -> DiagnosisRequest, Diagnosed; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
         FitRequest                              -> stops here until `deliver` brings the reply
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)
@@ -16,20 +16,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from quadid.online.buffer import Buffer, Rows
-from quadid.online.changes import ChangeReply, ChangeRequest
-from quadid.online.desk import Desk
-from quadid.online.fitting import FitReply, FitRequest, is_excited
-from quadid.online.learner import Learner
-from quadid.online.ledger import Answer, Ledger
+from quadid.online.active_set import ActiveSet, Answer
+from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis, DiagnosisReply
+from quadid.online.change_supervisor import ChangeSupervisor
+from quadid.online.estimator import Estimator
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality, judge
 from quadid.online.records import OnlineSet, Phase, Publish, SetState
-from quadid.online.rows import Cut, RowStore
-from quadid.online.sentry import Sentry
+from quadid.online.resampler import Resampler, Rows
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
-from quadid.online.study import STUDIED, Student, StudyReply
-from quadid.online.voice import Action, Voice
+from quadid.online.supervisor import Supervisor
+from quadid.online.window_fit import FitReply, FitRequest, is_excited
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 
@@ -45,8 +45,8 @@ class Session:
     """Session of one vehicle.
 
     Attributes:
-        buffer: the samples; its `counts`, `last` and `faults` tell what arrives.
-        ledger: which set is in force.
+        resampler: the samples; its `counts`, `last` and `faults` tell what arrives.
+        active_set: which set is in force.
         settings: as given.
     """
 
@@ -64,16 +64,16 @@ class Session:
             baseline: set from which creeping is measured; default `restored`.
         """
         self.settings = settings or SessionSettings()
-        self.buffer = Buffer(vehicle, self.settings.rate)
-        self.ledger = Ledger(self.settings.gate.approval, restored, next_sequence, baseline)
+        self.resampler = Resampler(vehicle, self.settings.rate)
+        self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline)
         self._vehicle = vehicle
-        self._voice = Voice(self.buffer.time.stamp)
-        studied = STUDIED if self.settings.diagnose else 0.0
-        self._store = RowStore(self.settings.rate, max(self.settings.window, studied) + 10.0)
-        self._sentry = Sentry(vehicle, self._store)
-        self._student = Student(vehicle, self._store, self.settings.diagnose, self.settings.seed)
-        self._learner = Learner(vehicle, self.settings.memory, self.settings.seed)
-        self._desk = Desk(self._learner, self.ledger, self._voice, self.settings.gate)
+        self._outbox = Outbox(self.resampler.time.stamp)
+        studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
+        self._store = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
+        self._change_supervisor = ChangeSupervisor(vehicle, self._store)
+        self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
+        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
+        self._supervisor = Supervisor(self._estimator, self.active_set, self._outbox, self.settings.gate)
         self._cut = Cut((), 0.0, 0)
         self._waiting: FitRequest | ChangeRequest | None = None
         self._reply: FitReply | ChangeReply | None = None
@@ -82,41 +82,41 @@ class Session:
         self._work: Iterator[None] | None = None
         self._asked_now = False
         self._number = 0
-        if self.ledger.in_force is not None:
-            self._learner.start_from(self.ledger.in_force)
-            self._voice.act(Publish("parameters", self.ledger.in_force))
+        if self.active_set.in_force is not None:
+            self._estimator.start_from(self.active_set.in_force)
+            self._outbox.act(Publish("parameters", self.active_set.in_force))
 
     # --- input
 
     def push(self, sample: Sample) -> None:
         """Takes one sample: stamp [s], channel, values in core units and frames."""
-        self.buffer.push(sample)
+        self.resampler.push(sample)
 
     def push_block(self, block: Block) -> None:
         """Takes messages as if their samples were pushed one by one."""
-        self.buffer.push_block(block)
+        self.resampler.push_block(block)
 
-    def deliver(self, reply: FitReply | ChangeReply | StudyReply) -> None:
+    def deliver(self, reply: FitReply | ChangeReply | DiagnosisReply) -> None:
         """Takes the answer to the running request or study; an answer to any other is ignored."""
-        if isinstance(reply, StudyReply):
-            self._student.deliver(reply)
+        if isinstance(reply, DiagnosisReply):
+            self._diagnosis.deliver(reply)
         elif self._waiting is not None and reply.number == self._waiting.number:
             self._reply = reply
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
         """A person approves the set that waits."""
-        answer = self.ledger.approve(self._voice.stamp(self._now), by, sequence)
-        self._voice.act(*answer.actions)
+        answer = self.active_set.approve(self._outbox.stamp(self._now), by, sequence)
+        self._outbox.act(*answer.actions)
         return answer
 
     def roll_back(self, by: str) -> Answer:
         """A person takes the set in force back; from then on sets wait for approval."""
-        answer = self.ledger.roll_back(self._voice.stamp(self._now), by)
+        answer = self.active_set.roll_back(self._outbox.stamp(self._now), by)
         if answer.done:
             self._outdated, self._work = self._number, None
-            self._sentry.restart()
-            self._desk.relearn(self._now, f"rolled back by {by}")
-            self._voice.act(*answer.actions)
+            self._change_supervisor.restart()
+            self._supervisor.relearn(self._now, f"rolled back by {by}")
+            self._outbox.act(*answer.actions)
         return answer
 
     def fit_now(self) -> Answer:
@@ -134,14 +134,14 @@ class Session:
     @property
     def backlog(self) -> float:
         """Data that have arrived and were not worked through yet [s]."""
-        return max(self.buffer.time.newest - self._now, 0.0) if math.isfinite(self._now) else 0.0
+        return max(self.resampler.time.newest - self._now, 0.0) if math.isfinite(self._now) else 0.0
 
     @property
     def busy(self) -> bool:
         """Whether there is a piece of work that waits for nothing."""
         if self._work is None and self._waiting is not None:
             return self._reply is not None
-        return self._work is not None or self._tick_due or self.buffer.busy
+        return self._work is not None or self._tick_due or self.resampler.busy
 
     def poll(self, most: int | None = None) -> list[Action]:
         """Works through what has arrived and returns what to do, in order.
@@ -154,29 +154,29 @@ class Session:
         while self.busy and (most is None or done < most):
             self._piece()
             done += 1
-        return self._voice.take()
+        return self._outbox.take()
 
     def status(self) -> SessionStatus:
         """What the session is doing now."""
-        newest, ledger = self.buffer.time.newest, self.ledger
-        windows = self._learner.fusion.windows
-        force, pending = ledger.in_force, ledger.pending
+        newest, active_set = self.resampler.time.newest, self.active_set
+        windows = self._estimator.fusion.windows
+        force, pending = active_set.in_force, active_set.pending
         return SessionStatus(
-            t=self._voice.stamp(newest),
-            phase=Phase.FITTING if self._waiting is not None else self._voice.phase,
-            reason=self._voice.reason,
-            excitation=self._learner.excitation,
+            t=self._outbox.stamp(newest),
+            phase=Phase.FITTING if self._waiting is not None else self._outbox.phase,
+            reason=self._outbox.reason,
+            excitation=self._estimator.excitation,
             samples=sum(len(w) for w in self._cut.windows),
             window_seconds=self._cut.seconds,
             gaps=self._cut.gaps,
             mse=windows[-1].mse if windows else math.nan,
-            fits=self._desk.fits,
-            rejected=self._desk.rejected,
+            fits=self._supervisor.fits,
+            rejected=self._supervisor.rejected,
             in_force=force.sequence if force else 0,
             pending=pending.sequence if pending else 0,
             stale=force is not None and force.state is SetState.STALE,
-            approval=ledger.approval,
-            faults=dict(self.buffer.faults),
+            approval=active_set.approval,
+            faults=dict(self.resampler.faults),
             backlog=self.backlog,
         )
 
@@ -199,7 +199,7 @@ class Session:
                 tick, self._tick_at = self._tick_at, self._tick_at + self._tick
                 self._work = self._at(tick)
         if self._work is None:
-            rows = self.buffer.work()
+            rows = self.resampler.work()
             if rows is not None:
                 self._take(rows)
         elif next(self._work, _DONE) is _DONE:
@@ -209,77 +209,77 @@ class Session:
         if rows.fresh:
             first = float(rows.t[0])
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
-            self._desk.interrupted(first)
-            self._sentry.restart()
-            self._voice.say(first, "info", "stream", "a stream of data begins")
+            self._supervisor.interrupted(first)
+            self._change_supervisor.restart()
+            self._outbox.say(first, "info", "stream", "a stream of data begins")
         self._store.add(rows)
         self._now = float(rows.t[-1]) + 1.0 / self.settings.rate
 
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
-        seen = yield from self._sentry.look(tick, self._tick, self._learner)
+        seen = yield from self._change_supervisor.look(tick, self._tick, self._estimator)
         if seen is not None:
-            self._voice.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
-            what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._voice.stamp(seen.at):.2f} s"
-            self._voice.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
+            self._outbox.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
+            what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
+            self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
         self._study(tick)
         yield
-        if self._sentry.seen is not None:
+        if self._change_supervisor.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
             yield from self._fit(tick)
 
     def _study(self, tick: float) -> None:
         """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
-        since = self._desk.learn_from
-        told = self._student.answer(tick, since, self._voice.stamp)
+        since = self._supervisor.learn_from
+        told = self._diagnosis.answer(tick, since, self._outbox.stamp)
         if told is not None:
-            self._voice.act(told)
-        moving = self._learner.learned and is_excited(self._learner.excitation)
-        if moving and self._sentry.seen is None and self._desk.quality == Quality():
-            request = self._student.ask(tick, since)
+            self._outbox.act(told)
+        moving = self._estimator.learned and is_excited(self._estimator.excitation)
+        if moving and self._change_supervisor.seen is None and self._supervisor.quality == Quality():
+            request = self._diagnosis.ask(tick, since)
             if request is not None:
-                self._voice.act(request)
+                self._outbox.act(request)
 
     def _explain(self, tick: float) -> None:
-        assert self._sentry.seen is not None
-        stamp = self._voice.stamp(self._sentry.seen.at)
-        request = self._sentry.ask(self._number + 1, tick, self._learner, stamp)
+        assert self._change_supervisor.seen is not None
+        stamp = self._outbox.stamp(self._change_supervisor.seen.at)
+        request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
         self._number, self._waiting = request.number, request
-        self._reply = self._sentry.answer_without_fit(request, self._learner)
+        self._reply = self._change_supervisor.answer_without_fit(request, self._estimator)
         if self._reply is None:
-            self._voice.act(request)
+            self._outbox.act(request)
 
     def _fit(self, tick: float) -> Iterator[None]:
         wanted = self.settings.window
         if self._asked_now:
             self._asked_now, wanted = False, min(SHORT_WINDOW, wanted)
-        start = max(tick - self.settings.window - LEAD, self._desk.learn_from)
+        start = max(tick - self.settings.window - LEAD, self._supervisor.learn_from)
         self._cut = self._store.cut(start - _EPS, tick - _EPS)
         if self._cut.reason or tick - start < wanted - 0.5:
             self._incomplete(tick, start)
             return
         yield
-        quality = judge(self._cut.windows, self._vehicle, self._learner.value("b"), self._learner.learned)
-        self._desk.quality = quality
+        quality = judge(self._cut.windows, self._vehicle, self._estimator.value("b"), self._estimator.learned)
+        self._supervisor.quality = quality
         if quality != Quality():
             phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
-            self._voice.note(tick, phase, quality.fault or quality.grounded)
+            self._outbox.note(tick, phase, quality.fault or quality.grounded)
             return
         yield
         self._number, self._last_fit = self._number + 1, tick
         start = max(start, tick - self.settings.window)
-        self._waiting = self._learner.request(self._number, self._cut.windows, start, tick)
-        self._voice.act(self._waiting)
+        self._waiting = self._estimator.request(self._number, self._cut.windows, start, tick)
+        self._outbox.act(self._waiting)
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self._cut.blocked:
-            self._voice.note(tick, Phase.BLOCKED, self._cut.reason)
+            self._outbox.note(tick, Phase.BLOCKED, self._cut.reason)
             return
         have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
-        self._voice.state(Phase.COLLECTING, f"{have}; {self._cut.reason or 'no gaps'}")
+        self._outbox.state(Phase.COLLECTING, f"{have}; {self._cut.reason or 'no gaps'}")
 
     def _apply(self) -> Iterator[None]:
         request, reply = self._waiting, self._reply
@@ -287,7 +287,7 @@ class Session:
         if request is None or request.number <= self._outdated:
             return
         if isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
-            self._sentry.restart()
-            self._desk.changed(request, reply)
+            self._change_supervisor.restart()
+            self._supervisor.changed(request, reply)
         elif isinstance(request, FitRequest) and isinstance(reply, FitReply):
-            yield from self._desk.fitted(request, reply)
+            yield from self._supervisor.fitted(request, reply)

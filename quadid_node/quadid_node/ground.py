@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, get_args
 
-from quadid.online.answering import Request, answer
+from quadid.online.jobs import Request, answer
 from quadid_node.parcel import ParcelError, pack, unpack
 from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
 

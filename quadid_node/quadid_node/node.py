@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
 from quadid.online import Event, Publish
-from quadid.online.ledger import Answer
+from quadid.online.active_set import Answer
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
@@ -249,7 +249,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         yield
         self._neighbours.look(deaf)
         yield
-        force = service.session.ledger.in_force
+        force = service.session.active_set.in_force
         if speaker.step(self._active) and force is not None:
             self._put(Publish("parameters", force))
         self._neighbours.note(speaker.ours, speaker.problem)
@@ -274,7 +274,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 if problem:
                     return SetParametersResult(successful=False, reason=problem)
                 if change.name == "approval":
-                    self._service.session.ledger.approval = change.value
+                    self._service.session.active_set.approval = change.value
         return SetParametersResult(successful=True)
 
     def _fit_now(self, request: Any, response: Any) -> Any:

@@ -14,9 +14,9 @@ from typing import Any, get_args
 
 import zenoh
 
-from quadid.online.answering import Reply, Request
-from quadid.online.fitting import FitRequest
-from quadid.online.study import StudyRequest
+from quadid.online.background_diagnosis import DiagnosisRequest
+from quadid.online.jobs import Reply, Request
+from quadid.online.window_fit import FitRequest
 from quadid_node.ground import ALIVE
 from quadid_node.parcel import ParcelError, pack, unpack
 from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble
@@ -144,7 +144,7 @@ class RemoteWorker:
         if not self._ground.there:
             self._local.submit(request)
             return
-        limit = STUDY_LIMIT if isinstance(request, StudyRequest) else FAR_LIMIT
+        limit = STUDY_LIMIT if isinstance(request, DiagnosisRequest) else FAR_LIMIT
         self._asked, self._until = request, self._clock() + limit
         try:
             self._ground.ask(request, self._answers, limit)

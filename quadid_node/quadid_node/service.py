@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
-from quadid.online.changes import ChangeReply, ChangeRequest
-from quadid.online.ledger import Answer
+from quadid.online.active_set import Answer
+from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.outbox import Action
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.online.status import SessionStatus
-from quadid.online.study import StudyReply, StudyRequest
-from quadid.online.voice import Action
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 from quadid_node.store import Restored, Store
@@ -148,7 +148,7 @@ class Service:
             if isinstance(action, FitRequest | ChangeRequest):
                 self._fit_began = self._clock()
                 self._worker.submit(action)
-            elif isinstance(action, StudyRequest):
+            elif isinstance(action, DiagnosisRequest):
                 self._studying = self._studying or self._worker.sibling()
                 self._studying.submit(action)
             else:
@@ -163,7 +163,7 @@ class Service:
         outputs: list[Output] = self._history_notes()
         studied = self._studying.poll() if self._studying is not None else []
         for item in (*self._worker.poll(), *studied):
-            if isinstance(item, StudyReply):
+            if isinstance(item, DiagnosisReply):
                 self.session.deliver(item)
             elif isinstance(item, FitReply | ChangeReply):
                 self._fit_seconds = self._clock() - self._fit_began
@@ -202,7 +202,7 @@ class Service:
             self._store.close()
 
     def _rate(self, name: str, now: float) -> float:
-        count = self.session.buffer.counts[name]
+        count = self.session.resampler.counts[name]
         since, before = self._counted.get(name, (now - RATE_MEMORY, 0))
         if now - since >= RATE_MEMORY:
             self._rates[name] = (count - before) / max(now - since, 1e-3)

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from quadid.errors import QuadidError
-from quadid.online.answering import Reply, Request, answer, failed
-from quadid.online.changes import ChangeReply
-from quadid.online.fitting import FitReply
-from quadid.online.study import StudyReply
+from quadid.online.background_diagnosis import DiagnosisReply
+from quadid.online.fault_isolation import ChangeReply
+from quadid.online.jobs import Reply, Request, answer, failed
+from quadid.online.window_fit import FitReply
 from quadid.vehicle import Vehicle
 from quadid_node.warm_up import WarmUp
 from quadid_node.worker_main import READY, THREADS, frame, unframe
@@ -213,7 +213,7 @@ class ProcessWorker:
                 self.state = "idle"
                 if self._request is not None:
                     self._give()
-            elif isinstance(item, FitReply | ChangeReply | StudyReply):
+            elif isinstance(item, FitReply | ChangeReply | DiagnosisReply):
                 self._request, self.state = None, "idle"
                 replies.append(item)
         if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":

@@ -28,8 +28,8 @@ def main() -> None:
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _behave(int(sys.argv[1]))
-    from quadid.online.answering import answer
-    from quadid.online.fitting import warm_up
+    from quadid.online.jobs import answer
+    from quadid.online.window_fit import warm_up
 
     try:
         vehicle = _read(requests)

@@ -16,7 +16,7 @@ from quadid_node.worker import InlineWorker, Trouble
 from benchmarks.online.accuracy import PELICAN, flown
 from benchmarks.online.memory import resident
 from quadid.online import Publish, SessionSettings
-from quadid.online.answering import Reply
+from quadid.online.jobs import Reply
 from quadid.window import Block, Recording
 from studies.soak import memory
 
@@ -142,7 +142,7 @@ class _Tally:
 
     def point(self) -> dict[str, Any]:
         """What was counted since the last point, and memory now."""
-        buffer, worker = self._service.session.buffer, self._worker
+        buffer, worker = self._service.session.resampler, self._worker
         taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
         out = {
             "memory_mib": resident(), "sent": self._sent, "taken": taken, "dropped": dropped,

@@ -60,8 +60,8 @@ class CountingNode(quadid_node.node.IdentifyNode):
         line = {
             "t": time.time(), "messages": dict(self.counted), "p50": float(np.median(ms)) if len(ms) else None,
             "p99": float(np.quantile(ms, 0.99)) if len(ms) else None, "max": float(ms.max()) if len(ms) else None,
-            "taken": dict(session.buffer.counts) if session else {},
-            "dropped": dict(session.buffer.faults) if session else {},
+            "taken": dict(session.resampler.counts) if session else {},
+            "dropped": dict(session.resampler.faults) if session else {},
             "fits": status.fits if status else 0, "in_force": status.in_force if status else 0,
             "backlog": status.backlog if status else 0.0, "memory": memory.parts(),
         }  # fmt: skip

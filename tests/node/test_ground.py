@@ -264,7 +264,7 @@ def test_a_parcel_that_wants_more_than_records_is_refused(item: object) -> None:
 
 
 def test_functions_of_our_own_rooms_are_refused() -> None:
-    for name in ("quadid.online.fitting\nfit_window", "quadid.online.answering\nnp", "quadid.window\nWindow.__init__"):
+    for name in ("quadid.online.window_fit\nfit_window", "quadid.online.jobs\nnp", "quadid.window\nWindow.__init__"):
         with pytest.raises(ParcelError):
             unpack(b"c" + name.encode() + b"\n.")
 

@@ -9,7 +9,7 @@ from quadid_replay import write_mcap
 
 from quadid.flight import fly
 from tests.node.peers import Ear, node, player
-from tests.online.test_steering import STEERED, without_rotors
+from tests.online.test_command_reconstruction import STEERED, without_rotors
 
 pytestmark = pytest.mark.usefixtures("ros")
 

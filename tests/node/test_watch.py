@@ -31,8 +31,8 @@ def quadid(*arguments: str) -> Process:
 def test_quadid_watch_shows_the_fleet_and_carries_commands(net: Net) -> None:
     """The command itself, a process of its own: live view, JSON, approval, and a vehicle that is not there."""
     owned = service()
-    owned.session.ledger.approval = "manual"
-    owned.session.ledger.hold(online_set(TRUE), 30.0)
+    owned.session.active_set.approval = "manual"
+    owned.session.active_set.hold(online_set(TRUE), 30.0)
     link = ZenohLink(net.client("quad1"), "quad1", owned)
     link.publish(accepted(2))
     link.report(owned.health())

@@ -57,8 +57,8 @@ def test_three_vehicles_are_seen_and_who_comes_late_gets_the_latest(net: Net) ->
 
 def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
     owned = service()
-    owned.session.ledger.approval = "manual"
-    owned.session.ledger.hold(online_set(TRUE), 30.0)
+    owned.session.active_set.approval = "manual"
+    owned.session.active_set.hold(online_set(TRUE), 30.0)
     link, fleet = ZenohLink(net.client("quad1"), "quad1", owned), Fleet(net.client("watch"))
     try:
         time.sleep(0.5)
@@ -72,8 +72,8 @@ def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
         asker.join()
         assert answers[0][0]
         assert answers[1] == (False, "nothing waits for approval")
-        assert owned.session.ledger.in_force is not None
-        assert owned.session.ledger.in_force.approved_by == "zenoh"
+        assert owned.session.active_set.in_force is not None
+        assert owned.session.active_set.in_force.approved_by == "zenoh"
     finally:
         fleet.close()
         link.close()

@@ -7,9 +7,9 @@ from functools import lru_cache
 
 from quadid.flight import Flight, fly
 from quadid.online import FitRequest, Session, fit_window
-from quadid.online.changes import ChangeRequest, explain_change
+from quadid.online.fault_isolation import ChangeRequest, isolate_fault
+from quadid.online.outbox import Action
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
-from quadid.online.voice import Action
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Sample
 
@@ -44,7 +44,7 @@ def answer(session: Session) -> list[Action]:
         out.extend(session.poll())
         request = session.running
         if isinstance(request, ChangeRequest):
-            session.deliver(explain_change(request))
+            session.deliver(isolate_fault(request))
         elif isinstance(request, FitRequest):
             session.deliver(fit_window(request))
         else:

@@ -14,9 +14,9 @@ from functools import lru_cache
 import numpy as np
 
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
-from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
-from quadid.online.voice import Action
+from quadid.online.outbox import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Sample

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from quadid.flight import fly
-from quadid.online.buffer import Buffer, Rows
-from quadid.online.lines import Line
+from quadid.online.channel_buffer import ChannelBuffer
+from quadid.online.resampler import Resampler, Rows
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Recording
-from tests.online.test_buffer import same
+from tests.online.test_resampler import same
 
 PELICAN = Vehicle.shipped("pelican")
 STEP = 0.05
@@ -32,8 +32,8 @@ def blocks(recording: Recording) -> Iterator[Block]:
             yield Block(t[rows] + 1e5, tuple((n, recording.channels[n].values[rows]) for n in names))
 
 
-def both_ways(stream: list[Block]) -> tuple[list[Rows], list[Rows], Buffer, Buffer]:
-    whole, single = Buffer(PELICAN), Buffer(PELICAN)
+def both_ways(stream: list[Block]) -> tuple[list[Rows], list[Rows], Resampler, Resampler]:
+    whole, single = Resampler(PELICAN), Resampler(PELICAN)
     a, b = [], []
     for block in stream:
         whole.push_block(block)
@@ -96,7 +96,7 @@ def test_blocks_in_any_order_of_arrival(recording: Recording) -> None:
 
 
 def test_a_line_takes_what_had_arrived_by_then_and_no_more() -> None:
-    line = Line(1)
+    line = ChannelBuffer(1)
     line.extend(np.array([1.0, 2.0, 3.0]), np.array([[1.0], [2.0], [3.0]]))
     line.add(4.0, (4.0,))
     assert (line.arrived, line.waiting) == (4, 4)

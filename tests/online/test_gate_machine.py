@@ -30,8 +30,8 @@ from quadid_node.store_file import read_history
 from quadid_node.worker import Trouble
 
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
-from quadid.online.answering import Reply, Request, failed
 from quadid.online.fusion import WindowEstimate
+from quadid.online.jobs import Reply, Request, failed
 from quadid.online.records import OnlineSet
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle
@@ -107,7 +107,7 @@ class Machine(RuleBasedStateMachine):
         self.worker = Adversary()
         self.store = Store(self.path, "pelican")
         self.service = Service(PELICAN, self.settings, self.worker, self.store)
-        self.ledger = self.service.session.ledger
+        self.ledger = self.service.session.active_set
         self.previous = self.ledger.in_force
         self.step()
 

@@ -9,10 +9,10 @@ import pytest
 
 from quadid.identify.fit import FitOptions, fit
 from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState, fit_window
-from quadid.online.changes import ChangeReply
+from quadid.online.fault_isolation import ChangeReply
 from quadid.online.gate import GateSettings
+from quadid.online.outbox import Action
 from quadid.online.records import OnlineSet, Publish
-from quadid.online.voice import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
@@ -114,7 +114,7 @@ def test_manual_approval_waits_and_rollback_stays_manual() -> None:
     assert accepted.approved_by == "ann"
     assert not session.roll_back("ann").done, "there is no earlier set"
     drive(session, [s for s in stream if 14.0 <= s.t < 22.0])
-    if session.ledger.pending is not None:
+    if session.active_set.pending is not None:
         session.approve("bob")
         assert session.roll_back("bob").done
         assert published(session.poll())[-1].parameters.values.tobytes() == accepted.parameters.values.tobytes()
@@ -137,7 +137,7 @@ def _learned(seconds: float, seed: int, until: float) -> tuple[Session, OnlineSe
     stream = samples(flight(seconds, seed).recording)
     session = Session(PELICAN, QUICK)
     drive(session, [s for s in stream if s.t < until])
-    force = session.ledger.in_force
+    force = session.active_set.in_force
     assert force is not None
     return session, force, [s for s in stream if s.t >= until]
 
@@ -162,7 +162,7 @@ def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> Non
 
 def test_a_rollback_drops_the_work_that_was_begun() -> None:
     session, force, later = _learned(24.0, 9, 20.0)
-    session.ledger.accept(replace(force, reason="a second one"), "test", 20.0, 20.0)
+    session.active_set.accept(replace(force, reason="a second one"), "test", 20.0, 20.0)
     for sample in later:
         session.push(sample)
     pieces = 0
@@ -184,7 +184,7 @@ def test_a_set_that_turns_out_worse_is_taken_back() -> None:
     session, good, later = _learned(40.0, 10, 14.0)
     worse = tuple(replace(p, value=p.value * (1.04 if p.name == "b" else 1.0)) for p in good.parameters)
     bad = replace(good, parameters=replace(good.parameters, parameters=worse))
-    session.ledger.accept(bad, "test", 14.0, 14.0)
+    session.active_set.accept(bad, "test", 14.0, 14.0)
     actions = drive(session, later)
     back = published(actions)[0]
     assert back.state is SetState.ROLLED_BACK

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from quadid.online import FitReply, FitRequest, Phase, Session
-from quadid.online.changes import ChangeReply, ChangeRequest
+from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.outbox import Action
 from quadid.online.records import OnlineFinding
-from quadid.online.study import StudyReply, StudyRequest
-from quadid.online.voice import Action
 from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
@@ -116,8 +116,8 @@ def test_a_change_of_a_vehicle_that_is_not_known_yet_needs_no_fit() -> None:
     assert told.findings[0].values["fraction"] == pytest.approx(1.0 / 0.85 - 1.0, rel=0.1)
 
 
-def studies(actions: list[Action]) -> list[StudyRequest]:
-    return [a for a in actions if isinstance(a, StudyRequest)]
+def studies(actions: list[Action]) -> list[DiagnosisRequest]:
+    return [a for a in actions if isinstance(a, DiagnosisRequest)]
 
 
 LONG = light_flight(96.0)
@@ -132,14 +132,14 @@ def test_a_minute_is_studied_beside_the_fits_and_told_half_a_minute_later() -> N
     assert (study.vehicle, study.seed) == (PELICAN, 3)
     assert sum(len(w) for w in study.windows) >= 2995
     assert study.stop <= 62.0 + study.start, "asked for as soon as there is a minute"
-    session.deliver(StudyReply(study.number + 1, (), "unknown"))
-    session.deliver(StudyReply(study.number, (MASS,), "explained"))
+    session.deliver(DiagnosisReply(study.number + 1, (), "unknown"))
+    session.deliver(DiagnosisReply(study.number, (MASS,), "explained"))
     assert session.running is None, "nothing waits for a study"
     rest = works(session, between(LONG, 63.7, 95.7, EPOCH), tells())
     (told,) = diagnosed(rest)
     assert (told.findings, told.verdict) == ((MASS,), "explained")
     assert (told.stop - told.start, told.t) == (60.0, told.stop)
-    assert told.stop == session.buffer.time.stamp(study.stop)
+    assert told.stop == session.resampler.time.stamp(study.stop)
     assert numbers(actions + rest) == list(range(1, session.status().fits + 1)), "studies have their own count"
 
 

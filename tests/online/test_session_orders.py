@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
-from quadid.online.changes import ChangeRequest
+from quadid.online.fault_isolation import ChangeRequest
 from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
@@ -37,7 +37,7 @@ def with_two_sets(shift: float = 0.0) -> Session:
     session = Session(PELICAN, QUICK)
     works(session, between(FLIGHT, 0.0, 8.7, shift), tells(sigma=0.02))
     works(session, between(FLIGHT, 8.7, 13.7, shift), tells(sigma=0.002))
-    assert session.ledger.predecessor is not None
+    assert session.active_set.predecessor is not None
     return session
 
 
@@ -80,7 +80,7 @@ def test_a_rollback_without_an_earlier_set_changes_nothing() -> None:
 
 def test_a_rollback_returns_to_the_set_before_and_learns_anew_from_there() -> None:
     session = with_two_sets(EPOCH)
-    good, before = session.ledger.predecessor, session.ledger.in_force
+    good, before = session.active_set.predecessor, session.active_set.in_force
     assert good is not None
     assert before is not None
     assert session.roll_back("bob").done
@@ -103,7 +103,7 @@ def test_a_rollback_returns_to_the_set_before_and_learns_anew_from_there() -> No
 
 def session_start(session: Session) -> float:
     """What turns session time into stamps [s]."""
-    return session.buffer.time.stamp(0.0)
+    return session.resampler.time.stamp(0.0)
 
 
 def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_counts() -> None:
@@ -181,10 +181,10 @@ def test_fit_now_with_hardly_any_data_says_what_is_missing() -> None:
 def test_a_set_that_predicts_worse_than_its_predecessor_is_taken_back_by_itself() -> None:
     session = Session(PELICAN, QUICK)
     works(session, between(FLIGHT, 0.0, 8.7), tells())
-    good = session.ledger.in_force
+    good = session.active_set.in_force
     assert good is not None
     worse = tuple(replace(p, value=p.value * (1.06 if p.name == "b" else 1.0)) for p in good.parameters)
-    session.ledger.accept(replace(good, parameters=replace(good.parameters, parameters=worse)), "test", 8.0, 8.0)
+    session.active_set.accept(replace(good, parameters=replace(good.parameters, parameters=worse)), "test", 8.0, 8.0)
     actions = works(session, between(FLIGHT, 8.7, 13.7), tells())
     (back,) = published(actions)
     assert (back.state, back.approved_by) == (SetState.ROLLED_BACK, "auto")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
+from quadid.online.outbox import Action
 from quadid.online.records import Publish
-from quadid.online.voice import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Block
 from tests.online.driving import EPOCH, events, published
@@ -120,7 +120,7 @@ def test_the_first_tick_follows_the_first_sample() -> None:
     assert begun.status().reason.startswith("0 of 4 s of flight"), "0.3 s at the tick of 1 s"
     half = Session(PELICAN, QUICK.model_copy(update={"refit": 0.5}))
     late = fits(works(half, between(FLIGHT, 0.0, 5.7, EPOCH + 0.7), tells()))
-    assert half.buffer.time.stamp(late[0].stop) == EPOCH + 4.5, "half a second short is enough"
+    assert half.resampler.time.stamp(late[0].stop) == EPOCH + 4.5, "half a second short is enough"
 
 
 @pytest.mark.parametrize("shift", [0.56, 0.58, 0.6])

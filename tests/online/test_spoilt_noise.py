@@ -8,8 +8,8 @@ import pytest
 from quadid.grid import to_windows
 from quadid.identify.noise import NoiseModel
 from quadid.model.layout import Layout
-from quadid.online.fitting import FitReply, FitRequest, fit_window
-from quadid.online.learner import Learner
+from quadid.online.estimator import Estimator
+from quadid.online.window_fit import FitReply, FitRequest, fit_window
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -50,7 +50,7 @@ def test_a_spoilt_noise_is_found_anew_and_the_fit_done(windows: tuple[Window, ..
 
 
 def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, ...]) -> None:
-    learner = Learner(PELICAN, 60.0, 0)
+    learner = Estimator(PELICAN, 60.0, 0)
     learner.request(1, windows, 0.0, 10.0)
     learner.take(fitted(windows, None, search=True), trusted=True)
     assert learner.noise is not None

@@ -13,7 +13,7 @@ from quadid.window import Channel
 FloatArray = NDArray[np.float64]
 
 
-class Line:
+class ChannelBuffer:
     """Samples of one channel, sorted by time.
 
     Attributes:

@@ -10,9 +10,9 @@ import pytest
 from quadid.flight import fly
 from quadid.flight.stabiliser import default_gains
 from quadid.online import GateSettings, Publish, Session, SessionSettings
-from quadid.online.buffer import Buffer
+from quadid.online.command_reconstruction import SOURCE
 from quadid.online.records import Phase, SetState
-from quadid.online.steering import SOURCE
+from quadid.online.resampler import Resampler
 from quadid.vehicle import Stabiliser, Vehicle
 from quadid.window import Recording
 from tests.online.driving import drive, samples
@@ -30,7 +30,7 @@ def without_rotors(recording: Recording) -> Recording:
 @pytest.mark.parametrize("rate", [50.0, 200.0])
 def test_the_commands_are_those_of_the_vehicle(rate: float) -> None:
     flight = fly(STEERED, seconds=16.0, seed=2, profile="excited", log_rate=rate, command_rate=rate)
-    told, steered = Buffer(STEERED), Buffer(STEERED)
+    told, steered = Resampler(STEERED), Resampler(STEERED)
     for sample in samples(flight.recording):
         told.push(sample)
     for sample in samples(without_rotors(flight.recording)):

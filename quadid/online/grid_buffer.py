@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.online.buffer import Rows
+from quadid.online.resampler import Rows
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +41,7 @@ class Cut:
     blocked: bool = False
 
 
-class RowStore:
+class GridBuffer:
     """Rows of the last `seconds`, one array a channel."""
 
     def __init__(self, rate: float, seconds: float) -> None:

@@ -19,7 +19,7 @@ class Answer:
     actions: tuple[Action, ...] = ()
 
 
-class Ledger:
+class ActiveSet:
     """Accepted sets of one vehicle.
 
     Attributes:

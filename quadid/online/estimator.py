@@ -13,11 +13,11 @@ from quadid.identify.noise import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.identify.uncertainty import Uncertainty, parameter_set
 from quadid.model.layout import Layout
-from quadid.online.fitting import FitReply, FitRequest, prior_of, scaled, unscaled
 from quadid.online.fusion import Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
+from quadid.online.window_fit import FitReply, FitRequest, prior_of, scaled, unscaled
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -34,7 +34,7 @@ NOISE_POOL = 24
 """Windows whose noise is pooled, newest counting fully."""
 
 
-class Learner:
+class Estimator:
     """Estimate of one vehicle.
 
     Attributes:

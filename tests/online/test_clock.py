@@ -7,11 +7,11 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.online.timebase import CONFIRMATIONS, TimeBase
+from quadid.online.clock import CONFIRMATIONS, StreamClock
 
 
 def test_a_single_wild_stamp_moves_nothing() -> None:
-    clock = TimeBase()
+    clock = StreamClock()
     assert clock.time(1.7e9, "gyro") == 1.7e9 % 86400
     assert clock.time(9e12, "gyro") is None
     assert clock.time(1.7e9 + 0.01, "gyro") is not None
@@ -19,7 +19,7 @@ def test_a_single_wild_stamp_moves_nothing() -> None:
 
 
 def test_a_reboot_begins_a_new_stretch_after_the_old_one() -> None:
-    clock = TimeBase()
+    clock = StreamClock()
     clock.time(500.0, "gyro")
     times = [clock.time(0.1 * k, "gyro") for k in range(10)]
     assert times[:CONFIRMATIONS] == [None] * CONFIRMATIONS
@@ -32,7 +32,7 @@ def test_a_reboot_begins_a_new_stretch_after_the_old_one() -> None:
 
 
 def test_a_channel_that_comes_late_is_late_and_no_reboot() -> None:
-    clock = TimeBase()
+    clock = StreamClock()
     for k in range(100):
         assert clock.time(500.0 + 0.1 * k, "gyro") is not None
         t = clock.time(500.0 + 0.1 * (k - 40), "velocity")
@@ -43,7 +43,7 @@ def test_a_channel_that_comes_late_is_late_and_no_reboot() -> None:
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
 def test_any_stamps_give_finite_times_and_a_newest_that_never_falls(stamps: list[float]) -> None:
-    clock, newest = TimeBase(), -math.inf
+    clock, newest = StreamClock(), -math.inf
     for stamp in stamps:
         t = clock.time(stamp, "gyro")
         assert t is None or math.isfinite(t)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError
-from quadid.online.lines import Line
+from quadid.online.channel_buffer import ChannelBuffer
 from quadid.rotation import continuous_sign
 from quadid.rotor_signal import RotorSignal
 from quadid.stabiliser import mixer_matrix, pack_gains, stabilise_rows
@@ -44,7 +44,7 @@ MOST_RUNS = 20
 """Runs of the stabiliser between two samples of the gyro, at most."""
 
 
-class Steering:
+class CommandReconstruction:
     """The stabiliser of one vehicle, run beside the stream."""
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -81,17 +81,17 @@ class Steering:
         self._t = np.empty(0)
         self._commands = np.empty((0, len(self._mixer)))
 
-    def advance(self, lines: Mapping[str, Line], until: float, forget: float) -> None:
+    def advance(self, buffers: Mapping[str, ChannelBuffer], until: float, forget: float) -> None:
         """Computes commands up to a time.
 
         Args:
-            lines: samples by channel.
+            buffers: samples by channel.
             until: time [s] up to which all samples are there.
             forget: commands before this time [s] are dropped.
         """
         if self._gains is None:
             return
-        reference, attitude, gyro = (lines[name] for name in NEEDED)
+        reference, attitude, gyro = (buffers[name] for name in NEEDED)
         if min(len(reference.t), len(attitude.t)) < 1 or len(gyro.t) < 2:
             return
         start = max(float(reference.t[0]), float(attitude.t[0]))
@@ -108,7 +108,7 @@ class Steering:
             t = t[torn[-1] :]
             if len(t) < 2:
                 return
-        commands = self._run(lines, t, min(max(round(self._rate * period), 1), MOST_RUNS))
+        commands = self._run(buffers, t, min(max(round(self._rate * period), 1), MOST_RUNS))
         if commands is None or (self._settled and np.mean(commands**2) * len(self._mixer) < LANDED * self._hover):
             self.restart()
             return
@@ -120,14 +120,14 @@ class Steering:
         else:
             self._settle(np.diff(t), commands, gyro.values[last + 1 - len(t) : last + 1])
 
-    def _run(self, lines: Mapping[str, Line], t: FloatArray, runs: int) -> FloatArray | None:
+    def _run(self, buffers: Mapping[str, ChannelBuffer], t: FloatArray, runs: int) -> FloatArray | None:
         """Commands from each of the times `t` to the next, shape (len(t) - 1, rotors); None: measured too long ago."""
         assert self._gains is not None
-        reference, attitude, gyro = (lines[name] for name in NEEDED)
+        reference, attitude, gyro = (buffers[name] for name in NEEDED)
         at = (t[:-1, None] + np.diff(t)[:, None] * (np.arange(runs) / runs)).ravel()
-        held, nearest = (np.searchsorted(line.t, at + 1e-9, "right") - 1 for line in (reference, attitude))
-        for line, before in ((reference, held), (attitude, nearest)):
-            if (at - line.t[before] > _oldest(line)).any():
+        held, nearest = (np.searchsorted(buffer.t, at + 1e-9, "right") - 1 for buffer in (reference, attitude))
+        for buffer, before in ((reference, held), (attitude, nearest)):
+            if (at - buffer.t[before] > _oldest(buffer)).any():
                 return None
         commands = np.empty((len(at), len(self._mixer)))
         stabilise_rows(
@@ -167,16 +167,16 @@ class Steering:
         return RotorSignal(self._t[:count], self._commands[:count], "held", SOURCE)
 
 
-def _oldest(line: Line) -> float:
+def _oldest(buffer: ChannelBuffer) -> float:
     """Age of the newest sample of a channel beyond which it is not steered by [s]."""
-    return min(OLDEST, GAP * float(np.median(np.diff(line.t)))) if len(line.t) > 1 else OLDEST
+    return min(OLDEST, GAP * float(np.median(np.diff(buffer.t)))) if len(buffer.t) > 1 else OLDEST
 
 
-def _between(line: Line, at: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(at, line.t, column) for column in line.values.T])
+def _between(buffer: ChannelBuffer, at: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(at, buffer.t, column) for column in buffer.values.T])
 
 
-def _turned(line: Line, at: FloatArray) -> FloatArray:
+def _turned(buffer: ChannelBuffer, at: FloatArray) -> FloatArray:
     """Attitudes at times, quaternions, by straight lines between neighbours of the same sign."""
-    out = np.column_stack([np.interp(at, line.t, column) for column in continuous_sign(line.values).T])
+    out = np.column_stack([np.interp(at, buffer.t, column) for column in continuous_sign(buffer.values).T])
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))

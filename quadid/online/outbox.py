@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from quadid.online.changes import ChangeRequest
-from quadid.online.fitting import FitRequest
+from quadid.online.background_diagnosis import DiagnosisRequest
+from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.records import Diagnosed, Event, Phase, Publish
-from quadid.online.study import StudyRequest
+from quadid.online.window_fit import FitRequest
 
-Action = FitRequest | ChangeRequest | StudyRequest | Publish | Diagnosed | Event
+Action = FitRequest | ChangeRequest | DiagnosisRequest | Publish | Diagnosed | Event
 
 
-class Voice:
+class Outbox:
     """Phase, reason and outgoing actions.
 
     Attributes:

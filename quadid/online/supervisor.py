@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from quadid.online.changes import ChangeReply, ChangeRequest
-from quadid.online.fitting import FitReply, FitRequest
+from quadid.online.active_set import ActiveSet
+from quadid.online.estimator import Estimator
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
-from quadid.online.learner import Learner
-from quadid.online.ledger import Ledger
+from quadid.online.outbox import Outbox
 from quadid.online.quality import Quality
 from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
-from quadid.online.voice import Voice
+from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 
 _EPS = 1e-6
 
 
-class Desk:
+class Supervisor:
     """Judges what the fits bring.
 
     Attributes:
@@ -27,9 +27,9 @@ class Desk:
         fits, rejected: fits done, and those the gate refused.
     """
 
-    def __init__(self, learner: Learner, ledger: Ledger, voice: Voice, gate: GateSettings) -> None:
-        """Works on the estimate of `learner` and the sets of `ledger`, speaks through `voice`."""
-        self._learner, self._ledger, self._voice, self._gate = learner, ledger, voice, gate
+    def __init__(self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings) -> None:
+        """Works on the estimate of `estimator` and the sets of `active_set`, speaks through `outbox`."""
+        self._estimator, self._active_set, self._outbox, self._gate = estimator, active_set, outbox, gate
         self.learn_from = -math.inf
         self.quality = Quality()
         self.fits = self.rejected = 0
@@ -41,41 +41,41 @@ class Desk:
 
     def relearn(self, start: float, why: str) -> None:
         """Forgets what was learned; learns from `start` [s] on."""
-        self._learner.forget()
+        self._estimator.forget()
         self.interrupted(start)
-        self._ledger.drop_pending()
-        self._voice.state(Phase.COLLECTING, f"{why}: learning anew")
+        self._active_set.drop_pending()
+        self._outbox.state(Phase.COLLECTING, f"{why}: learning anew")
 
     def changed(self, request: ChangeRequest, reply: ChangeReply) -> None:
         """Publishes what a sudden change was."""
-        voice, finding = self._voice, reply.finding
+        outbox, finding = self._outbox, reply.finding
         verdict = "explained" if finding is not None and finding.confident else "unknown"
-        start, stop = voice.stamp(request.start), voice.stamp(request.stop)
-        voice.act(Diagnosed(stop, start, stop, (finding,) if finding is not None else (), verdict))
+        start, stop = outbox.stamp(request.start), outbox.stamp(request.stop)
+        outbox.act(Diagnosed(stop, start, stop, (finding,) if finding is not None else (), verdict))
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
-        voice.say(request.stop, "warning", "finding", text)
+        outbox.say(request.stop, "warning", "finding", text)
         self.relearn(request.start + 0.1, "the vehicle has changed")
 
     def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
         """Takes in the fit of a window, piece by piece."""
         if reply.problem:
-            self._voice.note(request.stop, Phase.FAILED, reply.problem)
+            self._outbox.note(request.stop, Phase.FAILED, reply.problem)
             return
         if reply.estimate is None:
-            self._learner.take(reply, trusted=False)
+            self._estimator.take(reply, trusted=False)
             why = f"roll and pitch move too little: {_unrevealed(reply)}"
-            self._voice.note(request.stop, Phase.NOT_EXCITED, why)
+            self._outbox.note(request.stop, Phase.NOT_EXCITED, why)
             return
         self.fits += 1
         if not reply.estimate.finite:
             # Information adds up: one such window would spoil every estimate after it.
-            self._voice.note(request.stop, Phase.FAILED, "the fit of the newest window gave values that are no numbers")
+            self._outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
-        if not self._learner.fusion.judge(reply.estimate).agrees:
+        if not self._estimator.fusion.judge(reply.estimate).agrees:
             self._odd(request)
             return
         self._odd_since = None
-        self._learner.take(reply, trusted=True)
+        self._estimator.take(reply, trusted=True)
         yield
         if not self._taken_back(reply):
             self._judge(request, reply)
@@ -84,58 +84,60 @@ class Desk:
         """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed."""
         if self._odd_since is None:
             self._odd_since = request.stop
-        self._voice.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
+        self._outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
         if request.start < self._odd_since - _EPS:
             return
-        start, stop = self._voice.stamp(self._odd_since), self._voice.stamp(request.stop)
-        self._voice.act(Diagnosed(stop, start, stop, (), "unknown"))
+        start, stop = self._outbox.stamp(self._odd_since), self._outbox.stamp(request.stop)
+        self._outbox.act(Diagnosed(stop, start, stop, (), "unknown"))
         text = "windows disagree with what was known, for as long as a window: learning anew"
-        self._voice.say(request.stop, "warning", "change", text)
+        self._outbox.say(request.stop, "warning", "change", text)
         self.relearn(request.start, "the vehicle has changed")
 
     def _taken_back(self, reply: FitReply) -> bool:
         """Watches the set in force; rolls it back when its predecessor predicts new windows better."""
-        estimate, ledger = reply.estimate, self._ledger
-        if estimate is None or ledger.predecessor is None:
+        estimate, active_set = reply.estimate, self._active_set
+        if estimate is None or active_set.predecessor is None:
             return False
-        loss = self._learner.deviance(estimate, ledger.in_force) - self._learner.deviance(estimate, ledger.predecessor)
-        if not ledger.watch(estimate.start, estimate.stop, loss) or ledger.watched <= self._gate.watch:
+        loss = self._estimator.deviance(estimate, active_set.in_force) - self._estimator.deviance(
+            estimate, active_set.predecessor
+        )
+        if not active_set.watch(estimate.start, estimate.stop, loss) or active_set.watched <= self._gate.watch:
             return False
-        why = f"it predicts new windows worse than its predecessor (deviance {ledger.watched:.0f})"
-        self._voice.act(*ledger.roll_back(self._voice.stamp(estimate.stop), "auto", why).actions)
+        why = f"it predicts new windows worse than its predecessor (deviance {active_set.watched:.0f})"
+        self._outbox.act(*active_set.roll_back(self._outbox.stamp(estimate.stop), "auto", why).actions)
         self.relearn(estimate.stop, "a set was taken back")
         return True
 
     def _judge(self, request: FitRequest, reply: FitReply) -> None:
-        parameters = self._learner.parameters()
+        parameters = self._estimator.parameters()
         if parameters is None:
             return
-        ledger, voice = self._ledger, self._voice
-        case = self._learner.case(
-            parameters, self.quality, reply, ledger.in_force, ledger.baseline, ledger.approval, self._gate.windows,
-            ledger.seen,
+        active_set, outbox = self._active_set, self._outbox
+        case = self._estimator.case(
+            parameters, self.quality, reply, active_set.in_force, active_set.baseline, active_set.approval,
+            self._gate.windows, active_set.seen,
         )  # fmt: skip
         decision = decide(case, self._gate)
-        mse, unseen = self._learner.scores()
-        stop = voice.stamp(request.stop)
+        mse, unseen = self._estimator.scores()
+        stop = outbox.stamp(request.stop)
         item = OnlineSet(
-            0, decision.state, decision.reason, parameters, voice.stamp(self._learner.start), stop,
-            self._learner.rows, mse, unseen, self._learner.input_hash, check=decision.check,
+            0, decision.state, decision.reason, parameters, outbox.stamp(self._estimator.start), stop,
+            self._estimator.rows, mse, unseen, self._estimator.input_hash, check=decision.check,
         )  # fmt: skip
         if decision.state is SetState.ACCEPTED:
-            voice.act(*ledger.accept(item, "auto", stop, request.stop))
-            item = ledger.in_force or item
+            outbox.act(*active_set.accept(item, "auto", stop, request.stop))
+            item = active_set.in_force or item
         elif decision.state is SetState.PENDING:
-            item = ledger.hold(item, request.stop)
+            item = active_set.hold(item, request.stop)
         else:
             self.rejected += 1
-        voice.act(Publish("candidate", item))
-        voice.state(self._phase_of(decision.state), f"{decision.check}: {decision.reason}")
+        outbox.act(Publish("candidate", item))
+        outbox.state(self._phase_of(decision.state), f"{decision.check}: {decision.reason}")
 
     def _phase_of(self, state: SetState) -> Phase:
-        if state is SetState.PENDING or self._ledger.pending is not None:
+        if state is SetState.PENDING or self._active_set.pending is not None:
             return Phase.PENDING
-        force = self._ledger.in_force
+        force = self._active_set.in_force
         return Phase.ACCEPTED if force is not None and force.state is not SetState.STALE else Phase.CANDIDATE
 
 

@@ -1,4 +1,4 @@
-"""Buffer of a live stream: samples of different rates, in any order, become rows of one uniform grid.
+"""Resampler of a live stream: samples of different rates, in any order, become rows of one uniform grid.
 
 The rules of resampling are those of logs (`quadid.tracks`): no lag is invented, gaps are not bridged.  Rows leave in
 blocks once every channel had `SETTLE` seconds to arrive, so the order in which messages of different topics come in
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
-from quadid.online.gridding import columns_on_grid
-from quadid.online.lines import Line
-from quadid.online.steering import Steering
-from quadid.online.timebase import TimeBase
+from quadid.online.channel_buffer import ChannelBuffer
+from quadid.online.clock import StreamClock
+from quadid.online.command_reconstruction import CommandReconstruction
+from quadid.online.grid_columns import columns_on_grid
 from quadid.resample import HALF_WIDTH, lowpass
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.tracks import make_plan
@@ -67,7 +67,7 @@ class _Due:
     Attributes:
         first: first point of the grid [s].
         row: number of the block's first row; -1: a new beginning.
-        arrived: samples that had come by then, by line.
+        arrived: samples that had come by then, by buffer.
     """
 
     first: float
@@ -75,7 +75,7 @@ class _Due:
     arrived: tuple[int, ...]
 
 
-class Buffer:
+class Resampler:
     """Samples in, rows out.
 
     Attributes:
@@ -90,13 +90,13 @@ class Buffer:
         self.faults: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
         self.last: dict[str, float] = {}
-        self.time = TimeBase()
+        self.time = StreamClock()
         self._vehicle = vehicle
         self._step = 1.0 / rate
         rotors = len(vehicle.rotors)
         self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
-        self._lines = {name: Line(count) for name, count in self._columns.items()}
-        self._steering = Steering(vehicle)
+        self._buffers = {name: ChannelBuffer(count) for name, count in self._columns.items()}
+        self._reconstruction = CommandReconstruction(vehicle)
         self._due: deque[_Due] = deque()
         self._making: Iterator[Rows | None] | None = None
         self._first = math.inf
@@ -127,12 +127,12 @@ class Buffer:
         if t is None:
             self.faults[f"{name}: unconfirmed time"] += 1
             return
-        line = self._lines[name]
-        if line.waiting >= MOST_SAMPLES:
+        buffer = self._buffers[name]
+        if buffer.waiting >= MOST_SAMPLES:
             self.faults[f"{name}: flood"] += 1
             return
         self._advance(name, t)
-        line.add(t, values)
+        buffer.add(t, values)
         self._note_due()
         self.counts[name] += 1
         if t > self.last.get(name, -math.inf):
@@ -155,10 +155,10 @@ class Buffer:
         if math.isnan(self._next) or len(self.time.steps) > self._steps_seen:
             return None
         for name, values in block.columns:
-            line = self._lines.get(name)
-            if line is None or values.shape[1] != self._columns[name]:
+            buffer = self._buffers.get(name)
+            if buffer is None or values.shape[1] != self._columns[name]:
                 return None
-            if not np.abs(values).max(initial=0.0) < _LARGE or line.waiting + len(values) > MOST_SAMPLES:
+            if not np.abs(values).max(initial=0.0) < _LARGE or buffer.waiting + len(values) > MOST_SAMPLES:
                 return None
             if name == "attitude" and not (np.abs(np.sqrt(np.sum(values * values, axis=1)) - 1.0) < 0.9e-3).all():
                 return None
@@ -170,7 +170,7 @@ class Buffer:
         newest = float(times.max())
         self.time.note(newest, [name for name, _ in block.columns])
         for name, values in block.columns:
-            self._lines[name].extend(times, values[start:stop])
+            self._buffers[name].extend(times, values[start:stop])
             self.counts[name] += len(times)
             self.last[name] = max(self.last.get(name, -math.inf), newest)
 
@@ -205,19 +205,19 @@ class Buffer:
 
     def _restart(self, arrived: tuple[int, ...]) -> None:
         self._fresh = True
-        self._steering.restart()
-        for line, count in zip(self._lines.values(), arrived, strict=True):
-            line.restart(count)
+        self._reconstruction.restart()
+        for buffer, count in zip(self._buffers.values(), arrived, strict=True):
+            buffer.restart(count)
 
     def _make(self, due: _Due) -> Iterator[Rows | None]:
         """Makes a block of rows piece by piece: None after each piece but the last."""
         at: FloatArray = due.first + self._step * np.arange(due.row, due.row + BLOCK, dtype=np.float64)
         self._settle(float(at[0]), due.arrived)
         yield None
-        rows = yield from self._grid(at, dict(zip(self._lines, due.arrived, strict=True)))
+        rows = yield from self._grid(at, dict(zip(self._buffers, due.arrived, strict=True)))
         self._fresh = False
-        for line in self._lines.values():
-            line.forget(float(at[0]) - HISTORY)
+        for buffer in self._buffers.values():
+            buffer.forget(float(at[0]) - HISTORY)
         yield rows
 
     def _advance(self, name: str, t: float) -> None:
@@ -249,12 +249,12 @@ class Buffer:
         return self._first + self._step * (self._row + BLOCK - 1) + SETTLE
 
     def _arrived(self) -> tuple[int, ...]:
-        return tuple(line.arrived for line in self._lines.values())
+        return tuple(buffer.arrived for buffer in self._buffers.values())
 
     def _settle(self, start: float, arrived: tuple[int, ...]) -> None:
         oldest = start - HISTORY if self._fresh else start - SETTLE
-        for (name, line), count in zip(self._lines.items(), arrived, strict=True):
-            late, doubles = line.settle(oldest, count)
+        for (name, buffer), count in zip(self._buffers.items(), arrived, strict=True):
+            late, doubles = buffer.settle(oldest, count)
             if late:
                 self.faults[f"{name}: late"] += late
             if doubles:
@@ -262,8 +262,8 @@ class Buffer:
 
     def _grid(self, at: FloatArray, arrived: Mapping[str, int]) -> Generator[None, None, Rows]:
         channels = {}
-        for name, line in self._lines.items():
-            channel = line.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
+        for name, buffer in self._buffers.items():
+            channel = buffer.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
             if channel is not None:
                 channels[name] = channel
         recording = Recording("live", "stream", channels)
@@ -279,11 +279,11 @@ class Buffer:
     def _rotor_signal(self, recording: Recording, at: FloatArray, arrived: Mapping[str, int]) -> RotorSignal:
         """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
         told = arrived["rotor_speed"] or arrived["motor_command"]
-        if told or not self._steering.known or not arrived["attitude_reference"]:
+        if told or not self._reconstruction.known or not arrived["attitude_reference"]:
             return rotor_signal(recording, self._vehicle)
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
-        self._steering.advance(self._lines, until, float(at[0]) - HISTORY)
-        return self._steering.signal(until)
+        self._reconstruction.advance(self._buffers, until, float(at[0]) - HISTORY)
+        return self._reconstruction.signal(until)
 
 
 def _first(true: NDArray[np.bool_]) -> int:
@@ -300,4 +300,4 @@ def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
     return q if abs(norm - 1.0) <= 1e-3 else tuple(c / norm for c in q)
 
 
-__all__ = ["BLOCK", "HISTORY", "SETTLE", "Buffer", "Rows"]
+__all__ = ["BLOCK", "HISTORY", "SETTLE", "Resampler", "Rows"]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.online.buffer import Rows
+from quadid.online.resampler import Rows
 from quadid.resample import median
 from quadid.vehicle import Vehicle
 
@@ -63,7 +63,7 @@ class _Chunk:
     gyroscopic: FloatArray
 
 
-class Monitor:
+class ChangeDetector:
     """Watches the rows of one flight for sudden changes."""
 
     def __init__(self, vehicle: Vehicle) -> None:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from quadid.flight import fly
 from quadid.grid import to_windows
-from quadid.online.buffer import BLOCK, SETTLE, Buffer, Rows
-from quadid.online.rows import RowStore
+from quadid.online.grid_buffer import GridBuffer
+from quadid.online.resampler import BLOCK, SETTLE, Resampler, Rows
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
 from tests.faults.evidence import Happened
@@ -21,8 +21,8 @@ from tests.online.driving import EPOCH, flight, samples
 PELICAN = Vehicle.shipped("pelican")
 
 
-def run(stream: Sequence[Sample], buffer: Buffer | None = None) -> tuple[list[Rows], Buffer]:
-    buffer = buffer or Buffer(PELICAN)
+def run(stream: Sequence[Sample], buffer: Resampler | None = None) -> tuple[list[Rows], Resampler]:
+    buffer = buffer or Resampler(PELICAN)
     rows = []
     for sample in stream:
         buffer.push(sample)
@@ -89,7 +89,7 @@ def test_when_rows_are_asked_for_changes_nothing_not_even_for_late_samples_and_a
     arrived = sorted(first, key=lambda s: s.t + delay.get(s.channel, 0.0) + rng.exponential(0.05))
     arrived += samples(flight(4.0).recording, 3.0)
     prompt, seen = run(arrived)
-    lazy = Buffer(PELICAN)
+    lazy = Resampler(PELICAN)
     rows: list[Rows] = []
     for k, sample in enumerate(arrived):
         lazy.push(sample)
@@ -105,7 +105,7 @@ def test_what_arrives_between_two_pieces_of_work_changes_nothing() -> None:
     stream = sorted(
         samples(flight(4.0).recording), key=lambda s: s.t + {"gyro": 0.1, "rotor_speed": 0.3}.get(s.channel, 0.0)
     )
-    rows, buffer, pieces = [], Buffer(PELICAN), 0
+    rows, buffer, pieces = [], Resampler(PELICAN), 0
     for sample in stream:
         buffer.push(sample)
         if buffer.busy:
@@ -117,7 +117,7 @@ def test_what_arrives_between_two_pieces_of_work_changes_nothing() -> None:
     assert same(rows, run(stream)[0])
 
 
-def taken(buffer: Buffer) -> list[Rows]:
+def taken(buffer: Resampler) -> list[Rows]:
     return list(iter(buffer.next_rows, None))
 
 
@@ -151,7 +151,7 @@ def test_values_that_are_no_numbers_never_reach_a_row(bad: float, happened: Happ
 
 
 def test_wrong_width_unknown_channel_and_zero_quaternion_are_counted() -> None:
-    buffer = Buffer(PELICAN)
+    buffer = Resampler(PELICAN)
     buffer.push(Sample(0.0, "gyro", (1.0, 2.0)))
     buffer.push(Sample(0.0, "altitude", (1.0,)))
     buffer.push(Sample(0.0, "attitude", (0.0, 0.0, 0.0, 0.0)))
@@ -161,7 +161,7 @@ def test_wrong_width_unknown_channel_and_zero_quaternion_are_counted() -> None:
 def test_a_gap_is_not_bridged() -> None:
     stream = [s for s in samples(flight(12.0).recording) if not 5.0 < s.t < 6.0]
     rows, _ = run(stream)
-    store = RowStore(50.0, 30.0)
+    store = GridBuffer(50.0, 30.0)
     for block in rows:
         store.add(block)
     cut = store.cut(0.0, 11.0)

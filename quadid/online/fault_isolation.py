@@ -14,7 +14,7 @@ from quadid.identify.polish import Prior, polish
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, NEVER, Layout
-from quadid.online.monitor import Change
+from quadid.online.change_detection import Change
 from quadid.online.records import Alternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -91,7 +91,7 @@ class _Outcome:
     mse: float
 
 
-def explain_change(request: ChangeRequest) -> ChangeReply:
+def isolate_fault(request: ChangeRequest) -> ChangeReply:
     """Fits every look-alike to the data after the change; trouble is told in the reply, never raised."""
     try:
         return _explain(request)

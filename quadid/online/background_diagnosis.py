@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from quadid.errors import QuadidError
+from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.records import Alternative, Diagnosed, OnlineFinding
-from quadid.online.rows import COMPLETE, RowStore
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
-STUDIED = 60.0
+DIAGNOSED_SECONDS = 60.0
 """Flight that a diagnosis looks at [s]."""
 ANSWER_AFTER = 30.0
 """Time of the data between question and published answer [s]."""
@@ -24,7 +24,7 @@ Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class StudyRequest:
+class DiagnosisRequest:
     """The last minute, to be diagnosed.
 
     Attributes:
@@ -43,7 +43,7 @@ class StudyRequest:
 
 
 @dataclass(frozen=True)
-class StudyReply:
+class DiagnosisReply:
     """Answer: findings, most important first, with the verdict of `quadid.diagnose`; or why there is none."""
 
     number: int
@@ -52,14 +52,14 @@ class StudyReply:
     problem: str = ""
 
 
-def diagnose_window(request: StudyRequest) -> StudyReply:
+def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
     """Diagnoses; trouble is told in the reply, never raised."""
     from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
 
     try:
         result, _ = diagnose(request.windows, request.vehicle, seed=request.seed, swarm=True)
     except (QuadidError, ArithmeticError, ValueError) as error:
-        return StudyReply(request.number, problem=str(error))
+        return DiagnosisReply(request.number, problem=str(error))
     findings = []
     for f in result.findings:
         findings.append(OnlineFinding(
@@ -68,38 +68,38 @@ def diagnose_window(request: StudyRequest) -> StudyReply:
             {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
             tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
         ))  # fmt: skip
-    return StudyReply(request.number, tuple(findings), result.verdict.value)
+    return DiagnosisReply(request.number, tuple(findings), result.verdict.value)
 
 
-class Student:
+class BackgroundDiagnosis:
     """Asks for diagnoses of one vehicle, and tells what is new in their answers."""
 
-    def __init__(self, vehicle: Vehicle, store: RowStore, every: float, seed: int) -> None:
+    def __init__(self, vehicle: Vehicle, store: GridBuffer, every: float, seed: int) -> None:
         """Studies the rows of `store` every so many seconds of flight [s]; 0: never."""
         self._vehicle, self._store, self._every, self._seed = vehicle, store, every, seed
-        self._asked: StudyRequest | None = None
-        self._reply: StudyReply | None = None
+        self._asked: DiagnosisRequest | None = None
+        self._reply: DiagnosisReply | None = None
         self._last, self._number = -math.inf, 0
-        self._told: StudyReply | None = None
+        self._told: DiagnosisReply | None = None
 
-    def ask(self, tick: float, since: float) -> StudyRequest | None:
+    def ask(self, tick: float, since: float) -> DiagnosisRequest | None:
         """The next question, if it is time for one.
 
         Args:
             tick: now [s].
             since: data before this belong to another vehicle [s].
         """
-        start = tick - STUDIED
+        start = tick - DIAGNOSED_SECONDS
         if not self._every or self._asked is not None or tick - self._last < self._every or start < since:
             return None
         cut = self._store.cut(start, tick)
-        if cut.reason or cut.seconds < COMPLETE * STUDIED:
+        if cut.reason or cut.seconds < COMPLETE * DIAGNOSED_SECONDS:
             return None
         self._last, self._number = tick, self._number + 1
-        self._asked = StudyRequest(self._number, self._vehicle, cut.windows, start, tick, self._seed)
+        self._asked = DiagnosisRequest(self._number, self._vehicle, cut.windows, start, tick, self._seed)
         return self._asked
 
-    def deliver(self, reply: StudyReply) -> None:
+    def deliver(self, reply: DiagnosisReply) -> None:
         """Takes the answer to the running question; an answer to any other is ignored."""
         if self._asked is not None and reply.number == self._asked.number:
             self._reply = reply
@@ -129,7 +129,7 @@ def _stamped(finding: OnlineFinding, stamp: Callable[[float], float]) -> OnlineF
     return replace(finding, values={**finding.values, "time": stamp(finding.values["time"])})
 
 
-def _same(old: StudyReply, new: StudyReply) -> bool:
+def _same(old: DiagnosisReply, new: DiagnosisReply) -> bool:
     """No news: the same verdict and causes, and no number outside the interval told before."""
     if old.verdict != new.verdict or [f.effect for f in old.findings] != [f.effect for f in new.findings]:
         return False

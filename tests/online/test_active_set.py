@@ -9,13 +9,13 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from quadid.online.ledger import Answer, Ledger
+from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.records import Event, Publish, SetState
 from tests.online.test_gate import TRUE, online_set
 
 
 def test_approving_twice_and_an_old_number_do_nothing() -> None:
-    ledger = Ledger("manual")
+    ledger = ActiveSet("manual")
     held = ledger.hold(online_set(TRUE), 30.0)
     assert not ledger.approve(1.0, "ann", sequence=held.sequence + 5).done
     assert ledger.approve(1.0, "ann", sequence=held.sequence).done
@@ -27,7 +27,7 @@ def test_approving_twice_and_an_old_number_do_nothing() -> None:
 
 
 def test_rollback_returns_the_earlier_values_under_a_new_number() -> None:
-    ledger = Ledger("auto")
+    ledger = ActiveSet("auto")
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
     ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
     answer = ledger.roll_back(61.0, "bob")
@@ -40,7 +40,7 @@ def test_rollback_returns_the_earlier_values_under_a_new_number() -> None:
 
 
 def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
-    ledger = Ledger("auto", restored=online_set(TRUE), next_sequence=9)
+    ledger = ActiveSet("auto", restored=online_set(TRUE), next_sequence=9)
     assert ledger.in_force is not None
     assert ledger.in_force.state is SetState.STALE
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
@@ -49,7 +49,7 @@ def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
 
 
 def test_losses_to_the_predecessor_add_up_and_gains_do_not() -> None:
-    ledger = Ledger("auto")
+    ledger = ActiveSet("auto")
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
     assert not ledger.watch(29.5, 39.5, 5.0), "a window that the set has seen"
     assert ledger.watched == 0.0
@@ -63,7 +63,7 @@ def test_losses_to_the_predecessor_add_up_and_gains_do_not() -> None:
 
 def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
     """With words and stamps: they are what the history keeps."""
-    ledger = Ledger("manual")
+    ledger = ActiveSet("manual")
     assert ledger.approve(1.0, "ann") == Answer(False, "nothing waits for approval")
     assert ledger.roll_back(1.0, "ann") == Answer(False, "there is no earlier set to return to")
     waits = ledger.hold(replace(online_set(TRUE), reason="3 windows agree"), 30.0)
@@ -86,7 +86,7 @@ def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
 
 
 def test_a_rollback_by_itself_keeps_the_approval_and_the_baseline() -> None:
-    ledger = Ledger("auto")
+    ledger = ActiveSet("auto")
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
     ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
     baseline = ledger.baseline
@@ -96,7 +96,7 @@ def test_a_rollback_by_itself_keeps_the_approval_and_the_baseline() -> None:
 
 
 def test_a_restored_set_says_where_it_is_from_and_is_the_baseline() -> None:
-    ledger = Ledger("auto", restored=replace(online_set(TRUE), reason="3 windows agree"))
+    ledger = ActiveSet("auto", restored=replace(online_set(TRUE), reason="3 windows agree"))
     assert ledger.in_force is not None
     assert ledger.in_force.reason == "from an earlier run (3 windows agree): not yet confirmed by this flight"
     assert ledger.baseline is ledger.in_force
@@ -104,11 +104,11 @@ def test_a_restored_set_says_where_it_is_from_and_is_the_baseline() -> None:
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
     assert ledger.in_force.sequence == 2, "one more than the restored set's"
     approved = replace(online_set(TRUE), sequence=5)
-    assert Ledger("auto", restored=online_set(TRUE), baseline=approved).baseline is approved
+    assert ActiveSet("auto", restored=online_set(TRUE), baseline=approved).baseline is approved
 
 
 def test_creeping_is_measured_from_the_first_set_or_the_last_one_a_person_approved() -> None:
-    ledger = Ledger("auto")
+    ledger = ActiveSet("auto")
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
     first = ledger.in_force
     assert ledger.baseline is first
@@ -119,7 +119,7 @@ def test_creeping_is_measured_from_the_first_set_or_the_last_one_a_person_approv
 
 
 def test_a_newer_set_that_waits_takes_the_number_of_the_older_one() -> None:
-    ledger = Ledger("manual")
+    ledger = ActiveSet("manual")
     older, newer = (ledger.hold(online_set({**TRUE, "b": b}), 30.0) for b in (2.3e-5, 2.4e-5))
     assert (older.sequence, newer.sequence) == (1, 1)
     assert ledger.pending is newer
@@ -129,14 +129,14 @@ def test_a_newer_set_that_waits_takes_the_number_of_the_older_one() -> None:
 
 
 def test_twenty_sets_can_be_taken_back() -> None:
-    ledger = Ledger("auto")
+    ledger = ActiveSet("auto")
     for k in range(25):
         ledger.accept(online_set(TRUE), "auto", float(k), float(k))
     assert [ledger.roll_back(30.0, "auto").done for _ in range(21)] == [True] * 20 + [False]
 
 
 def test_a_set_that_waits_can_be_dropped() -> None:
-    ledger = Ledger("manual")
+    ledger = ActiveSet("manual")
     ledger.hold(online_set(TRUE), 30.0)
     ledger.drop_pending()
     assert ledger.pending is None
@@ -148,7 +148,7 @@ class Machine(RuleBasedStateMachine):
 
     @initialize(approval=st.sampled_from(["auto", "manual"]))
     def start(self, approval: str) -> None:
-        self.ledger = Ledger(approval)
+        self.ledger = ActiveSet(approval)
         self.numbers: list[int] = []
         self.t = 0.0
 

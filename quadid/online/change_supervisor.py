@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.online.changes import ChangeReply, ChangeRequest
-from quadid.online.learner import Learner
-from quadid.online.monitor import CHUNK, Change, Monitor
+from quadid.online.change_detection import CHUNK, Change, ChangeDetector
+from quadid.online.estimator import Estimator
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.grid_buffer import GridBuffer
 from quadid.online.quality import Quality, judge
 from quadid.online.records import OnlineFinding
-from quadid.online.rows import RowStore
 from quadid.vehicle import Vehicle
 
 AFTER_CHANGE = 3.0
@@ -31,67 +31,67 @@ class Seen:
     at: float
 
 
-class Sentry:
+class ChangeSupervisor:
     """Watches one vehicle for sudden changes.
 
     Attributes:
         seen: the change that is being looked into, or None.
     """
 
-    def __init__(self, vehicle: Vehicle, store: RowStore) -> None:
+    def __init__(self, vehicle: Vehicle, store: GridBuffer) -> None:
         """Watches the rows of `store`, which are of `vehicle`."""
         self._vehicle, self._store = vehicle, store
-        self._monitor = Monitor(vehicle)
+        self._detector = ChangeDetector(vehicle)
         self.seen: Seen | None = None
 
     def restart(self) -> None:
         """Begins anew: the stream was interrupted, or a change was dealt with."""
-        self._monitor.restart()
+        self._detector.restart()
         self.seen = None
 
-    def look(self, tick: float, length: float, learner: Learner) -> Generator[None, None, Seen | None]:
+    def look(self, tick: float, length: float, estimator: Estimator) -> Generator[None, None, Seen | None]:
         """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
         for i in reversed(range(round(length / CHUNK))):
-            self._monitor.add(self._store.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
+            self._detector.add(self._store.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
         if self.seen is not None:
             return None
         yield
         recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
         yield
-        b = learner.value("b")
-        if recent.reason or judge(recent.windows, self._vehicle, b, learner.learned) != Quality():
-            self._monitor.restart()
+        b = estimator.value("b")
+        if recent.reason or judge(recent.windows, self._vehicle, b, estimator.learned) != Quality():
+            self._detector.restart()
             return None
         yield
-        change = self._monitor.look(b, np.array([learner.value(n) for n in ("J_xx", "J_yy", "J_zz")]))
+        change = self._detector.look(b, np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")]))
         if change is None:
             return None
         self.seen = Seen(change, self._store.onset(change.time) if change.channel == "thrust" else change.time)
         return self.seen
 
-    def ask(self, number: int, tick: float, learner: Learner, stamp: float) -> ChangeRequest | None:
+    def ask(self, number: int, tick: float, estimator: Estimator, stamp: float) -> ChangeRequest | None:
         """The question what a change was, once there is enough data after it.
 
         Args:
             number: of the request.
             tick: now [s].
-            learner: what was known before.
+            estimator: what was known before.
             stamp: time of the change as a stamp [s].
         """
         if self.seen is None or tick < self.seen.at + AFTER_CHANGE - _EPS:
             return None
         cut = self._store.cut(self.seen.at + 0.1, tick - _EPS)
         return ChangeRequest(
-            number, self._vehicle, cut.windows, self.seen.at, tick, learner.theta, learner.z_sigma, learner.noise,
+            number, self._vehicle, cut.windows, self.seen.at, tick, estimator.theta, estimator.z_sigma, estimator.noise,
             self.seen.change, stamp,
         )  # fmt: skip
 
     @staticmethod
-    def answer_without_fit(request: ChangeRequest, learner: Learner) -> ChangeReply | None:
+    def answer_without_fit(request: ChangeRequest, estimator: Estimator) -> ChangeReply | None:
         """The answer where a fit could say nothing: no data, or nothing known before."""
         if not request.windows:
             return ChangeReply(request.number, problem="too little data after the change")
-        if not learner.learned:
+        if not estimator.learned:
             return ChangeReply(request.number, _unlearned(request.change, request.time))
         return None
 

@@ -24,7 +24,7 @@ LARGEST = 1e11
 """Stamps beyond this [s] are no times."""
 
 
-class TimeBase:
+class StreamClock:
     """Maps stamps [s] to session time [s], which counts from midnight of the first stamp and never runs back.
 
     Attributes:
