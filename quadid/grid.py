@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
+from quadid.intersample import follow_feedback
 from quadid.resample import COINCIDENT, sample_period
+from quadid.resampling_plan import REQUIRED, Plan, make_plan, on_grid, reach
 from quadid.rotor_signal import RotorSignal, rotor_signal
-from quadid.tracks import REQUIRED, Plan, make_plan, on_grid, reach
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
-from quadid.within_samples import follow_feedback
 
 FloatArray = NDArray[np.float64]
 Span = tuple[float, float]
@@ -91,7 +91,7 @@ def grid_recording(
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
     filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``, with the slope within
-    each sample that the flight controller's feedback makes (`quadid.within_samples`).
+    each sample that the flight controller's feedback makes (`quadid.intersample`).
 
     Args:
         recording: a log in core units and frames.

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from quadid.effects import EFFECTS, known_keys, rotor_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
-from quadid.plain import LONGEST_NAME
+from quadid.sanitise import LONGEST_NAME
 
 FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
@@ -113,7 +113,7 @@ class Stabiliser(_Strict):
     """The on-board attitude stabiliser, where known.
 
     Attributes:
-        gains: by name, as in `quadid.stabiliser`.
+        gains: by name, as in `quadid.attitude_controller`.
         rate: how often it runs [Hz]; None for once a log row.
     """
 

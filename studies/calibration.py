@@ -33,8 +33,8 @@ from quadid.diagnose.result import FoundParameter
 from quadid.diagnose.screen import screen
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
+from quadid.identify.covariance import Z95
 from quadid.identify.shooting import Shooting
-from quadid.identify.uncertainty import Z95
 from studies.campaign import Case, cases, flown
 from studies.page import put_section
 

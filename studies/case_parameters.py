@@ -3,7 +3,7 @@
     QUADID_DATA=../shared/data python -m studies.case_parameters --out docs/results
 
 Errors in stated standard deviations, of the flight that trains and of the one that validates, each by itself.  The last
-column is the inner loop of the flight controller that acted within the samples of the log (`quadid.within_samples`), in
+column is the inner loop of the flight controller that acted within the samples of the log (`quadid.intersample`), in
 1/s^2 on the angle and 1/s on the rate; the rotor speeds run on within each sample as it says.
 """
 
@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
 from quadid.identify.fit import FitOptions, fit
+from quadid.intersample import find_feedback
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.within_samples import find_feedback
 from studies.cases import windows
 from studies.page import put_section
 

@@ -23,8 +23,8 @@ from quadid_cli.excite import knowledge
 from quadid_cli.exciting import Limits, Proposal, Simulator, propose
 
 from quadid.flight import Flight, draw_truth, fly
-from quadid.identify.design import halfwidths
 from quadid.identify.fit import FitOptions, fit
+from quadid.identify.optimal_input import halfwidths
 from quadid.identify.result import fitted_vehicle
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from quadid.baselines.optimisers import NAMES, minimise
 from quadid.flight import draw_truth, fly
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES

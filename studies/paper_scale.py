@@ -21,8 +21,8 @@ import numpy as np
 
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.score import mse_score
-from quadid.identify.swarm import SwarmOptions
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle

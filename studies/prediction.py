@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from quadid_cli.loading import load_logs, load_vehicle
 
 from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.horizon import rate_errors
+from quadid.identify.prediction import rate_errors
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from studies import regression

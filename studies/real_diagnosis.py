@@ -23,8 +23,8 @@ from quadid_cli.loading import load_logs, load_vehicle
 
 from quadid.diagnose import Diagnosis, Workings, diagnose
 from quadid.errors import QuadidError
-from quadid.identify.horizon import horizon_scores
 from quadid.identify.open_loop import QUANTITIES, mean_errors, no_change
+from quadid.identify.prediction import horizon_scores
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -24,7 +24,7 @@ from quadid.baselines.black_box import BlackBox, score_black_box
 from quadid.baselines.quadrotor_io import FEEDTHROUGH, quadrotor_io
 from quadid.baselines.subspace import METHODS, Loop, fit_subspace
 from quadid.flight import fly
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]

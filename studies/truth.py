@@ -24,9 +24,9 @@ from quadid.diagnose.validation import settle
 from quadid.flight import draw_truth, fly
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import FitOptions, fit
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Shooting
-from quadid.identify.spectrum import shaped_noise
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
@@ -73,7 +73,7 @@ def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
 
 
 def _white(shooting: Shooting, theta: FloatArray) -> NoiseModel:
-    from quadid.identify.noise import estimate_noise
+    from quadid.identify.noise_model import estimate_noise
 
     lin = shooting.linearise(theta, shooting.free([]))
     return estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0)

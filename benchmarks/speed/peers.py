@@ -14,10 +14,10 @@ from benchmarks.kernel import numpy_moments, numpy_step
 from benchmarks.speed.flights import flight
 from benchmarks.speed.timing import interleaved
 from quadid.baselines.optimisers import minimise
-from quadid.identify.box import BoxProblem
 from quadid.identify.fit import SWARM_SECONDS, SWARM_SEGMENTS
+from quadid.identify.particle_swarm import Swarm, SwarmOptions
 from quadid.identify.shooting import Shooting
-from quadid.identify.swarm import Swarm, SwarmOptions
+from quadid.identify.shooting_objective import BoxProblem
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 

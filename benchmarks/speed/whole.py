@@ -16,7 +16,7 @@ from benchmarks.speed.timing import child, command, interleaved
 from quadid.diagnose import diagnose
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.swarm import SwarmOptions
+from quadid.identify.particle_swarm import SwarmOptions
 from quadid.model.layout import Layout
 from quadid.online.window_fit import FitRequest, fit_window
 from quadid.vehicle import Vehicle
@@ -169,7 +169,7 @@ def _exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
 def particles_and_parameters(rounds: int) -> dict[str, Any]:
     """The swarm's cost against particles, the linearisation against free parameters and against windows."""
     from quadid.identify.fit import SWARM_SECONDS
-    from quadid.identify.floor import flexible_names
+    from quadid.identify.noise_estimation import flexible_names
     from quadid.identify.shooting import Shooting
     from quadid.parameters import NOMINAL_NAMES
 

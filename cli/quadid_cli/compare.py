@@ -29,8 +29,8 @@ from quadid_cli.options import (
 
 if TYPE_CHECKING:
     from quadid.baselines.comparison import Problem, Tried
-    from quadid.identify.noise import NoiseModel
-    from quadid.identify.stabiliser_gains import Autopilot
+    from quadid.identify.controller_gains import Autopilot
+    from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
     from quadid.window import Window
     from quadid_cli.loading import Log
@@ -109,8 +109,8 @@ def run(
     """
     from quadid.baselines import comparison
     from quadid.baselines.subspace import METHODS as BLACK_BOXES
+    from quadid.identify.controller_gains import find_autopilot
     from quadid.identify.fit import FitOptions, fit
-    from quadid.identify.stabiliser_gains import find_autopilot
     from quadid_cli.searching import check_length
 
     windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]
@@ -156,8 +156,8 @@ class Judge:
     def problem(self, objective: str) -> Problem:
         """The problem that optimisers solve; raises NotIdentifiableError where the data do not hold what it needs."""
         from quadid.errors import NotIdentifiableError
-        from quadid.identify.box import BoxProblem
-        from quadid.identify.closed_loop import PaperProblem
+        from quadid.identify.paper_objective import PaperProblem
+        from quadid.identify.shooting_objective import BoxProblem
 
         if objective == "shooting":
             return BoxProblem(self.train, self.vehicle)
@@ -171,7 +171,7 @@ class Judge:
     def optimiser(self, method: Tried, lowest: float, problem: Problem) -> JsonDict:
         """One optimiser's entry of the result."""
         from quadid.baselines.comparison import Scores, optimiser_entry
-        from quadid.identify.closed_loop import paper_score
+        from quadid.identify.paper_objective import paper_score
         from quadid.identify.score import mse_score
         from quadid.parameters import NOMINAL_NAMES
 

@@ -25,7 +25,7 @@ from quadid_cli.options import (
 
 if TYPE_CHECKING:
     from quadid.diagnose.pipeline import Workings
-    from quadid.identify.noise import NoiseModel
+    from quadid.identify.noise_model import NoiseModel
     from quadid.identify.result import ScoredSet
     from quadid.report.residual_maps import ResidualMap
     from quadid.vehicle import Vehicle

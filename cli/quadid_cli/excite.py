@@ -17,7 +17,7 @@ from quadid_cli.options import JsonTarget, OutFolder, Preset, Rate, ReportFile, 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from quadid.identify.noise import NoiseModel
+    from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
     from quadid_cli.exciting import Limits, Proposal
     from quadid_cli.terminal import Advance

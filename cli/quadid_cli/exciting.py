@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
-from quadid.identify.design import d_optimal, halfwidths
 from quadid.identify.excitation import excitation
+from quadid.identify.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 
 if TYPE_CHECKING:
-    from quadid.identify.noise import NoiseModel
+    from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
     from quadid_cli.terminal import Advance
 

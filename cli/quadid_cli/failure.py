@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from quadid.errors import QuadidError
-from quadid.plain import one_line
+from quadid.sanitise import one_line
 
 
 class Failure(NamedTuple):

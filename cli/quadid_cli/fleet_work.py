@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
-from quadid.plain import one_line
+from quadid.sanitise import one_line
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -113,9 +113,9 @@ def _identified(job: Job) -> Row:
 
 
 def _bounded(fit: Fit, missing: dict[str, str]) -> Fit:
-    from quadid.identify.result import bound_by_file, withheld
+    from quadid.identify.result import bound_by_file, mask_unidentifiable
 
-    return bound_by_file(withheld(fit, missing))
+    return bound_by_file(mask_unidentifiable(fit, missing))
 
 
 def _when(log: Log) -> Row:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import NotIdentifiableError
-from quadid.plain import LONGEST_LINE, plain
+from quadid.sanitise import LONGEST_LINE, plain
 from quadid_cli.options import (
     JsonTarget,
     Logs,
@@ -29,9 +29,9 @@ from quadid_cli.options import (
 from quadid_cli.searching import OPTIMIZERS, check_optimizer, search
 
 if TYPE_CHECKING:
+    from quadid.identify.controller_gains import Autopilot
     from quadid.identify.fit import Fit
     from quadid.identify.result import ScoredSet
-    from quadid.identify.stabiliser_gains import Autopilot
     from quadid.vehicle import Vehicle
     from quadid_cli.loading import Log
     from quadid_cli.terminal import Advance
@@ -128,13 +128,13 @@ def run(
         target: the vehicle file to write.
         advance: told how far the fit is.
     """
-    from quadid.identify.result import bound_by_file, fitted_vehicle, identify_result, withheld
-    from quadid.identify.stabiliser_gains import find_autopilot
+    from quadid.identify.controller_gains import find_autopilot
+    from quadid.identify.result import bound_by_file, fitted_vehicle, identify_result, mask_unidentifiable
     from quadid_cli.output import write_text
 
     begin = time.perf_counter()
     fit = search(optimizer, [w for log in train for w in log.windows], vehicle, seed, advance)
-    fit = bound_by_file(withheld(fit, out_of_reach(train)))
+    fit = bound_by_file(mask_unidentifiable(fit, out_of_reach(train)))
     seconds = time.perf_counter() - begin
     autopilot = find_autopilot([w for log in train for w in log.windows], vehicle)
     sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
@@ -156,7 +156,7 @@ def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
 
 def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> ScoredSet:
     """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
-    from quadid.identify.closed_loop import paper_score
+    from quadid.identify.paper_objective import paper_score
     from quadid.identify.result import ScoredSet
     from quadid.identify.score import mse_score
     from quadid.model.layout import Layout

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from quadid.plain import LONGEST_LINE
-from quadid.plain import plain as clean
+from quadid.sanitise import LONGEST_LINE
+from quadid.sanitise import plain as clean
 from quadid_cli.options import JsonTarget, Preset, Start, Stop
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quadid.diagnose import Diagnosis
-    from quadid.identify.closed_loop import PaperProblem, PaperScore
     from quadid.identify.fit import Fit
-    from quadid.identify.noise import NoiseModel
+    from quadid.identify.noise_model import NoiseModel
+    from quadid.identify.paper_objective import PaperProblem, PaperScore
     from quadid.vehicle import Vehicle
     from quadid.window import Window
     from quadid_cli.terminal import Advance
@@ -129,9 +129,9 @@ def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduc
         seed: of flights and searches.
         advance: told how far it is.
     """
-    from quadid.identify.closed_loop import PaperProblem
+    from quadid.identify.controller_gains import find_autopilot
+    from quadid.identify.paper_objective import PaperProblem
     from quadid.identify.score import mse_score
-    from quadid.identify.stabiliser_gains import find_autopilot
 
     flown = fly(folder, plan, seed, advance)
     train, vehicle = flown.sets[0], flown.vehicle
@@ -216,7 +216,7 @@ def algorithm_1(problem: PaperProblem, plan: Plan, seed: int) -> tuple[float, Co
     """
     from dataclasses import replace
 
-    from quadid.identify.swarm import Stop, Swarm, SwarmOptions
+    from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 
     begin = time.perf_counter()
     options = replace(

@@ -25,7 +25,7 @@ def score(
     out: OutFolder = Path(),
 ) -> None:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
-    from quadid.identify.horizon import horizon_scores
+    from quadid.identify.prediction import horizon_scores
     from quadid.identify.result import score_result
     from quadid.model.layout import Layout
     from quadid_cli import loading, output, tables, terminal

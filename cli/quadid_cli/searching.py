@@ -51,8 +51,8 @@ def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, ad
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance)
     from quadid.baselines.optimisers import minimise
-    from quadid.identify.at_point import fit_at
-    from quadid.identify.box import BoxProblem
+    from quadid.identify.evaluate_at import fit_at
+    from quadid.identify.shooting_objective import BoxProblem
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
     advance(name, 0.0)

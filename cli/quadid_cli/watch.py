@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import QuadidError
-from quadid.plain import plain
+from quadid.sanitise import plain
 from quadid_cli.options import JsonTarget
 
 if TYPE_CHECKING:

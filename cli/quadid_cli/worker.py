@@ -21,7 +21,7 @@ def worker(
     """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone."""
     from quadid_node.stopping import Stop
 
-    from quadid.plain import plain
+    from quadid.sanitise import plain
 
     stop = Stop()
     from quadid_node.ground import work

@@ -13,7 +13,7 @@ from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, quadrotor_i
 from quadid.baselines.state_space import SubspaceModel, predict
 from quadid.baselines.subspace import fit_subspace
 from quadid.errors import NotIdentifiableError
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, expected_squares
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout

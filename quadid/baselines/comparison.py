@@ -39,7 +39,7 @@ SUCCESS = 1.01
 
 
 class Problem(Protocol):
-    """An objective in a box, as every optimiser sees it: `quadid.identify.box`, `quadid.identify.closed_loop`."""
+    """An objective in a box, as every optimiser sees it (`shooting_objective`, `paper_objective`)."""
 
     lower: FloatArray
     upper: FloatArray

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadid.errors import ParameterError
-from quadid.identify.swarm import checked_box, read_only
+from quadid.identify.particle_swarm import checked_box, read_only
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -19,8 +19,8 @@ from quadid.baselines.ledger import WORST, Batch, BudgetSpentError, Ledger, NoGr
 from quadid.baselines.lshade import SMALLEST_POPULATION, LShade, LShadeOptions
 from quadid.baselines.lshade import Stop as LShadeStop
 from quadid.errors import ParameterError, nearest
-from quadid.identify.swarm import Stop as SwarmStop
-from quadid.identify.swarm import Swarm, SwarmOptions, checked_box, read_only
+from quadid.identify.particle_swarm import Stop as SwarmStop
+from quadid.identify.particle_swarm import Swarm, SwarmOptions, checked_box, read_only
 
 FloatArray = NDArray[np.float64]
 Polish = Callable[[Batch, FloatArray, FloatArray, FloatArray], FloatArray]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model, fit_model
-from quadid.identify.floor import flexible_names
+from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.shooting import Shooting
 
 FloatArray = NDArray[np.float64]

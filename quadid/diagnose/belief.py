@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 from quadid.diagnose.handover import sensor_errors
 from quadid.diagnose.models import Model
+from quadid.identify.covariance import Z95
 from quadid.identify.shooting import Shooting
-from quadid.identify.uncertainty import Z95
 from quadid.model.layout import Entry
 
 LIKELY_SENSOR = 10.0

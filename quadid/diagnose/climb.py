@@ -109,4 +109,4 @@ class Climb:
         return next(rung for rung, shooting in enumerate(self._ladder) if not is_long(shooting))
 
     def _follows(self, rung: int, model: Model) -> bool:
-        return model.misfit < (CLEAN_MISFIT if is_long(self._ladder[rung]) else LINEAR_MISFIT)
+        return model.reduced_chi_square < (CLEAN_MISFIT if is_long(self._ladder[rung]) else LINEAR_MISFIT)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from quadid.diagnose.candidates import Candidate, all_names
 from quadid.diagnose.exchange import left_over
 from quadid.diagnose.models import Model, as_model, free_names
-from quadid.identify.free import Free
-from quadid.identify.linearised import Linearised
-from quadid.identify.polish import bounded_step, default_prior, polish, scaled_difference
+from quadid.identify.gauss_newton import bounded_step, default_prior, polish, scaled_difference
+from quadid.identify.parameterization import Free
+from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 

@@ -13,8 +13,8 @@ from quadid.diagnose.search import Search
 from quadid.diagnose.validation import Worth
 from quadid.diagnose.words import evidence
 from quadid.effects import EFFECTS
+from quadid.identify.covariance import Z95, uncertainty
 from quadid.identify.shooting import Shooting
-from quadid.identify.uncertainty import Z95, uncertainty
 
 MOST_ALTERNATIVES = 4
 STEP_SIGMA = 3e-4

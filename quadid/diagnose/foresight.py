@@ -3,7 +3,7 @@
 Where much stays unexplained, the most likely parameters of the findings are those of the fastest motion, which the
 model follows best, and a simulation half a second ahead may be worse than none.  Who needs a prediction all the same is
 better served by effects of the catalogue as stand-ins for what is not known, fitted to miss by as little as possible up
-to half a second ahead (`identify.ahead`).  Such numbers are no physics, and no findings.
+to half a second ahead (`identify.multistep_fit`).  Such numbers are no physics, and no findings.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
 from quadid.diagnose.vehicle_file import Fitted
 from quadid.effects import EFFECTS
-from quadid.identify.ahead import STAGES, fit_ahead
-from quadid.identify.floor import FLEXIBLE_DRAG
-from quadid.identify.free import Free
+from quadid.identify.multistep_fit import STAGES, fit_ahead
+from quadid.identify.noise_estimation import FLEXIBLE_DRAG
 from quadid.identify.open_loop import mean_errors
+from quadid.identify.parameterization import Free
 from quadid.identify.shooting import Shooting
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES

@@ -10,9 +10,17 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.blocks import block_labels, held_out_deviance
 from quadid.diagnose.candidates import Candidate
-from quadid.identify.polish import Polished, Prior, bounded_step, default_prior, polish, prior_terms, scaled_difference
+from quadid.identify.covariance import score_products
+from quadid.identify.gauss_newton import (
+    Polished,
+    Prior,
+    bounded_step,
+    default_prior,
+    polish,
+    prior_terms,
+    scaled_difference,
+)
 from quadid.identify.shooting import Free, Linearised, Shooting
-from quadid.identify.uncertainty import score_products
 from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]
@@ -57,7 +65,7 @@ class Model:
         return float(self.lin.rows.sum())
 
     @property
-    def misfit(self) -> float:
+    def reduced_chi_square(self) -> float:
         """Deviance per independent residual; 1 at the noise floor."""
         return float(self.lin.cost.sum()) / max(self.rows, 1.0)
 

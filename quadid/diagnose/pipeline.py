@@ -26,9 +26,9 @@ from quadid.diagnose.vehicle_file import Fitted, extended_vehicle
 from quadid.diagnose.whole_rest import with_look_alike
 from quadid.errors import NotIdentifiableError
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
-from quadid.identify.floor import flexible_fit, noise_floor, residual_noise
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import polish
+from quadid.identify.gauss_newton import polish
+from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -113,7 +113,7 @@ def diagnose(
     believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
     findings = describe(decisive, search, per_finding, believed)
     foresight, said = None, []
-    if verdict is Verdict.UNKNOWN and search.model.misfit > POOR:
+    if verdict is Verdict.UNKNOWN and search.model.reduced_chi_square > POOR:
         report("prediction", 0.0)
         try:
             foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
@@ -180,11 +180,11 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Searc
     """Selects causes forwards, where that leads nowhere backwards, and again when they show the noise to be less."""
     ladder, short = begun.ladder, begun.short
     search = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere)
-    if search.model.misfit > LINEAR_MISFIT:
+    if search.model.reduced_chi_square > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
         general = eliminate(short, begun.flexible, begun.listed)
         other = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, general)
-        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.misfit))
+        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
             break

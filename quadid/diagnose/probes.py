@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadid.diagnose.blocks import Gain, block_labels, held_out_deviance, paired_gain
 from quadid.diagnose.models import Model
 from quadid.diagnose.signals import signals
-from quadid.identify.columns import Columns
+from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
 
 FloatArray = NDArray[np.float64]

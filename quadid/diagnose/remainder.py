@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.models import Model
 from quadid.diagnose.probes import Alone, Follows, follows
-from quadid.identify.floor import SPECTRUM_SECONDS
+from quadid.identify.noise_estimation import SPECTRUM_SECONDS
+from quadid.identify.noise_spectrum import LOWEST, mode_power
+from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.identify.shooting import Shooting
-from quadid.identify.spectrum import LOWEST, mode_power
-from quadid.identify.spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.model.rollout import CHANNEL_NAMES
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate, all_names, unset_times
 from quadid.diagnose.models import Model, restore_settled
-from quadid.identify.polish import default_prior
+from quadid.identify.gauss_newton import default_prior
 from quadid.identify.shooting import Linearised, Shooting
 
 FloatArray = NDArray[np.float64]

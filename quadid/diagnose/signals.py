@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.columns import Columns
+from quadid.identify.segment_jacobian import Columns
 
 FloatArray = NDArray[np.float64]
 

@@ -41,7 +41,7 @@ def drafts_of(
     shooting: Shooting, model: Model, scores: list[Score], tests: int, elsewhere: Sequence[FloatArray]
 ) -> list[Draft]:
     """Candidates to refit: the best by prediction, and look-alikes that come near them."""
-    far = model.misfit > LINEAR_MISFIT
+    far = model.reduced_chi_square > LINEAR_MISFIT
     least = 0.5 * max(exceeded(FALSE_ALARM / tests, 1), LEAST_GAIN, LEAST_SHARE * model.rows)
     linear = [s for s in scores if not s.candidate.starts and s.drop > least][:MOST_SKETCHES]
     thin, base, every = thinned(shooting, model, FAR_SEGMENTS) if far else (shooting, model, 1)

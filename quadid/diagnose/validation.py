@@ -21,7 +21,7 @@ from quadid.diagnose.models import Model, restore_settled
 from quadid.diagnose.result import Benefit, Validation
 from quadid.diagnose.search import Search
 from quadid.effects import EFFECTS
-from quadid.identify.polish import polish
+from quadid.identify.gauss_newton import polish
 from quadid.identify.shooting import Shooting
 from quadid.window import Window
 

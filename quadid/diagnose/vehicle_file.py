@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
-from quadid.identify.uncertainty import uncertainty
+from quadid.identify.covariance import uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle

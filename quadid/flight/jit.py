@@ -24,7 +24,7 @@ F = TypeVar("F", bound=Callable[..., object])
 def fingerprint() -> str:
     """Hash of every source file of this package and of what its kernels take from outside."""
     digest = hashlib.sha256(repr(GRAVITY).encode())
-    digest.update((resources.files("quadid") / "stabiliser.py").read_bytes())
+    digest.update((resources.files("quadid") / "attitude_controller.py").read_bytes())
     for entry in sorted(resources.files(__package__ or "quadid.flight").iterdir(), key=lambda e: e.name):
         if entry.name.endswith(".py"):
             digest.update(entry.read_bytes())

@@ -1,16 +1,16 @@
-"""The stabiliser of the flown vehicle: gains tuned on the type's truth; the control law is `quadid.stabiliser`."""
+"""The stabiliser of the flown vehicle: gains tuned on the type's truth; its law is `quadid.attitude_controller`."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from quadid.attitude_controller import GAIN_NAMES as GAIN_NAMES
+from quadid.attitude_controller import GAIN_UNITS as GAIN_UNITS
+from quadid.attitude_controller import mixer_matrix as mixer_matrix
+from quadid.attitude_controller import pack_gains as pack_gains
+from quadid.attitude_controller import stabilise as stabilise
+from quadid.attitude_controller import stabiliser_step as stabiliser_step
 from quadid.flight.truth import TruthParameters
-from quadid.stabiliser import GAIN_NAMES as GAIN_NAMES
-from quadid.stabiliser import GAIN_UNITS as GAIN_UNITS
-from quadid.stabiliser import mixer_matrix as mixer_matrix
-from quadid.stabiliser import pack_gains as pack_gains
-from quadid.stabiliser import stabilise as stabilise
-from quadid.stabiliser import stabiliser_step as stabiliser_step
 from quadid.vehicle import Vehicle
 
 ANGLE_BANDWIDTH, YAW_BANDWIDTH = 4.5, 1.5

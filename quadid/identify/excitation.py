@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import WindowError
-from quadid.identify.floor import flexible_names as flexible_names
-from quadid.identify.floor import noise_floor as noise_floor
-from quadid.identify.floor import residual_noise as residual_noise
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import Convergence, Polished, Prior, default_prior, polish
-from quadid.identify.scale import with_uncertain_scale
+from quadid.identify.composite_likelihood import with_second_cut
+from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
+from quadid.identify.gauss_newton import Convergence, Polished, Prior, default_prior, polish
+from quadid.identify.noise_estimation import flexible_names as flexible_names
+from quadid.identify.noise_estimation import noise_floor as noise_floor
+from quadid.identify.noise_estimation import residual_noise as residual_noise
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.swarm import Stop, Swarm, SwarmOptions
-from quadid.identify.two_cuts import with_second_cut
-from quadid.identify.uncertainty import Uncertainty, parameter_set, uncertainty
+from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
 from quadid.parameters import NOMINAL_NAMES, ParameterSet

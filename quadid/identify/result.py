@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from quadid.identify.covariance import Z95
 from quadid.identify.fit import Fit
-from quadid.identify.horizon import HorizonScore
 from quadid.identify.open_loop import QUANTITIES
+from quadid.identify.prediction import HorizonScore
 from quadid.identify.score import SetScore
-from quadid.identify.uncertainty import Z95
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status, impossible_inertia
 from quadid.vehicle import ParameterPrior, Vehicle
@@ -116,7 +116,7 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
     ]
 
 
-def withheld(fit: Fit, reasons: Mapping[str, str]) -> Fit:
+def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
     """The fit without what these data cannot tell: such parameters keep the vehicle file's value and say nothing.
 
     Args:

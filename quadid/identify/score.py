@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler

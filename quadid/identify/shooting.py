@@ -14,14 +14,14 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.columns import Columns
-from quadid.identify.free import Free as Free
-from quadid.identify.gram_kernel import reduce_segments
+from quadid.identify.elimination import Reduced, StatePrior
+from quadid.identify.elimination_kernel import reduce_segments
 from quadid.identify.initial_states import first_states, retract
-from quadid.identify.linearised import Linearised as Linearised
-from quadid.identify.linearised import join
-from quadid.identify.noise import NoiseModel
-from quadid.identify.reduction import Reduced, StatePrior
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.parameterization import Free as Free
+from quadid.identify.segment_cost import Linearised as Linearised
+from quadid.identify.segment_cost import join
+from quadid.identify.segment_jacobian import Columns
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout

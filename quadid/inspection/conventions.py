@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import sample_period
-from quadid.tracks import GAP
+from quadid.resampling_plan import GAP
 from quadid.vehicle import GRAVITY
 from quadid.window import Channel, Recording
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
 from quadid.resample import sample_period
+from quadid.resampling_plan import CSV_GAP, GAP
 from quadid.saturation import at_limit
-from quadid.tracks import CSV_GAP, GAP
 from quadid.window import CHANNELS, Channel, Recording
 
 FloatArray = NDArray[np.float64]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.attitude_controller import mixer_matrix, pack_gains
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
 from quadid.model.closed_loop_kernel import OUTPUTS, fly_closed_loop
@@ -16,7 +17,6 @@ from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
 from quadid.model.rollout_kernel import Flight
 from quadid.model.simd import LANES, aligned
-from quadid.stabiliser import mixer_matrix, pack_gains
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -46,7 +46,7 @@ class ClosedLoop:
         Args:
             window: with `attitude_reference`, finite throughout.
             vehicle: geometry and mass.
-            gains: of the stabiliser, see `quadid.stabiliser.GAIN_UNITS`.
+            gains: of the stabiliser, see `quadid.attitude_controller.GAIN_UNITS`.
             rate: how often the stabiliser runs [Hz], a multiple of the grid's rate; None: once a row.
 
         Raises:

@@ -1,7 +1,7 @@
 """The model in closed loop: the stabiliser turns the model's own motion and the pilot's references into rotor input.
 
-Rotors, body and sensors are those of `quadid.model.rollout_kernel`; the control law is `quadid.stabiliser`.  Each lane
-flies its own trajectory, so rotors are stepped lane by lane from what each lane's stabiliser commanded.
+Rotors, body and sensors are those of `quadid.model.rollout_kernel`; the control law is `quadid.attitude_controller`.
+Each lane flies its own trajectory, so rotors are stepped lane by lane from what each lane's stabiliser commanded.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from quadid.model.rows import (
 from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
 
 # isort: on
+from quadid.attitude_controller import rotation_of, steer
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
 from quadid.rotation import write_rotation
-from quadid.stabiliser import rotation_of, steer
 
 FloatArray = NDArray[np.float64]
 
@@ -144,8 +144,8 @@ def _fly_closed_loop(
 
     Args:
         references: roll, pitch, yaw [rad], throttle 0..1 of each row, held over it, (n, 4).
-        gains: see `quadid.stabiliser.pack_gains`.
-        mixer: see `quadid.stabiliser.mixer_matrix`.
+        gains: see `quadid.attitude_controller.pack_gains`.
+        mixer: see `quadid.attitude_controller.mixer_matrix`.
         substeps: runs of the stabiliser a row.
         lanes: how many of the block's lanes are wanted.
         geometry: (rotors, 3): x, y [m], spin.

@@ -50,7 +50,7 @@ def _sources() -> int:
         for entry in folder.iterdir()
         if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py"))
     )
-    outside = [(resources.files("quadid") / name).read_bytes() for name in ("stabiliser.py", "rotation.py")]
+    outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
     return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside]))
 
 

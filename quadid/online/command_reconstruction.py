@@ -1,7 +1,8 @@
 """Rotor commands where nobody tells them: references through the stabiliser, as the vehicle computes them on board.
 
 A vehicle that publishes its references, its attitude and its rates, and whose stabiliser is known (`stabiliser:` in the
-vehicle file), has told its rotor commands too: the control law of `quadid.stabiliser` makes the one out of the others.
+vehicle file), has told its rotor commands too: the control law of `quadid.attitude_controller` makes the one out of the
+others.
 Commands are computed at the gyro's samples, and act from each until the next; a stabiliser that runs faster than the
 gyro comes is run in between on interpolated measurements, and its mean is taken.
 
@@ -19,12 +20,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
 from quadid.errors import LogError
 from quadid.online.channel_buffer import ChannelBuffer
+from quadid.resampling_plan import GAP
 from quadid.rotation import continuous_sign
 from quadid.rotor_signal import RotorSignal
-from quadid.stabiliser import mixer_matrix, pack_gains, stabilise_rows
-from quadid.tracks import GAP
 from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]

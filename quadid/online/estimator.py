@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
-from quadid.identify.noise import NoiseModel
+from quadid.identify.covariance import Uncertainty, parameter_set
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
-from quadid.identify.uncertainty import Uncertainty, parameter_set
 from quadid.model.layout import Layout
 from quadid.online.fusion import Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded, survival
 from quadid.errors import QuadidError
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import Prior, polish
+from quadid.identify.gauss_newton import Prior, polish
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, NEVER, Layout

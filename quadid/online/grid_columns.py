@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.resample import split_stretches
-from quadid.tracks import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
+from quadid.resampling_plan import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
 
 FloatArray = NDArray[np.float64]
 

@@ -1,9 +1,9 @@
 """Resampler of a live stream: samples of different rates, in any order, become rows of one uniform grid.
 
-The rules of resampling are those of logs (`quadid.tracks`): no lag is invented, gaps are not bridged.  Rows leave in
-blocks once every channel had `SETTLE` seconds to arrive, so the order in which messages of different topics come in
-changes nothing.  Which samples a block is made of is settled when samples arrive, not when somebody asks for rows: a
-fit that keeps the reader busy changes nothing either, not even for samples that come later than that.
+The rules of resampling are those of logs (`quadid.resampling_plan`): no lag is invented, gaps are not bridged.  Rows
+leave in blocks once every channel had `SETTLE` seconds to arrive, so the order in which messages of different topics
+come in changes nothing.  Which samples a block is made of is settled when samples arrive, not when somebody asks for
+rows: a fit that keeps the reader busy changes nothing either, not even for samples that come later than that.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from quadid.online.clock import StreamClock
 from quadid.online.command_reconstruction import CommandReconstruction
 from quadid.online.grid_columns import columns_on_grid
 from quadid.resample import HALF_WIDTH, lowpass
+from quadid.resampling_plan import make_plan
 from quadid.rotor_signal import RotorSignal, rotor_signal
-from quadid.tracks import make_plan
 from quadid.vehicle import Vehicle
 from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
 

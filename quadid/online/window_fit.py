@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, residual_noise, swarm_search
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import Polished, Prior, polish, robust_weights
+from quadid.identify.gauss_newton import Polished, Prior, polish, robust_weights
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.fusion import WindowEstimate

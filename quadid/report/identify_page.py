@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure

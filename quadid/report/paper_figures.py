@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.closed_loop import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
+from quadid.identify.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
 from quadid.report.figures import LABELS, liveliest, trace
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, settle_states
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import NEVER, Layout

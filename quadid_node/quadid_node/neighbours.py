@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from quadid.plain import plain
+from quadid.sanitise import plain
 
 
 class Offer(NamedTuple):

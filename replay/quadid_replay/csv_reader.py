@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError, nearest
-from quadid.plain import plain
 from quadid.resample import COINCIDENT, sample_period
+from quadid.sanitise import plain
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble

@@ -13,8 +13,8 @@ import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
 
 from quadid.errors import LogError
-from quadid.plain import plain
 from quadid.resample import fresh_rows
+from quadid.sanitise import plain
 from quadid.window import Recording
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.definition_check import DefinitionError, check_definition

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 
 from quadid.errors import LogError
-from quadid.plain import plain
+from quadid.sanitise import plain
 
 MAGIC = b"\x89MCAP0\r\n"
 RATIO, FLOOR, CEILING = 200, 64 << 20, 4 << 30

@@ -13,7 +13,7 @@ from io import BytesIO
 from pathlib import Path
 
 from quadid.errors import LogError
-from quadid.plain import plain
+from quadid.sanitise import plain
 
 _KNOWN = frozenset(b"BFIMPQARDLCSO")
 _DEFINITIONS = frozenset(b"FP")

@@ -17,7 +17,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from quadid.errors import LogError
-from quadid.plain import plain
+from quadid.sanitise import plain
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first

@@ -14,7 +14,7 @@ from quadid.baselines.black_box import fit_black_box, score_black_box
 from quadid.baselines.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import fly
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES

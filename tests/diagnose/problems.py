@@ -13,9 +13,9 @@ from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.models import Model, fit_model
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import SWARM_SECONDS
-from quadid.identify.floor import noise_floor, residual_noise
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import polish
+from quadid.identify.gauss_newton import polish
+from quadid.identify.noise_estimation import noise_floor, residual_noise
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window

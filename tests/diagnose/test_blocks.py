@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 from quadid.diagnose.blocks import BLOCK_SECONDS, block_labels, held_out_deviance, paired_gain
 from quadid.diagnose.models import extend
 from quadid.diagnose.validation import settle
-from quadid.identify.linearised import Linearised
-from quadid.identify.polish import polish
+from quadid.identify.gauss_newton import polish
+from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import Shooting
 from quadid.model.rollout import Segments
 from tests.diagnose.problems import cause, fitted, window_with

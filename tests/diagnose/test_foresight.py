@@ -16,7 +16,7 @@ from quadid.diagnose.models import Model, fit_model
 from quadid.diagnose.vehicle_file import extended_vehicle
 from quadid.flight import draw_truth, fly
 from quadid.grid import to_windows
-from quadid.identify.horizon import horizon_scores
+from quadid.identify.prediction import horizon_scores
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import Layout

@@ -15,7 +15,7 @@ from quadid.diagnose.pipeline import judge
 from quadid.diagnose.probes import SITES, Follows
 from quadid.diagnose.remainder import ALARM, Remainder, Structure, remainder
 from quadid.diagnose.result import Verdict
-from quadid.identify.spectrum import mode_power
+from quadid.identify.noise_spectrum import mode_power
 from tests.diagnose.problems import Problem, clean, fitted, window_with
 
 FloatArray = NDArray[np.float64]

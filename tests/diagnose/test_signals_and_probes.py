@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from quadid.diagnose.probes import SITES, Follows, follows
 from quadid.diagnose.signals import LAGS, signals
 from quadid.flight import draw_truth, fly
-from quadid.identify.columns import Columns
+from quadid.identify.segment_jacobian import Columns
 from tests.diagnose.problems import SEED, Problem, clean, fitted, window_with
 from tests.identify.flights import PELICAN
 

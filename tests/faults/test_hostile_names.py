@@ -16,7 +16,7 @@ from quadid_replay import open_log
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError, VehicleError
-from quadid.plain import LONGEST_LINE
+from quadid.sanitise import LONGEST_LINE
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 from tests.cli.conftest import Cli, inside

@@ -6,8 +6,8 @@ import hashlib
 from pathlib import Path
 from typing import Any, cast
 
+import quadid.attitude_controller
 import quadid.flight
-import quadid.stabiliser
 from quadid.flight import jit
 from quadid.flight.airframe import derivative
 from quadid.flight.march import march
@@ -16,7 +16,7 @@ from quadid.vehicle import GRAVITY
 
 def test_stamp_of_every_kernel_covers_all_sources() -> None:
     digest = hashlib.sha256(repr(GRAVITY).encode())
-    digest.update(Path(quadid.stabiliser.__file__).read_bytes())
+    digest.update(Path(quadid.attitude_controller.__file__).read_bytes())
     for file in sorted(Path(quadid.flight.__file__).parent.glob("*.py")):
         digest.update(file.read_bytes())
     assert jit.fingerprint() == digest.hexdigest()

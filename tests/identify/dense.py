@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from quadid.identify.noise import SLOW_TIME, NoiseModel
+from quadid.identify.noise_model import SLOW_TIME, NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES

@@ -7,9 +7,9 @@ import pytest
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
-from quadid.identify.horizon import horizon_scores, rate_errors
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.open_loop import true_rate
+from quadid.identify.prediction import horizon_scores, rate_errors
 from quadid.identify.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from quadid.errors import WindowError
 from quadid.flight import draw_truth, fly
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import VELOCITY_PRIOR, Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.change_detection import Change, ChangeDetector
 from quadid.online.fault_isolation import ChangeRequest, isolate_fault

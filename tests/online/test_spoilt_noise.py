@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quadid.grid import to_windows
-from quadid.identify.noise import NoiseModel
+from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
 from quadid.online.window_fit import FitReply, FitRequest, fit_window

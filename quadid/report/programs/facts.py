@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.effects import rotor_losses
 from quadid.parameters import NOMINAL_UNITS
-from quadid.plain import LONGEST_LINE, plain
+from quadid.sanitise import LONGEST_LINE, plain
 from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.polish import Prior, prior_terms
+from quadid.identify.gauss_newton import Prior, prior_terms
 from quadid.identify.shooting import Free, Linearised
 from quadid.parameters import Parameter, ParameterSet, Status
 

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.attitude_controller import mixer_matrix
 from quadid.chi_square import exceeded
 from quadid.rotation import euler
-from quadid.stabiliser import mixer_matrix
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -158,7 +158,7 @@ def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, Float
 
 
 def _slope_of_law(window: Window, vehicle: Vehicle, gains: Mapping[str, float], rate: float) -> FloatArray | None:
-    """Slope of the speeds [rad/s^2], shape (n, rotors), that the control law of `quadid.stabiliser` makes.
+    """Slope of the speeds [rad/s^2], shape (n, rotors), that the control law of `quadid.attitude_controller` makes.
 
     Nothing runs on where the gyro is missing or a speed is at its limit; None where a sample holds one step of the law.
     """

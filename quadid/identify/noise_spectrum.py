@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.noise import SHAPE_POINTS, NoiseModel
+from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
 
 FloatArray = NDArray[np.float64]

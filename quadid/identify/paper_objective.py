@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.stabiliser_gains import Autopilot
+from quadid.identify.controller_gains import Autopilot
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
@@ -137,7 +137,7 @@ def paper_score(
         windows: of one set.
         vehicle: geometry and mass.
         theta: full parameter vector, shape (size,).
-        autopilot: the stabiliser, see `quadid.identify.stabiliser_gains.find_autopilot`.
+        autopilot: the stabiliser, see `quadid.identify.controller_gains.find_autopilot`.
     """
     if autopilot is None or not any(has_references(w) for w in windows):
         return None

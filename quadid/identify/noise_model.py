@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.chi_square import lower_mean
-from quadid.identify.reduction import Whitening
+from quadid.identify.elimination import Whitening
 from quadid.vehicle import Noise
 
 FloatArray = NDArray[np.float64]

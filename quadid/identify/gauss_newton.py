@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.bounded import least_within
+from quadid.identify.box_qp import least_within
 from quadid.identify.shooting import Free, Linearised, Shooting
 
 FloatArray = NDArray[np.float64]

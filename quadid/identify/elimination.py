@@ -60,7 +60,7 @@ class StatePrior(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """Quadratic form of every segment's cost in the parameters, see `quadid.identify.linearised.Linearised`.
+    """Quadratic form of every segment's cost in the parameters, see `quadid.identify.segment_cost.Linearised`.
 
     Attributes:
         gram: (segments, P, P); grad: (segments, P); cost: (segments,).

@@ -1,8 +1,8 @@
 """The stabiliser of a vehicle: its gains as given, or found in a log that holds references and rotor commands.
 
-The control law is that of `quadid.stabiliser`: angle P, rate PI, mixer.  Its inputs (references, measured attitude and
-rate) and its output (rotor commands) are all logged, so the gains follow from a regression; how much of the commands it
-leaves unexplained says whether the vehicle flies this law at all.
+The control law is that of `quadid.attitude_controller`: angle P, rate PI, mixer.  Its inputs (references, measured
+attitude and rate) and its output (rotor commands) are all logged, so the gains follow from a regression; how much of
+the commands it leaves unexplained says whether the vehicle flies this law at all.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.attitude_controller import GAIN_NAMES
 from quadid.parameters import NOMINAL_NAMES
-from quadid.stabiliser import GAIN_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -41,7 +41,7 @@ class Autopilot:
     """A stabiliser that can be simulated.
 
     Attributes:
-        gains: by name, see `quadid.stabiliser.GAIN_UNITS`.
+        gains: by name, see `quadid.attitude_controller.GAIN_UNITS`.
         rate: how often it runs [Hz]; None for once a row.
         source: ``given`` or ``identified``.
         explained: share of the variance of the throttle, roll, pitch and yaw commands explained; NaN when given.

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.effects import EFFECTS
-from quadid.identify.noise import NoiseModel, estimate_noise
-from quadid.identify.polish import FloatArray, Polished, polish
+from quadid.identify.gauss_newton import FloatArray, Polished, polish
+from quadid.identify.noise_model import NoiseModel, estimate_noise
+from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.spectrum import shaped_noise
 from quadid.model.layout import LOSS, Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window

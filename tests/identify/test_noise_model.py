@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import freqz, lfilter
 
-from quadid.identify.noise import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
+from quadid.identify.noise_model import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
+from quadid.identify.noise_spectrum import LOWEST, shaped_noise
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
-from quadid.identify.spectrum import LOWEST, shaped_noise
 from quadid.vehicle import Noise
 from tests.identify.flights import PELICAN, at_truth, flown, turned
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.polish import Polished, Prior, polish, prior_terms, scaled_difference
+from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, scaled_difference
 from quadid.identify.shooting import Free, Shooting
 
 FloatArray = NDArray[np.float64]

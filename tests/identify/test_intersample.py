@@ -14,12 +14,12 @@ from quadid.flight import fly
 from quadid.flight.stabiliser import default_gains
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.score import mse_score
+from quadid.intersample import find_feedback, follow_feedback
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Stabiliser, Vehicle
 from quadid.window import Window
-from quadid.within_samples import find_feedback, follow_feedback
 from tests.identify.fast_loop import EVERY, fly_fast
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.reduction import VELOCITY, Reduced, StatePrior, Whitening
+from quadid.identify.elimination import VELOCITY, Reduced, StatePrior, Whitening
 
 # isort: off
 from quadid.model.simd import (

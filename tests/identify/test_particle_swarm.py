@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
-from quadid.identify.swarm import Stop, Swarm, SwarmOptions
+from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 
 FloatArray = NDArray[np.float64]
 Cost = Callable[[FloatArray], FloatArray]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from quadid.errors import NotIdentifiableError, QuadidError
-from quadid.identify import polish as polishing
+from quadid.identify import gauss_newton as polishing
 from quadid.identify.fit import FitOptions, fit
-from quadid.identify.polish import (
+from quadid.identify.gauss_newton import (
     LONGEST_STEP,
     Convergence,
     Polished,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from quadid.identify import composite_likelihood
 from quadid.identify import fit as fitting
-from quadid.identify import two_cuts
+from quadid.identify.composite_likelihood import BothCuts, with_second_cut
 from quadid.identify.fit import FitOptions, fit
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import default_prior, polish
+from quadid.identify.gauss_newton import default_prior, polish
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
-from quadid.identify.two_cuts import BothCuts, with_second_cut
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
 from tests.identify.flights import PELICAN, at_truth, flown, values_of, with_noise
@@ -129,7 +129,7 @@ def spiked(window: Window, rows: Sequence[int] | NDArray[np.int64], size: float)
 
 
 def test_a_second_cut_that_goes_astray_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(two_cuts, "WORSE", 0.5)
+    monkeypatch.setattr(composite_likelihood, "WORSE", 0.5)
     assert both(with_noise(flown(3, noise_scale=0.0).window, 1))[0] is None
 
 
@@ -153,7 +153,7 @@ def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
     gains = []
     for most in (60, 10_000):
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(two_cuts, "MOST_COMPARED", most)
+            patched.setattr(composite_likelihood, "MOST_COMPARED", most)
             found = with_second_cut(shooting, one, free, prior, robust=False)
         assert found is not None
         gains.append(np.diag(np.linalg.inv(found.information + np.diag(prior.sigma**-2.0))))
@@ -163,7 +163,7 @@ def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
 def test_what_both_cuts_share_needs_only_some_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     window = with_noise(flown(3, noise_scale=0.0).window, 1)
     whole, _, _ = both(window)
-    monkeypatch.setattr(two_cuts, "MOST_COMPARED", 30)
+    monkeypatch.setattr(composite_likelihood, "MOST_COMPARED", 30)
     some, _, _ = both(window)
     assert whole is not None
     assert some is not None

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.free import Free
+from quadid.identify.gauss_newton import bounded_step, scaled_difference
 from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
-from quadid.identify.polish import bounded_step, scaled_difference
+from quadid.identify.parameterization import Free
 from quadid.model import layout as ix
 from quadid.parameters import impossible_inertia
 from quadid.vehicle import Vehicle

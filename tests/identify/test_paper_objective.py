@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.closed_loop import OUTPUT_NAMES, PaperProblem, measured_outputs, paper_score
-from quadid.identify.stabiliser_gains import Autopilot, find_autopilot
+from quadid.identify.controller_gains import Autopilot, find_autopilot
+from quadid.identify.paper_objective import OUTPUT_NAMES, PaperProblem, measured_outputs, paper_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Stabiliser

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.covariance import parameter_set, uncertainty
 from quadid.identify.fit import FIT_SECONDS, Fit
-from quadid.identify.noise import NoiseModel
-from quadid.identify.polish import Convergence, default_prior
+from quadid.identify.gauss_newton import Convergence, default_prior
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
-from quadid.identify.uncertainty import parameter_set, uncertainty
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -9,10 +9,10 @@ import pytest
 
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, fly
-from quadid.identify.ahead import STAGES, fit_ahead
-from quadid.identify.free import Free
-from quadid.identify.horizon import horizon_scores
+from quadid.identify.multistep_fit import STAGES, fit_ahead
 from quadid.identify.open_loop import OpenLoop, mean_errors, no_change
+from quadid.identify.parameterization import Free
+from quadid.identify.prediction import horizon_scores
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.identify.polish import Prior, scaled_difference
+from quadid.identify.covariance import Uncertainty
+from quadid.identify.gauss_newton import Prior, scaled_difference
 from quadid.identify.shooting import Free
-from quadid.identify.uncertainty import Uncertainty
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 
