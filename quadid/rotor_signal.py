@@ -36,37 +36,31 @@ class RotorSignal(NamedTuple):
 def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
     """Picks measured or commanded rotor speeds where there are any, else motor commands, and converts to rad/s.
 
-    Measured speeds of a vehicle whose file describes a command (normalized, pwm) are readings, so ``instant``; they are
-    passed over when they come at less than half the rate of the commands.
+    Measured speeds of a vehicle whose file describes a command (normalized, pwm) are readings, so ``instant``.  They
+    are passed over when all are zero, when the file describes pulse widths and the log has them, and when they come
+    at less than half the rate of the commands.
 
     Raises:
         NotIdentifiableError: slower than `SLOWEST_RATE`.
         LogError: neither channel; number or unit of the columns does not fit the vehicle.
     """
-    speed, command = (_usable(recording, name) for name in ("rotor_speed", "motor_command"))
+    channel, notes = rotor_channel(recording, vehicle)
     described = vehicle.command.kind != "rotor_speed"
-    if speed is None and command is None:
+    if channel is None:
         raise LogError(
-            f"{recording.name}: no rotor speeds and no motor commands", "either of them", fix=_HOW_TO_GET_MOTORS
-        )
-    notes: tuple[str, ...] = ()
-    if speed is not None and command is not None and described:
-        slow = sample_period(speed.t) > 2.0 * sample_period(command.t)
-        if slow or sample_period(speed.t) > 1.0 / SLOWEST_RATE:
-            notes = (f"measured speeds ({speed.source}) come too slowly; motor commands ({command.source}) used",)
-            speed = None
-    if speed is not None:
+            "; ".join((f"{recording.name}: no rotor speeds and no motor commands", *notes)), "either of them",
+            _HOW_TO_GET_MOTORS,
+        )  # fmt: skip
+    source = channel.source or channel.name
+    if channel.name == "rotor_speed":
         measured = described and recording.format != "csv"
-        signal = RotorSignal(
-            speed.t, speed.values, "instant" if measured else vehicle.command.sampling, speed.source or "rotor_speed"
-        )
+        signal = RotorSignal(channel.t, channel.values, "instant" if measured else vehicle.command.sampling, source)
     else:
-        assert command is not None
         if not described:
-            raise _needs_command_kind(recording, command, vehicle)
-        _check_unit(recording, command, vehicle)
-        values = vehicle.command.to_rotor_speed(command.values)
-        signal = RotorSignal(command.t, values, vehicle.command.sampling, command.source or "motor_command", notes)
+            raise _needs_command_kind(recording, channel, vehicle)
+        _check_unit(recording, channel, vehicle)
+        values = vehicle.command.to_rotor_speed(channel.values)
+        signal = RotorSignal(channel.t, values, vehicle.command.sampling, source, notes)
     _check_columns(recording, signal, vehicle)
     rate = 1.0 / sample_period(signal.t)
     if rate < SLOWEST_RATE:
@@ -75,6 +69,33 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
             f"{SLOWEST_RATE:g} Hz or more, 50 Hz for inertias", _HOW_TO_GET_MOTORS,
         )  # fmt: skip
     return signal
+
+
+def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channel | None, tuple[str, ...]]:
+    """Picks the channel that drives the rotors, as `rotor_signal` says; None where there is none.
+
+    Returns:
+        ``rotor_speed`` or ``motor_command`` as logged, and why measured speeds were passed over, if they were.
+    """
+    speed, command = (_usable(recording, name) for name in ("rotor_speed", "motor_command"))
+    why = "" if speed is None else _passed_over(speed, command, vehicle)
+    if speed is not None and why:
+        return command, (f"measured speeds ({speed.source}) {why}",)
+    return speed or command, ()
+
+
+def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | None) -> str:
+    """Why measured speeds are not used; empty where they are."""
+    if not np.any(speed.values):
+        return "are all zero: the ESCs do not report"
+    if command is None or vehicle is None or vehicle.command.kind == "rotor_speed":
+        return ""
+    if vehicle.command.kind == "pwm" and _looks_like_pwm(command):
+        return f"are not what '{vehicle.name}' describes; its pulse widths ({command.source}) used"
+    period = sample_period(speed.t)
+    if period > 2.0 * sample_period(command.t) or period > 1.0 / SLOWEST_RATE:
+        return f"come too slowly; motor commands ({command.source}) used"
+    return ""
 
 
 def _usable(recording: Recording, name: str) -> Channel | None:

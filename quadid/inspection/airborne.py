@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.resample import moving_mean, sample_period
+from quadid.rotor_signal import rotor_channel
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
 
@@ -28,15 +29,15 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
     thrust: where the accelerometer does not point along its usual direction for half a second, it lies somewhere.
     """
     channels = recording.channels
-    for name in ("rotor_speed", "motor_command"):
-        if name in channels and len(channels[name].t) > 1:
-            thrust, hover = _thrust(channels[name], vehicle)
-            if hover <= 0.0:
-                return ()
-            t, on = channels[name].t, thrust > _LEAST * hover
-            if "accel" in channels and len(channels["accel"].t) > 10:
-                on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
-            return _spans(t, on)
+    rotors, _ = rotor_channel(recording, vehicle)
+    if rotors is not None:
+        thrust, hover = _thrust(rotors, vehicle)
+        if hover <= 0.0:
+            return ()
+        t, on = rotors.t, thrust > _LEAST * hover
+        if "accel" in channels and len(channels["accel"].t) > 10:
+            on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
+        return _spans(t, on)
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))
     return ()

@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from quadid_replay.clocks import WrapCounter
+from quadid_replay.boot_clock import BootClock
 from quadid_replay.motors import ardupilot_motor_outputs
-from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds
+from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_stamp
 
 from quadid.window import Sample
 from quadid_node.chooser import Chooser
@@ -44,9 +44,7 @@ class MavlinkDecoder:
         self.autopilot = 0
         self._rotors = rotors
         self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
-        self._servo_clock = WrapCounter()
-        self._newest: float | None = None
-        self._offset: float | None = None
+        self._boot_clock: BootClock[list[Reading]] = BootClock()
         self._row: list[float] = []
         self._row_time = math.nan
 
@@ -65,27 +63,15 @@ class MavlinkDecoder:
         if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
             return
         readings = READERS[name](message)
-        t = self._time(message, received) if readings else None
-        if t is None:
+        if not readings:
             return
-        for reading in readings:
-            yield from self._channel(t, reading)
-
-    def _time(self, message: Any, received: float) -> float | None:
-        """Boot time of a message; its receive time mapped onto the boot clock where it tells none."""
-        boot = boot_seconds(message)
-        if boot == 0.0 and self._newest is not None and self._newest > 1.0:
-            boot = None  # zero stands for unknown
-        if boot is not None and message.get_type() == "SERVO_OUTPUT_RAW" and self._newest is not None:
-            boot = self._servo_clock.unwrap_near(boot * 1e6, self._newest * 1e6) * 1e-6
-        if boot is None:
-            return None if self._offset is None else received - self._offset
-        if self._newest is not None and boot < self._newest - 1.0:
-            self._offset = None  # perhaps a reboot: the offset belongs to the old boot
-        delay = received - boot
-        self._offset = delay if self._offset is None else min(self._offset, delay)
-        self._newest = boot
-        return boot
+        clock = self._boot_clock
+        boot = boot_stamp(message, clock.newest)
+        placed = clock.unstamped(readings, received) if boot is None else clock.stamped(readings, boot, received)
+        for waited, t in placed:
+            if t is not None:
+                for reading in waited:
+                    yield from self._channel(t, reading)
 
     def _channel(self, t: float, reading: Reading) -> Iterator[Sample]:
         source = reading.source.split(" ")[0]

@@ -10,10 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quadid_replay.clocks import WrapCounter
 from quadid_replay.frames import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import RPM
 
 MILLI = 1e-3
+_SERVO_TURN = 2.0**32 * 1e-6
+"""SERVO_OUTPUT_RAW counts microseconds in 32 bits: [s] until it starts over."""
 _UNIX_US = 1e14
 """Stamps above this [us] count from the UNIX epoch."""
 
@@ -142,6 +145,22 @@ def boot_seconds(m: Any) -> float | None:
     if stamp is None or stamp > _UNIX_US:
         return None
     return float(stamp) * 1e-6
+
+
+def boot_stamp(m: Any, newest: float | None) -> float | None:
+    """Returns the message's own stamp [s] since boot, with whole turns of a 32-bit counter added; None without one.
+
+    Args:
+        m: a message.
+        newest: newest stamp known of this vehicle [s].
+    """
+    boot = boot_seconds(m)
+    if newest is None or boot is None:
+        return boot
+    raw = boot
+    if m.get_type() == "SERVO_OUTPUT_RAW":
+        boot = WrapCounter(_SERVO_TURN).unwrap_near(raw, newest)
+    return None if raw == 0.0 and abs(boot - newest) > 1.0 else boot  # zero stands for unknown
 
 
 def unix_seconds(m: Any) -> float | None:

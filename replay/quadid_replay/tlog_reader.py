@@ -11,12 +11,13 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from quadid.errors import LogError
 from quadid.window import Recording
-from quadid_replay.clocks import LogClock, WrapCounter
+from quadid_replay.boot_clock import BootClock, Placed
+from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.mavlink_frames import FrameCount, iterate_frames
 from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count
-from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES, Reading, boot_seconds, unix_seconds
+from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES, Reading, boot_stamp, unix_seconds
 
 _DIALECT = extend_dialect(ardupilotmega)
 _WANTED = {n for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS or m.msgname in STATE_MESSAGES}
@@ -35,9 +36,7 @@ class _VehicleLog:
         self.kind = 0
         self.autopilot = _INVALID
         self.rotors = 0
-        self._servo_clock = WrapCounter()
-        self._newest_boot: float | None = None
-        self._receive_offset: float | None = None
+        self._boot_clock: BootClock[list[Reading]] = BootClock()
         self._unix_offset: float | None = None
         self._esc_rows: dict[str, tuple[float | None, int, list[float]]] = {}
 
@@ -56,32 +55,23 @@ class _VehicleLog:
         elif name != "RAW_IMU" or self.autopilot == _ARDUPILOT:  # elsewhere RAW_IMU counts in sensor units
             readings = READERS[name](m)
             if readings:
-                t = self._time(m, received)
-                for reading in readings:
-                    self._note(t, reading)
+                boot = self._stamp(m)
+                known = self._boot_clock
+                self._note_all(
+                    known.unstamped(readings, received) if boot is None else known.stamped(readings, boot, received)
+                )
 
-    def _time(self, m: Any, received: float) -> float | None:
-        """Returns recording time: boot time where the message has it, else receive time mapped onto it."""
-        boot = boot_seconds(m)
-        if boot == 0.0 and self._newest_boot is not None and self._newest_boot > 1.0:
-            boot = None  # zero stands for unknown
-        if m.get_type() == "SERVO_OUTPUT_RAW" and boot is not None and self._newest_boot is not None:
-            boot = self._servo_clock.unwrap_near(boot * 1e6, self._newest_boot * 1e6) * 1e-6
-        if boot is None:
-            unix = unix_seconds(m)
-            if unix is not None and self._unix_offset is not None:
-                boot = unix - self._unix_offset
-            elif self._receive_offset is not None:
-                boot = received - self._receive_offset
-            else:
-                return None  # nothing told the boot time yet
-        else:
-            if self._newest_boot is not None and boot < self._newest_boot - 1.0:
-                self._receive_offset = None  # perhaps a reboot: the offset belongs to the old boot
-            delay = received - boot
-            self._receive_offset = delay if self._receive_offset is None else min(self._receive_offset, delay)
-            self._newest_boot = boot
-        return self.clock.time(boot)
+    def _stamp(self, m: Any) -> float | None:
+        """Returns the message's own stamp on the boot clock [s]; None where it has none."""
+        boot = boot_stamp(m, self._boot_clock.newest)
+        unix = unix_seconds(m)
+        return unix - self._unix_offset if unix is not None and self._unix_offset is not None else boot
+
+    def _note_all(self, placed: list[Placed[list[Reading]]]) -> None:
+        for readings, boot in placed:
+            t = None if boot is None else self.clock.time(boot)
+            for reading in readings:
+                self._note(t, reading)
 
     def _note(self, t: float | None, reading: Reading) -> None:
         width = _WIDTH.get(reading.signal, 3)
@@ -104,7 +94,8 @@ class _VehicleLog:
         self._esc_rows[key] = (started, reading.place, row)
 
     def finish(self) -> None:
-        """Adds the last round of ESC messages, which no other followed."""
+        """Adds what still waits: messages without a stamp and the last round of ESC messages."""
+        self._note_all(self._boot_clock.finish())
         for (signal, source), columns in self.signals.items():
             started, _, row = self._esc_rows.get(source, (None, 0, []))
             if signal == "esc" and row:

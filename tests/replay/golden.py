@@ -14,7 +14,17 @@ from quadid.resample import sample_period
 from quadid.window import Recording
 
 GOLDEN = Path(__file__).with_name("golden.json")
-PATTERNS = ("nanodrone/*.csv", "crazyflie_rpm/*.csv", "cases/*/train.csv", "ardupilot/*.*", "px4/*", "mcap/*", "tlog/*")
+PATTERNS = (
+    "nanodrone/*.csv",
+    "crazyflie_rpm/*.csv",
+    "cases/*/train.csv",
+    "ardupilot/*.*",
+    "ardupilot_sitl/*.bin",
+    "ardupilot_sitl/*.tlog",
+    "px4/*",
+    "mcap/*",
+    "tlog/*",
+)
 
 
 def real_logs(folder: Path) -> list[str]:

@@ -19,6 +19,8 @@ from quadid_replay.frames import GRAVITY
 from quadid_replay.motors import RPM
 
 from quadid.errors import LogError
+from quadid.grid import grid_recording
+from quadid.vehicle import Vehicle
 
 MAV = extend_dialect(ardupilotmega)
 UNIX = 1_700_000_000_000_000
@@ -231,3 +233,37 @@ def test_frames_without_measurements_are_no_flight(tmp_path: Path) -> None:
         log.add(float(k), heartbeat())
     with pytest.raises(LogError, match="no measurements"):
         open_log(opened(tmp_path, bytes(log.data)))
+
+
+def test_esc_telemetry_without_a_stamp_stays_in_time_though_the_clocks_drift(tmp_path: Path) -> None:
+    log = Tlog()
+    log.add(0.0, heartbeat())
+    for k in range(5000):
+        t, received = 5.0 + 0.02 * k, (1.0 + 5e-4) * 0.02 * k
+        log.add(received, attitude(t))
+        log.add(received, servo(t))
+        log.add(received, MAV.MAVLink_esc_telemetry_1_to_4_message([0] * 4, *[[k] * 4] * 5))
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    speeds = recording.channels["rotor_speed"]
+    np.testing.assert_allclose(speeds.t, 5.0 + 0.02 * np.round(speeds.values[:, 0] / RPM), atol=1e-3)
+
+
+def vehicle(path: Path) -> Vehicle:
+    return Vehicle.from_yaml(path.read_text(encoding="utf-8"))
+
+
+def test_speeds_that_are_all_zero_do_not_hide_the_outputs(data_dir: Path) -> None:
+    folder = data_dir / "ardupilot_sitl"
+    recording = open_log(folder / "x_zero_rpm.tlog")
+    gridded = grid_recording(recording, vehicle(folder / "sitl_x_pwm.yaml"))
+    assert gridded.report.rotor_source.startswith("SERVO_OUTPUT_RAW")
+    assert any("all zero" in note for note in gridded.report.notes)
+    with pytest.raises(LogError, match=r"motor commands .* expects rotor speeds"):
+        grid_recording(recording, vehicle(folder / "sitl_x.yaml"))
+
+
+def test_a_vehicle_of_pulse_widths_uses_them_beside_measured_speeds(data_dir: Path) -> None:
+    folder = data_dir / "ardupilot_sitl"
+    gridded = grid_recording(open_log(folder / "quad_sq.tlog"), vehicle(folder / "quad_sq_pwm.yaml"))
+    assert gridded.report.rotor_source.startswith("SERVO_OUTPUT_RAW")
+    assert gridded.windows[0].sampling == "held" or gridded.report.filtered

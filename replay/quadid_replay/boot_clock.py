@@ -1,0 +1,71 @@
+"""Times of messages without a stamp of their own, from the stamped ones around them.
+
+An autopilot writes its messages in order, so a message without a stamp was written between the stamped ones before and
+after it.  The link only shows how long after the earlier one it came; nothing older than that one counts, so neither a
+slow drift of the receiver's clock nor a simulation that runs faster than time moves it.
+"""
+
+from __future__ import annotations
+
+from typing import Generic, NamedTuple, TypeVar
+
+T = TypeVar("T")
+
+FARTHEST = 1.0
+"""A message that comes more than this [s] after the last stamped one has no known time."""
+_MOST_WAITING = 4096
+
+
+class Placed(NamedTuple, Generic[T]):
+    """An item and its time [s] on the boot clock; None where nothing tells it."""
+
+    item: T
+    time: float | None
+
+
+class BootClock(Generic[T]):
+    """Gives every message a time; those without a stamp wait for the next stamped one."""
+
+    def __init__(self) -> None:
+        self.newest: float | None = None
+        """Time of the newest stamped message [s]."""
+        self._newest_received = 0.0
+        self._waiting: list[tuple[T, float]] = []
+
+    def stamped(self, item: T, time: float, received: float) -> list[Placed[T]]:
+        """Takes a message with a stamp; returns those that waited for one newer than all before, then itself.
+
+        Args:
+            item: the message.
+            time: its stamp [s], unwrapped.
+            received: when it came [s], on any clock.
+        """
+        if self.newest is not None and self.newest - FARTHEST <= time <= self.newest:
+            return [Placed(item, time)]
+        placed = self._release(time)
+        self.newest, self._newest_received = time, received
+        return [*placed, Placed(item, time)]
+
+    def unstamped(self, item: T, received: float) -> list[Placed[T]]:
+        """Takes a message without a stamp; returns messages that have waited too long for a stamped one."""
+        early = self._release(None) if len(self._waiting) >= _MOST_WAITING else []
+        self._waiting.append((item, received))
+        return early
+
+    def finish(self) -> list[Placed[T]]:
+        """Returns the messages that still wait, when no other will come."""
+        return self._release(None)
+
+    def _release(self, following: float | None) -> list[Placed[T]]:
+        placed = [Placed(item, self._between(received, following)) for item, received in self._waiting]
+        self._waiting.clear()
+        return placed
+
+    def _between(self, received: float, following: float | None) -> float | None:
+        """Time of a message received at `received`, before a stamp of `following` [s]."""
+        if self.newest is None:
+            return None
+        later = max(0.0, received - self._newest_received)
+        if following is not None and following >= self.newest:
+            return min(self.newest + later, following)
+        return self.newest + later if later <= FARTHEST else None

@@ -1,0 +1,73 @@
+"""Messages without a stamp: between the stamped ones around them, whatever the receiver's clock does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from quadid_replay.boot_clock import FARTHEST, BootClock, Placed
+
+
+def play(speed: Callable[[float], float], stamped: float = 0.02, phase: float = 0.0) -> tuple[list[float], list[float]]:
+    """Plays 240 s of stamped messages, each followed `phase` s later by one without; returns true and found times."""
+    clock: BootClock[float] = BootClock()
+    out: list[Placed[float]] = []
+    for k in range(int(240.0 / stamped)):
+        t = stamped * k
+        out += clock.stamped(-1.0, t, speed(t))
+        out += clock.unstamped(t + phase, speed(t + phase))
+    out += clock.finish()
+    kept = [(item, time) for item, time in out if item >= 0.0 and time is not None]
+    return [a for a, _ in kept], [b for _, b in kept]
+
+
+@pytest.mark.parametrize("rate", [1.0, 1.0 + 2e-4, 0.4, 3.0], ids=["steady", "drift", "slow", "fast"])
+def test_a_drifting_receiver_never_moves_a_message_out_of_its_place(rate: float) -> None:
+    true, found = play(lambda t: 5e5 + rate * t)
+    np.testing.assert_allclose(found, true, atol=1e-6)
+
+
+def test_a_stepping_receiver_clock_does_no_harm() -> None:
+    true, found = play(lambda t: t + (3600.0 if t > 100.0 else 0.0) - (7200.0 if t > 150.0 else 0.0), phase=0.008)
+    assert len(found) == len(true) == 12000
+    assert np.max(np.abs(np.subtract(found, true))) < 0.0201
+    assert np.median(np.abs(np.subtract(found, true))) < 1e-6
+
+
+def test_arrival_tells_the_phase_between_rare_stamps_but_never_leaves_them() -> None:
+    true, found = play(lambda t: t, stamped=0.5, phase=0.3)
+    np.testing.assert_allclose(found, true, atol=1e-9)
+    rng = np.random.default_rng(1)
+    true, found = play(lambda t: t + rng.exponential(0.2), stamped=0.1, phase=0.03)
+    errors = np.subtract(found, true)
+    assert errors.min() >= -0.0301
+    assert errors[:-1].max() <= 0.0701
+
+
+def test_without_a_stamp_near_there_is_no_time() -> None:
+    clock: BootClock[str] = BootClock()
+    assert clock.unstamped("before any", 0.0) == []
+    assert clock.stamped("first", 5.0, 1.0) == [Placed("before any", None), Placed("first", 5.0)]
+    clock.unstamped("near", 1.5)
+    clock.unstamped("far", 1.0 + FARTHEST + 0.1)
+    assert clock.finish() == [Placed("near", 5.5), Placed("far", None)]
+
+
+def test_a_reboot_starts_anew() -> None:
+    clock: BootClock[str] = BootClock()
+    clock.stamped("old", 100.0, 0.0)
+    clock.unstamped("last", 0.01)
+    assert clock.stamped("new", 2.0, 20.0) == [Placed("last", 100.01), Placed("new", 2.0)]
+    clock.unstamped("next", 20.01)
+    item, time = clock.stamped("after", 2.02, 20.02)[0]
+    assert item == "next"
+    assert time == pytest.approx(2.01)
+
+
+def test_an_older_stamp_between_is_disorder() -> None:
+    clock: BootClock[str] = BootClock()
+    clock.stamped("target", 1.006, 0.0)
+    clock.unstamped("esc", 0.0)
+    assert clock.stamped("servo", 1.0, 0.001) == [Placed("servo", 1.0)]
+    assert clock.stamped("attitude", 1.02, 0.002)[0] == Placed("esc", 1.006)
