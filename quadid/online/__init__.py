@@ -9,6 +9,7 @@ The same samples, commands and seed give the same actions bit for bit, however `
 """
 
 from quadid.online.gate import GateSettings
+from quadid.online.jobs import Job, JobReply
 from quadid.online.records import (
     Diagnosed,
     Event,
@@ -28,6 +29,8 @@ __all__ = [
     "FitReply",
     "FitRequest",
     "GateSettings",
+    "Job",
+    "JobReply",
     "OnlineSet",
     "Phase",
     "Publish",

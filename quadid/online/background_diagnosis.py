@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from quadid.errors import QuadidError
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
+from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, Diagnosed, OnlineFinding
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -24,32 +26,38 @@ Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class DiagnosisRequest:
+class DiagnosisRequest(Job):
     """The last minute, to be diagnosed.
 
     Attributes:
-        number: counts the studies of a session.
         vehicle: nominal vehicle.
         windows: data; start, stop: their time [s].
         seed: of what is drawn.
     """
 
-    number: int
+    background: ClassVar[bool] = True
+
     vehicle: Vehicle
     windows: tuple[Window, ...]
     start: float
     stop: float
     seed: int
 
+    def run(self) -> DiagnosisReply:
+        """Diagnoses the windows."""
+        return diagnose_window(self)
+
+    def failed(self, problem: str) -> DiagnosisReply:
+        """The reply of a diagnosis that could not be run."""
+        return DiagnosisReply(self.number, problem)
+
 
 @dataclass(frozen=True)
-class DiagnosisReply:
+class DiagnosisReply(JobReply):
     """Answer: findings, most important first, with the verdict of `quadid.diagnose`; or why there is none."""
 
-    number: int
     findings: tuple[OnlineFinding, ...] = ()
     verdict: str = ""
-    problem: str = ""
 
 
 def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
@@ -59,7 +67,7 @@ def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
     try:
         result, _ = diagnose(request.windows, request.vehicle, seed=request.seed, swarm=True)
     except (QuadidError, ArithmeticError, ValueError) as error:
-        return DiagnosisReply(request.number, problem=str(error))
+        return request.failed(str(error))
     findings = []
     for f in result.findings:
         findings.append(OnlineFinding(
@@ -68,7 +76,7 @@ def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
             {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
             tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
         ))  # fmt: skip
-    return DiagnosisReply(request.number, tuple(findings), result.verdict.value)
+    return DiagnosisReply(request.number, "", tuple(findings), result.verdict.value)
 
 
 class BackgroundDiagnosis:
@@ -79,13 +87,14 @@ class BackgroundDiagnosis:
         self._vehicle, self._store, self._every, self._seed = vehicle, store, every, seed
         self._asked: DiagnosisRequest | None = None
         self._reply: DiagnosisReply | None = None
-        self._last, self._number = -math.inf, 0
+        self._last = -math.inf
         self._told: DiagnosisReply | None = None
 
-    def ask(self, tick: float, since: float) -> DiagnosisRequest | None:
+    def ask(self, number: int, tick: float, since: float) -> DiagnosisRequest | None:
         """The next question, if it is time for one.
 
         Args:
+            number: of the job.
             tick: now [s].
             since: data before this belong to another vehicle [s].
         """
@@ -95,13 +104,13 @@ class BackgroundDiagnosis:
         cut = self._store.cut(start, tick)
         if cut.reason or cut.seconds < COMPLETE * DIAGNOSED_SECONDS:
             return None
-        self._last, self._number = tick, self._number + 1
-        self._asked = DiagnosisRequest(self._number, self._vehicle, cut.windows, start, tick, self._seed)
+        self._last = tick
+        self._asked = DiagnosisRequest(number, self._vehicle, cut.windows, start, tick, self._seed)
         return self._asked
 
-    def deliver(self, reply: DiagnosisReply) -> None:
+    def deliver(self, reply: JobReply) -> None:
         """Takes the answer to the running question; an answer to any other is ignored."""
-        if self._asked is not None and reply.number == self._asked.number:
+        if self._asked is not None and self._asked.is_answered_by(reply) and isinstance(reply, DiagnosisReply):
             self._reply = reply
 
     def answer(self, tick: float, since: float, stamp: Callable[[float], float]) -> Diagnosed | None:

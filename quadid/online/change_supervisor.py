@@ -90,9 +90,9 @@ class ChangeSupervisor:
     def answer_without_fit(request: ChangeRequest, estimator: Estimator) -> ChangeReply | None:
         """The answer where a fit could say nothing: no data, or nothing known before."""
         if not request.windows:
-            return ChangeReply(request.number, problem="too little data after the change")
+            return request.failed("too little data after the change")
         if not estimator.learned:
-            return ChangeReply(request.number, _unlearned(request.change, request.time))
+            return ChangeReply(request.number, finding=_unlearned(request.change, request.time))
         return None
 
 

@@ -15,6 +15,7 @@ from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, NEVER, Layout
 from quadid.online.change_detection import Change
+from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -39,11 +40,10 @@ EFFECT_SIGMA = 0.3
 
 
 @dataclass(frozen=True)
-class ChangeRequest:
+class ChangeRequest(Job):
     """A change to be explained.
 
     Attributes:
-        number: counts requests of a session.
         vehicle: the vehicle.
         windows: data from the change on.
         start, stop: their time [s].
@@ -53,7 +53,6 @@ class ChangeRequest:
         time: when, refined; in the time of the stream's stamps [s].
     """
 
-    number: int
     vehicle: Vehicle
     windows: tuple[Window, ...]
     start: float
@@ -64,14 +63,20 @@ class ChangeRequest:
     change: Change
     time: float
 
+    def run(self) -> ChangeReply:
+        """Isolates the fault."""
+        return isolate_fault(self)
+
+    def failed(self, problem: str) -> ChangeReply:
+        """The reply where nothing could be fitted."""
+        return ChangeReply(self.number, problem)
+
 
 @dataclass(frozen=True)
-class ChangeReply:
-    """Answer: findings (most likely first), or why there is none."""
+class ChangeReply(JobReply):
+    """Answer: the most likely finding, or why there is none."""
 
-    number: int
     finding: OnlineFinding | None = None
-    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,14 +101,14 @@ def isolate_fault(request: ChangeRequest) -> ChangeReply:
     try:
         return _explain(request)
     except (QuadidError, np.linalg.LinAlgError) as error:
-        return ChangeReply(request.number, problem=str(error))
+        return request.failed(str(error))
 
 
 def _explain(request: ChangeRequest) -> ChangeReply:
     layout = Layout(request.vehicle)
     shooting = Shooting(request.windows, request.vehicle, SEGMENT, request.noise, layout)
     if shooting.count < 3:
-        return ChangeReply(request.number, problem="too little data after the change")
+        return request.failed("too little data after the change")
     nothing = _fit(shooting, request, _Cause("", (), ()))
     kept = shooting.snapshot()
     outcomes = []
@@ -116,8 +121,8 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     best = outcomes[0] if outcomes else nothing
     drop = nothing.deviance - best.deviance
     if not outcomes or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1)):
-        return ChangeReply(request.number, problem="no known cause explains it")
-    return ChangeReply(request.number, _finding(request, nothing, outcomes))
+        return request.failed("no known cause explains it")
+    return ChangeReply(request.number, finding=_finding(request, nothing, outcomes))
 
 
 def _causes(request: ChangeRequest) -> list[_Cause]:

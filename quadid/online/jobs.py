@@ -1,26 +1,49 @@
-"""Answers whatever a session asks: what a fit process does, and a replay inline."""
+"""Work that a session asks for and does not do itself: a fit, a question about a change, a diagnosis.
+
+Whoever drives the session runs it, in its own process or another, and delivers the reply.
+"""
 
 from __future__ import annotations
 
-from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest, diagnose_window
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest, isolate_fault
-from quadid.online.window_fit import FitReply, FitRequest, fit_window
-
-Request = FitRequest | ChangeRequest | DiagnosisRequest
-Reply = FitReply | ChangeReply | DiagnosisReply
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, TypeGuard
 
 
-def answer(request: Request) -> Reply:
-    """Does what a request asks for; trouble is told in the reply, never raised."""
-    if isinstance(request, FitRequest):
-        return fit_window(request)
-    return isolate_fault(request) if isinstance(request, ChangeRequest) else diagnose_window(request)
+@dataclass(frozen=True)
+class JobReply:
+    """Answer to a job.
+
+    Attributes:
+        number: of the job.
+        problem: why there is no result, or empty.
+    """
+
+    number: int
+    problem: str = ""
 
 
-def failed(request: Request, problem: str) -> Reply:
-    """The answer to a request that could not be worked on."""
-    if isinstance(request, FitRequest):
-        return FitReply(request.number, problem)
-    if isinstance(request, ChangeRequest):
-        return ChangeReply(request.number, problem=problem)
-    return DiagnosisReply(request.number, problem=problem)
+@dataclass(frozen=True)
+class Job(ABC):
+    """A pure function of its own fields.
+
+    Attributes:
+        number: counts the jobs of a session.
+        background: whether the session goes on meanwhile; it stands still for all others.
+    """
+
+    background: ClassVar[bool] = False
+
+    number: int
+
+    @abstractmethod
+    def run(self) -> JobReply:
+        """Does it; trouble is the reply's `problem`, never raised."""
+
+    @abstractmethod
+    def failed(self, problem: str) -> JobReply:
+        """The reply of a job that could not be run."""
+
+    def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
+        """Whether a reply is to this job, and of its kind."""
+        return isinstance(reply, type(self.failed(""))) and reply.number == self.number

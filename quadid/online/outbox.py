@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from quadid.online.background_diagnosis import DiagnosisRequest
-from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.jobs import Job
 from quadid.online.records import Diagnosed, Event, Phase, Publish
-from quadid.online.window_fit import FitRequest
 
-Action = FitRequest | ChangeRequest | DiagnosisRequest | Publish | Diagnosed | Event
+Action = Job | Publish | Diagnosed | Event
 
 
 class Outbox:

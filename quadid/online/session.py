@@ -14,14 +14,17 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
 
 from quadid.online.active_set import ActiveSet, Answer
-from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis, DiagnosisReply
+from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality, judge
 from quadid.online.records import OnlineSet, Phase, Publish, SetState
@@ -29,7 +32,7 @@ from quadid.online.resampler import Resampler, Rows
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
 from quadid.online.supervisor import Supervisor
-from quadid.online.window_fit import FitReply, FitRequest, is_excited
+from quadid.online.window_fit import is_excited
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 
@@ -75,8 +78,9 @@ class Session:
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
         self._supervisor = Supervisor(self._estimator, self.active_set, self._outbox, self.settings.gate)
         self._cut = Cut((), 0.0, 0)
-        self._waiting: FitRequest | ChangeRequest | None = None
-        self._reply: FitReply | ChangeReply | None = None
+        self._waiting: Job | None = None
+        self._reply: JobReply | None = None
+        self._land: Callable[[Any], Iterator[None]] = iter
         self._outdated = 0
         self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
         self._work: Iterator[None] | None = None
@@ -96,12 +100,12 @@ class Session:
         """Takes messages as if their samples were pushed one by one."""
         self.resampler.push_block(block)
 
-    def deliver(self, reply: FitReply | ChangeReply | DiagnosisReply) -> None:
-        """Takes the answer to the running request or study; an answer to any other is ignored."""
-        if isinstance(reply, DiagnosisReply):
-            self._diagnosis.deliver(reply)
-        elif self._waiting is not None and reply.number == self._waiting.number:
+    def deliver(self, reply: JobReply) -> None:
+        """Takes the answer to a running job; an answer to any other is ignored."""
+        if self._waiting is not None and reply.number == self._waiting.number:
             self._reply = reply
+        else:
+            self._diagnosis.deliver(reply)
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
         """A person approves the set that waits."""
@@ -127,8 +131,8 @@ class Session:
     # --- output
 
     @property
-    def running(self) -> FitRequest | ChangeRequest | None:
-        """The request whose reply the session waits for."""
+    def running(self) -> Job | None:
+        """The job whose reply the session waits for."""
         return self._waiting
 
     @property
@@ -237,8 +241,9 @@ class Session:
             self._outbox.act(told)
         moving = self._estimator.learned and is_excited(self._estimator.excitation)
         if moving and self._change_supervisor.seen is None and self._supervisor.quality == Quality():
-            request = self._diagnosis.ask(tick, since)
+            request = self._diagnosis.ask(self._number + 1, tick, since)
             if request is not None:
+                self._number = request.number
                 self._outbox.act(request)
 
     def _explain(self, tick: float) -> None:
@@ -247,7 +252,7 @@ class Session:
         request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
-        self._number, self._waiting = request.number, request
+        self._await(request, partial(self._changed, request))
         self._reply = self._change_supervisor.answer_without_fit(request, self._estimator)
         if self._reply is None:
             self._outbox.act(request)
@@ -269,10 +274,11 @@ class Session:
             self._outbox.note(tick, phase, quality.fault or quality.grounded)
             return
         yield
-        self._number, self._last_fit = self._number + 1, tick
+        self._last_fit = tick
         start = max(start, tick - self.settings.window)
-        self._waiting = self._estimator.request(self._number, self._cut.windows, start, tick)
-        self._outbox.act(self._waiting)
+        request = self._estimator.request(self._number + 1, self._cut.windows, start, tick)
+        self._await(request, partial(self._supervisor.fitted, request))
+        self._outbox.act(request)
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self._cut.blocked:
@@ -284,10 +290,15 @@ class Session:
     def _apply(self) -> Iterator[None]:
         request, reply = self._waiting, self._reply
         self._waiting = self._reply = None
-        if request is None or request.number <= self._outdated:
+        if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
-        if isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
-            self._change_supervisor.restart()
-            self._supervisor.changed(request, reply)
-        elif isinstance(request, FitRequest) and isinstance(reply, FitReply):
-            yield from self._supervisor.fitted(request, reply)
+        yield from self._land(reply)
+
+    def _changed(self, request: ChangeRequest, reply: ChangeReply) -> Iterator[None]:
+        self._change_supervisor.restart()
+        self._supervisor.changed(request, reply)
+        yield
+
+    def _await(self, job: Job, land: Callable[[Any], Iterator[None]]) -> None:
+        """Stands still until the reply to a job is there; `land` takes it in."""
+        self._number, self._waiting, self._land = job.number, job, land

@@ -15,6 +15,7 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.fusion import WindowEstimate
+from quadid.online.jobs import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -40,11 +41,10 @@ RATED = ("J_xx", "J_yy")
 
 
 @dataclass(frozen=True)
-class FitRequest:
+class FitRequest(Job):
     """A window to be fitted.
 
     Attributes:
-        number: counts requests of a session.
         vehicle: the vehicle.
         windows: stretches of data on one grid.
         start, stop: the time they stand for [s].
@@ -55,7 +55,6 @@ class FitRequest:
         measure: measure the sensor noise in this window too.
     """
 
-    number: int
     vehicle: Vehicle
     windows: tuple[Window, ...]
     start: float
@@ -66,14 +65,20 @@ class FitRequest:
     seed: int
     measure: bool = False
 
+    def run(self) -> FitReply:
+        """Fits the window."""
+        return fit_window(self)
+
+    def failed(self, problem: str) -> FitReply:
+        """The reply of a fit that could not be run."""
+        return FitReply(self.number, problem)
+
 
 @dataclass(frozen=True)
-class FitReply:
+class FitReply(JobReply):
     """Answer to a request.
 
     Attributes:
-        number: of the request.
-        problem: why there is no estimate, or empty.
         excitation: relative standard deviations that this window alone allows, shape (6,); None after a failure.
         excited: whether they suffice.
         estimate: quadratic model at the optimum.
@@ -82,8 +87,6 @@ class FitReply:
         measured: noise measured in this window, when that was asked for.
     """
 
-    number: int
-    problem: str = ""
     excitation: FloatArray | None = None
     excited: bool = False
     estimate: WindowEstimate | None = None
@@ -122,7 +125,7 @@ def fit_window(request: FitRequest) -> FitReply:
     try:
         return _fit(request)
     except (QuadidError, np.linalg.LinAlgError) as error:
-        return FitReply(request.number, problem=str(error))
+        return request.failed(str(error))
 
 
 def _fit(request: FitRequest) -> FitReply:
@@ -130,7 +133,7 @@ def _fit(request: FitRequest) -> FitReply:
     theta, noise = request.theta, request.noise
     shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
     if shooting.count == 0:
-        return FitReply(request.number, problem="no stretch is long enough for one segment")
+        return request.failed("no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
     bounds = _bounds(shooting, theta, free)
     drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)

@@ -10,9 +10,9 @@ import queue
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
-from quadid.online.jobs import Request, answer
+from quadid.online.jobs import Job
 from quadid_node.parcel import ParcelError, pack, unpack
 from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
 
@@ -92,12 +92,12 @@ def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]
 def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
     try:
         request = unpack(query.payload.to_bytes() if query.payload is not None else b"")
-        if not isinstance(request, get_args(Request)):
+        if not isinstance(request, Job):
             raise ParcelError(f"a parcel with a {type(request).__name__}", "a request of a fit")
     except ParcelError as error:
         done.refused += 1
         told(f"refused: {error}")
         query.reply_err(str(error).encode())
         return
-    query.reply(query.key_expr, pack(answer(request)))
+    query.reply(query.key_expr, pack(request.run()))
     done.answered += 1

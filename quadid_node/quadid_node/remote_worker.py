@@ -10,13 +10,11 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import zenoh
 
-from quadid.online.background_diagnosis import DiagnosisRequest
-from quadid.online.jobs import Reply, Request
-from quadid.online.window_fit import FitRequest
+from quadid.online.jobs import Job, JobReply
 from quadid_node.ground import ALIVE
 from quadid_node.parcel import ParcelError, pack, unpack
 from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble
@@ -56,7 +54,7 @@ class Ground:
         """Whether no ground machine lives any more."""
         return not self._alive
 
-    def ask(self, request: Request, answers: queue.Queue[tuple[int, Any]], seconds: float) -> None:
+    def ask(self, request: Job, answers: queue.Queue[tuple[int, Any]], seconds: float) -> None:
         """Sends a request; what comes back is put into `answers` with its number, None for a refusal."""
 
         def take(reply: Any) -> None:
@@ -113,7 +111,7 @@ class RemoteWorker:
         """Takes over `local`, which is closed with it."""
         self._local, self._ground, self._clock = local, ground, clock
         self._answers: queue.Queue[tuple[int, Any]] = queue.Queue()
-        self._asked: Request | None = None
+        self._asked: Job | None = None
         self._until = 0.0
         self._told: list[Trouble] = []
         self._was_there = False
@@ -139,21 +137,21 @@ class RemoteWorker:
         """Of the child."""
         return self._local.restarts
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Job) -> None:
         """Begins a fit on the ground, or on board."""
         if not self._ground.there:
             self._local.submit(request)
             return
-        limit = STUDY_LIMIT if isinstance(request, DiagnosisRequest) else FAR_LIMIT
+        limit = STUDY_LIMIT if request.background else FAR_LIMIT
         self._asked, self._until = request, self._clock() + limit
         try:
             self._ground.ask(request, self._answers, limit)
         except zenoh.ZError as error:
             self._fall_back(f"cannot be asked ({str(error).splitlines()[0]:.80})")
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         """What has come from either; never waits."""
-        out: list[Reply | Trouble] = list(self._local.poll())
+        out: list[JobReply | Trouble] = list(self._local.poll())
         while not self._answers.empty():
             number, data = self._answers.get_nowait()
             if self._asked is not None and number == self._asked.number:
@@ -177,13 +175,13 @@ class RemoteWorker:
         self._local.close()
         self._ground.close()
 
-    def _take(self, number: int, data: bytes | None, out: list[Reply | Trouble]) -> None:
+    def _take(self, number: int, data: bytes | None, out: list[JobReply | Trouble]) -> None:
         try:
             reply = unpack(data) if data is not None else None
         except ParcelError as error:
             self._fall_back(f"answers what cannot be read ({error})")
             return
-        if not isinstance(reply, get_args(Reply)) or reply.number != number:
+        if self._asked is None or not self._asked.is_answered_by(reply):
             self._fall_back("refused the request" if data is None else "answers something else")
             return
         self._asked = None
@@ -194,8 +192,7 @@ class RemoteWorker:
         request, self._asked = self._asked, None
         self._ground.rest()
         self._was_there = False
-        kind = "fits" if isinstance(request, FitRequest) else "work"
-        self._told.append(Trouble("warning", f"the ground machine {why}: {kind} on board for {REST:g} s or longer"))
+        self._told.append(Trouble("warning", f"the ground machine {why}: work on board for {REST:g} s or longer"))
         if request is not None:
             self._local.submit(request)
 

@@ -10,10 +10,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from quadid.online import FitReply, FitRequest, Session, SessionSettings
+from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
-from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.outbox import Action
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.online.status import SessionStatus
@@ -145,14 +143,14 @@ class Service:
         """Gives requests to the workers; returns the rest."""
         outputs: list[Output] = []
         for action in actions:
-            if isinstance(action, FitRequest | ChangeRequest):
-                self._fit_began = self._clock()
-                self._worker.submit(action)
-            elif isinstance(action, DiagnosisRequest):
+            if not isinstance(action, Job):
+                outputs.append(action)
+            elif action.background:
                 self._studying = self._studying or self._worker.sibling()
                 self._studying.submit(action)
             else:
-                outputs.append(action)
+                self._fit_began = self._clock()
+                self._worker.submit(action)
         return outputs
 
     def idle(self) -> list[Output]:
@@ -163,13 +161,12 @@ class Service:
         outputs: list[Output] = self._history_notes()
         studied = self._studying.poll() if self._studying is not None else []
         for item in (*self._worker.poll(), *studied):
-            if isinstance(item, DiagnosisReply):
-                self.session.deliver(item)
-            elif isinstance(item, FitReply | ChangeReply):
-                self._fit_seconds = self._clock() - self._fit_began
-                self.session.deliver(item)
-            else:
+            if isinstance(item, Trouble):
                 outputs.append(self._trouble(item))
+                continue
+            if self.session.running is not None and item.number == self.session.running.number:
+                self._fit_seconds = self._clock() - self._fit_began
+            self.session.deliver(item)
         return [*outputs, *self._history_trouble()]
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:

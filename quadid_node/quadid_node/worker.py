@@ -16,10 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from quadid.errors import QuadidError
-from quadid.online.background_diagnosis import DiagnosisReply
-from quadid.online.fault_isolation import ChangeReply
-from quadid.online.jobs import Reply, Request, answer, failed
-from quadid.online.window_fit import FitReply
+from quadid.online.jobs import Job, JobReply
 from quadid.vehicle import Vehicle
 from quadid_node.warm_up import WarmUp
 from quadid_node.worker_main import READY, THREADS, frame, unframe
@@ -49,10 +46,10 @@ class Trouble:
 class Worker(Protocol):
     """What the service needs of a worker."""
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Job) -> None:
         """Begins a fit."""
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         """What has happened since the last call."""
 
     @property
@@ -77,16 +74,16 @@ class InlineWorker:
     state = "inline"
 
     def __init__(self) -> None:
-        self._waiting: list[Request] = []
+        self._waiting: list[Job] = []
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Job) -> None:
         """Takes a request, to be fitted by the next `poll`."""
         self._waiting.append(request)
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         """Does all fits that wait."""
         waiting, self._waiting = self._waiting, []
-        return [answer(request) for request in waiting]
+        return [job.run() for job in waiting]
 
     def sibling(self) -> InlineWorker:
         """Another one."""
@@ -121,7 +118,7 @@ class ProcessWorker:
         self._name, self._limit = name, limit
         self._child: subprocess.Popen[bytes] | None = None
         self._out, self._in = bytearray(), bytearray()
-        self._request: Request | None = None
+        self._request: Job | None = None
         self._tries = self._failures = self.restarts = 0
         self._since = self._last_failure = -1e9
         self._told: list[Trouble] = []
@@ -138,15 +135,15 @@ class ProcessWorker:
         """Process id of the child; 0 while there is none."""
         return self._child.pid if self._child is not None else 0
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Job) -> None:
         """Gives the child a request, or keeps it until there is a child that can take it."""
         self._request, self._tries = request, 0
         if self.state == "idle":
             self._give()
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         """Moves bytes, checks on the child, restarts it when it is time; never blocks."""
-        replies: list[Reply | Trouble] = []
+        replies: list[JobReply | Trouble] = []
         if self.state == "resting" and self._clock() >= self._since:
             self._start()
         if self._child is not None:
@@ -206,21 +203,21 @@ class ProcessWorker:
             while data := os.read(self._child.stdout.fileno(), _PIPE_BYTES):
                 self._in += data
 
-    def _received(self) -> list[Reply]:
-        replies: list[Reply] = []
+    def _received(self) -> list[JobReply]:
+        replies: list[JobReply] = []
         while (item := unframe(self._in)) is not None:
             if item == READY:
                 self.state = "idle"
                 if self._request is not None:
                     self._give()
-            elif isinstance(item, FitReply | ChangeReply | DiagnosisReply):
+            elif isinstance(item, JobReply):
                 self._request, self.state = None, "idle"
                 replies.append(item)
         if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
             self._failures = 0
         return replies
 
-    def _check(self, replies: list[Reply | Trouble]) -> None:
+    def _check(self, replies: list[JobReply | Trouble]) -> None:
         """Looks whether the child died or hangs; keeps or gives up its request."""
         assert self._child is not None
         code = self._child.poll()
@@ -241,7 +238,7 @@ class ProcessWorker:
         self._told.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
         if self._request is not None and self._tries >= TRIES:
             problem = f"{TRIES} {self._name} processes failed on this window (the last one {why})"
-            replies.append(failed(self._request, problem))
+            replies.append(self._request.failed(problem))
             self._told.append(Trouble("error", problem))
             self._request = None
 

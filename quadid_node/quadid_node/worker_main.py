@@ -28,7 +28,6 @@ def main() -> None:
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _behave(int(sys.argv[1]))
-    from quadid.online.jobs import answer
     from quadid.online.window_fit import warm_up
 
     try:
@@ -37,8 +36,8 @@ def main() -> None:
             return
         warm_up(vehicle)
         _write(channel, READY)
-        while (request := _read(requests)) is not None:
-            _write(channel, answer(request))
+        while (job := _read(requests)) is not None:
+            _write(channel, job.run())
     except MemoryError:
         sys.exit("the fit process needs more memory than it may have")  # one line; the parent says what follows
 

@@ -16,7 +16,7 @@ from quadid_node.worker import InlineWorker, Trouble
 from benchmarks.online.accuracy import PELICAN, flown
 from benchmarks.online.memory import resident
 from quadid.online import Publish, SessionSettings
-from quadid.online.jobs import Reply
+from quadid.online.jobs import JobReply
 from quadid.window import Block, Recording
 from studies.soak import memory
 
@@ -37,7 +37,7 @@ class TimedWorker(InlineWorker):
         super().__init__()
         self.spent, self.fits = 0.0, 0
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         """Does what waits, and times it."""
         begin = time.thread_time()
         done = super().poll()

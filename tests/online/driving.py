@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from quadid.flight import Flight, fly
-from quadid.online import FitRequest, Session, fit_window
-from quadid.online.fault_isolation import ChangeRequest, isolate_fault
+from quadid.online import Session
 from quadid.online.outbox import Action
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
@@ -43,12 +42,9 @@ def answer(session: Session) -> list[Action]:
     while True:
         out.extend(session.poll())
         request = session.running
-        if isinstance(request, ChangeRequest):
-            session.deliver(isolate_fault(request))
-        elif isinstance(request, FitRequest):
-            session.deliver(fit_window(request))
-        else:
+        if request is None:
             return out
+        session.deliver(request.run())
 
 
 def drive(session: Session, stream: Sequence[Sample], chunk: int = 40) -> list[Action]:

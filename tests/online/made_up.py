@@ -14,8 +14,9 @@ from functools import lru_cache
 import numpy as np
 
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.fusion import WindowEstimate
+from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
@@ -23,7 +24,7 @@ from quadid.window import Sample
 from tests.online.test_gate import TRUE
 
 PELICAN = Vehicle.shipped("pelican")
-Worker = Callable[[FitRequest | ChangeRequest], FitReply | ChangeReply | None]
+Worker = Callable[[Job], JobReply | None]
 """Answers a request; None: it is still at work."""
 
 
@@ -82,9 +83,9 @@ def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shif
 def tells(sigma: float = 0.005, **factors: float) -> Worker:
     """A worker whose fits say the truth times `factors`, with a relative standard deviation of `sigma`."""
 
-    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply:
-        if isinstance(request, ChangeRequest):
-            return ChangeReply(request.number, problem="made up")
+    def work(request: Job) -> JobReply:
+        if not isinstance(request, FitRequest):
+            return request.failed("made up")
         values = np.array([TRUE[n] * factors.get(n, 1.0) for n in NOMINAL_NAMES])
         window = WindowEstimate(
             request.start, request.stop, np.log(values), np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0

@@ -8,7 +8,6 @@ import pytest
 
 from quadid.online import Diagnosed, Session, SessionSettings
 from quadid.online.background_diagnosis import ANSWER_AFTER, DIAGNOSED_SECONDS, DiagnosisReply, DiagnosisRequest
-from quadid.online.jobs import answer
 from quadid.online.outbox import Action
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
@@ -34,8 +33,8 @@ def test_it_is_asked_for_after_a_minute_of_flight_and_told_later() -> None:
     (request,) = studies(early)
     assert request.stop - request.start == pytest.approx(DIAGNOSED_SECONDS)
     assert sum(len(w) for w in request.windows) * 0.02 == pytest.approx(DIAGNOSED_SECONDS, abs=0.1)
-    session.deliver(DiagnosisReply(request.number, (DRAG,), "explained"))
-    session.deliver(DiagnosisReply(99, (), "unknown"))
+    session.deliver(DiagnosisReply(request.number, "", (DRAG,), "explained"))
+    session.deliver(DiagnosisReply(99, "", (), "unknown"))
     assert not diagnosed(drive(session, [s for s in stream if EPOCH + 80.0 <= s.t < EPOCH + 88.0]))
     rest = drive(session, [s for s in stream if s.t >= EPOCH + 88.0])
     (told,) = diagnosed(rest)
@@ -54,7 +53,7 @@ def test_what_was_told_is_not_told_again_but_news_are() -> None:
         actions = drive(session, [sample])
         told += diagnosed(actions)
         for request in studies(actions):
-            session.deliver(DiagnosisReply(request.number, next(replies, (moved,)), "explained"))
+            session.deliver(DiagnosisReply(request.number, "", next(replies, (moved,)), "explained"))
     assert [d.findings for d in told][:1] == [(DRAG,)]
     assert (replace(DRAG, values={"k_x": 0.31}),) not in [d.findings for d in told]
 
@@ -67,7 +66,7 @@ def test_zero_never_asks() -> None:
 def test_an_answer_from_before_a_change_is_not_told() -> None:
     session, stream = fly(100.0)
     (request,) = studies(drive(session, [s for s in stream if s.t < EPOCH + 70.0]))
-    session.deliver(DiagnosisReply(request.number, (DRAG,), "explained"))
+    session.deliver(DiagnosisReply(request.number, "", (DRAG,), "explained"))
     late = [Sample(s.t + 400.0, s.channel, s.values) for s in stream]  # a break in the stream: another flight perhaps
     assert not diagnosed(drive(session, late[:8000]))
 
@@ -76,7 +75,7 @@ def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
     made = flight(61.5, 11, "excited", (("rotor_drag", "k_x", 0.35), ("rotor_drag", "k_y", 0.35)))
     session = Session(PELICAN, QUICK)
     (request,) = studies(drive(session, samples(made.recording)))
-    reply = answer(request)
+    reply = request.run()
     assert isinstance(reply, DiagnosisReply)
     assert not reply.problem
     assert reply.findings[0].effect == "rotor_drag"

@@ -31,7 +31,7 @@ from quadid_node.worker import Trouble
 
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
 from quadid.online.fusion import WindowEstimate
-from quadid.online.jobs import Reply, Request, failed
+from quadid.online.jobs import Job, JobReply
 from quadid.online.records import OnlineSet
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle
@@ -58,13 +58,13 @@ class Adversary:
     ready, state = True, "idle"
 
     def __init__(self) -> None:
-        self.asked: list[Request] = []
-        self.answers: list[Reply | Trouble] = []
+        self.asked: list[Job] = []
+        self.answers: list[JobReply | Trouble] = []
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Job) -> None:
         self.asked.append(request)
 
-    def poll(self) -> list[Reply | Trouble]:
+    def poll(self) -> list[JobReply | Trouble]:
         answers, self.answers = self.answers, []
         return answers
 
@@ -169,7 +169,7 @@ class Machine(RuleBasedStateMachine):
     def fit(self, kind: str, sigma: float) -> None:
         request = self.worker.asked[-1]
         if kind == "failed" or not isinstance(request, FitRequest):
-            reply: Reply = failed(request, "the fit process died")
+            reply: JobReply = request.failed("the fit process died")
         else:
             reply = estimate(request, self.factors, sigma)
             if kind == "not a number":

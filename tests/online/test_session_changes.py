@@ -11,6 +11,7 @@ import pytest
 from quadid.online import FitReply, FitRequest, Phase, Session
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action
 from quadid.online.records import OnlineFinding
 from quadid.window import Sample
@@ -34,13 +35,18 @@ MASS = OnlineFinding(
 )
 
 
+def stop_of(job: Job) -> float:
+    assert isinstance(job, FitRequest)
+    return job.stop
+
+
 def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> None:
     session = Session(PELICAN, QUICK)
 
-    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
+    def work(request: Job) -> JobReply | None:
         if isinstance(request, ChangeRequest):
-            return ChangeReply(request.number, MASS)
-        return tells(b=0.85 if request.stop > 18.0 else 1.0)(request)
+            return ChangeReply(request.number, finding=MASS)
+        return tells(b=0.85 if stop_of(request) > 18.0 else 1.0)(request)
 
     actions = works(session, between(DROPPED, 0.0, 17.5, EPOCH), work)
     (seen,) = events(actions, "change")
@@ -69,14 +75,14 @@ def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> 
 def test_while_a_change_is_explained_the_session_waits() -> None:
     session = Session(PELICAN, QUICK)
 
-    def work(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
+    def work(request: Job) -> JobReply | None:
         return None if isinstance(request, ChangeRequest) else tells()(request)
 
     works(session, between(DROPPED, 0.0, 20.7), work)
     question = session.running
     assert isinstance(question, ChangeRequest)
     assert session.status().phase is Phase.FITTING
-    session.deliver(ChangeReply(question.number - 1, MASS))
+    session.deliver(ChangeReply(question.number - 1, finding=MASS))
     assert session.poll() == []
     session.deliver(ChangeReply(question.number, problem="no known cause explains it"))
     said = session.poll()
@@ -87,9 +93,9 @@ def test_while_a_change_is_explained_the_session_waits() -> None:
 
 
 def test_an_answer_of_the_wrong_kind_is_ignored_and_the_question_asked_again() -> None:
-    def confused(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply:
+    def confused(request: Job) -> JobReply:
         if isinstance(request, FitRequest):
-            return ChangeReply(request.number, MASS)
+            return ChangeReply(request.number, finding=MASS)
         return FitReply(request.number, problem="an answer to a fit")
 
     session = Session(PELICAN, QUICK)
@@ -132,23 +138,24 @@ def test_a_minute_is_studied_beside_the_fits_and_told_half_a_minute_later() -> N
     assert (study.vehicle, study.seed) == (PELICAN, 3)
     assert sum(len(w) for w in study.windows) >= 2995
     assert study.stop <= 62.0 + study.start, "asked for as soon as there is a minute"
-    session.deliver(DiagnosisReply(study.number + 1, (), "unknown"))
-    session.deliver(DiagnosisReply(study.number, (MASS,), "explained"))
+    session.deliver(DiagnosisReply(study.number + 1, "", (), "unknown"))
+    session.deliver(DiagnosisReply(study.number, "", (MASS,), "explained"))
     assert session.running is None, "nothing waits for a study"
     rest = works(session, between(LONG, 63.7, 95.7, EPOCH), tells())
     (told,) = diagnosed(rest)
     assert (told.findings, told.verdict) == ((MASS,), "explained")
     assert (told.stop - told.start, told.t) == (60.0, told.stop)
     assert told.stop == session.resampler.time.stamp(study.stop)
-    assert numbers(actions + rest) == list(range(1, session.status().fits + 1)), "studies have their own count"
+    jobs = [a.number for a in actions + rest if isinstance(a, Job)]
+    assert jobs == list(range(1, session.status().fits + 2)), "one count for all jobs"
 
 
 @pytest.mark.parametrize("worker", ["failing", "blind", "off"])
 def test_what_is_not_known_or_does_not_move_is_not_studied(worker: str) -> None:
-    def blind(request: FitRequest | ChangeRequest) -> FitReply | ChangeReply | None:
-        return tells()(request) if request.stop < 20.0 else FitReply(request.number, excitation=np.full(6, 5.0))
+    def blind(request: Job) -> JobReply | None:
+        return tells()(request) if stop_of(request) < 20.0 else FitReply(request.number, excitation=np.full(6, 5.0))
 
-    def failing(request: FitRequest | ChangeRequest) -> FitReply:
+    def failing(request: Job) -> FitReply:
         return FitReply(request.number, problem="no luck")
 
     settings = STUDYING.model_copy(update={"diagnose": 0.0}) if worker == "off" else STUDYING

@@ -8,6 +8,7 @@ import pytest
 
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.jobs import Job
 from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
@@ -28,7 +29,7 @@ MANUAL = QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "m
 FLIGHT = light_flight(30.0)
 
 
-def never(request: FitRequest | ChangeRequest) -> None:
+def never(job: Job) -> None:
     """A worker that does not answer."""
 
 
