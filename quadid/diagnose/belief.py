@@ -16,12 +16,8 @@ from quadid.model.layout import Entry
 
 LIKELY_SENSOR = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
-ONE_SIGN = (
-    "rotor_drag.k_x", "rotor_drag.k_y", "axial_inflow.k_z", "rate_damping.l_p", "rate_damping.m_q", "rotor_spin_up.J",
-)  # fmt: skip
-"""Numbers that physics keeps from being negative: air takes energy from the motion, a rotor's inertia is one …"""
 WRONG_SIGN = 0.1
-"""… but for what a fit may lay beside the truth: this share of their typical size."""
+"""Share of its typical size by which a number that cannot be negative may be, for what a fit lays beside the truth."""
 AT_BOUND = 1e-6
 """Share of the width of the bounds within which a number rests on one of them."""
 
@@ -50,7 +46,7 @@ def _of_wrong_sign(model: Model) -> Iterator[Entry]:
     sigma = dict(zip(model.free.names, model.sigma, strict=True))
     for e in _entries(model):
         highest = (float(model.theta[e.index]) - e.neutral) / e.typical + Z95 * sigma[e.name]
-        if e.name in ONE_SIGN and highest < -WRONG_SIGN:
+        if e.sign > 0 and highest < -WRONG_SIGN:
             yield e
 
 

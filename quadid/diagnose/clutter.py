@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from quadid.diagnose.candidates import Candidate, all_names
 from quadid.diagnose.exchange import left_over
 from quadid.diagnose.models import Model, as_model, free_names
+from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import bounded_step, default_prior, polish, scaled_difference
 from quadid.identify.parameterization import Free
 from quadid.identify.segment_cost import Linearised
@@ -35,7 +36,7 @@ _ITERATIONS = 4
 
 def untidy_names(listed: Sequence[Candidate]) -> list[str]:
     """Entries of the catalogue that may be a little off on any vehicle; changes at a moment are events, not clutter."""
-    return all_names([c for c in listed if c.timed is None and c.effect not in ("wind", "ground_effect")])
+    return all_names([c for c in listed if c.timed is None and not EFFECTS[c.effect].needs])
 
 
 def without_in_clutter(

@@ -12,8 +12,8 @@ from quadid.diagnose.blocks import Gain, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model, extend, fit_model, sketch
 from quadid.diagnose.screen import Score
+from quadid.effects import NEVER
 from quadid.identify.shooting import Shooting
-from quadid.model.layout import NEVER
 
 FloatArray = NDArray[np.float64]
 

@@ -30,10 +30,6 @@ from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
 
-STAND_INS = (
-    "rotor_drag", "rotor_drag_moment", "axial_inflow", "rate_damping", "cg_offset", "motor_lag", "rotor_spin_up",
-)  # fmt: skip
-"""Effects that may stand for forces and moments nobody has named."""
 POOR = 2.0
 """Deviance per row above which an unexplained flight is predicted poorly enough to refit."""
 AHEAD = STAGES[-1][-1]
@@ -42,15 +38,6 @@ BETTER = 0.9
 """The refitted parameters are kept when their error is below this share of that of the findings' own."""
 FREER = 20.0
 """Factor each way that nominal parameters may lie from their guess, where the vehicle file gives no bounds."""
-MOTIONLESS = (
-    "gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment", "imu_lever_arm", "imu_lag", "attitude_delay",
-    "ahrs_acceleration_error",
-)  # fmt: skip
-"""Effects that do not move the vehicle."""
-FORCES = (
-    "rotor_drag", "rotor_drag_moment", "parasitic_drag", "axial_inflow", "thrust_curve", "ground_effect",
-)  # fmt: skip
-"""Effects that runs tell only where velocity was measured."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +113,15 @@ def refit_to_predict(
 def _causes(found: Model, listed: Sequence[Candidate], flown: bool) -> tuple[Candidate, ...]:
     """Findings, and the stand-ins that are none."""
     present = {c.label for c in found.causes}
-    others = [c for c in listed if c.label in STAND_INS and c.label not in present and not c.split]
+    others = [c for c in listed if EFFECTS[c.effect].stand_in and c.label not in present and not c.split]
     return (*found.causes, *(c for c in others if _refitted(c, flown)))
 
 
 def _refitted(cause: Candidate, flown: bool) -> bool:
     """Whether a cause acts on the motion, all the time, the same in every flight, and shows where it was measured."""
-    moves = cause.effect not in MOTIONLESS and cause.timed is None and not EFFECTS[cause.effect].per_log
-    return moves and (flown or cause.effect not in FORCES)
+    effect = EFFECTS[cause.effect]
+    moves = effect.acts != "sensor" and cause.timed is None and not effect.per_log
+    return moves and (flown or (effect.acts != "air" and effect.name != "thrust_curve"))
 
 
 def _free(vehicle: Vehicle, decisive: Shooting, causes: Sequence[Candidate], flown: bool) -> Free:

@@ -13,9 +13,8 @@ from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.models import Model
 from quadid.diagnose.probes import SITES, Alone
 from quadid.diagnose.remainder import Remainder
+from quadid.effects import EFFECTS
 
-OFFSETS = {"gyro_bias": "gyro", "accel_bias": "force"}
-"""Effects that claim a constant offset, and the kind of site where a change of it shows."""
 CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
 """How the name of a signal begins that an offset may follow: warming up, vibration, acceleration."""
 ALARM = 30.0
@@ -28,8 +27,8 @@ def inconstant(model: Model, left: Remainder) -> Iterator[tuple[Candidate, str]]
     """Offsets in `model` that are not constant, each with a sentence that says what they follow."""
     group = {s.name: s.group for s in SITES}
     for cause in model.causes:
-        kind = OFFSETS.get(cause.effect)
-        if kind is None:
+        kind = EFFECTS[cause.effect].constant_on
+        if not kind:
             continue
         least = max(ALARM, SHARE * model.worth.get(cause.label, 0.0))
         here = [a for a in left.alone if a.site.startswith(kind) and a.signal.startswith(CHANGES)]

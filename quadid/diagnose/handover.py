@@ -16,11 +16,10 @@ from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.exchange import LEAST_GAIN, Round, Trial, split_causes
 from quadid.diagnose.models import Model, extend
 from quadid.diagnose.screen import screen
+from quadid.effects import EFFECTS
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Entry
 
-SENSOR_ERRORS = ("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
-"""Effects whose size a data sheet bounds."""
 LIKELY = 2.0
 """Typical sizes beyond which an error of a sensor is set beside other causes once more."""
 TAKEN_OVER = 0.5
@@ -48,7 +47,7 @@ def hand_over(shooting: Shooting, model: Model, listed: Sequence[Candidate], tes
     if not unlikely:
         return None
     trials = []
-    others = [c for c in listed if c.timed is None and c.effect not in SENSOR_ERRORS]
+    others = [c for c in listed if c.timed is None and not EFFECTS[c.effect].sized]
     scores = screen(shooting, model, others)
     least = exceeded(FALSE_ALARM / tests, 1)
     for candidate in [s.candidate for s in scores if s.drop > 0.5 * least][:MOST_REFITS]:
@@ -62,7 +61,7 @@ def hand_over(shooting: Shooting, model: Model, listed: Sequence[Candidate], tes
 
 def sensor_errors(shooting: Shooting, model: Model, sizes: float) -> list[Entry]:
     """Errors of sensors in `model` that are larger than so many typical sizes."""
-    names = [n for c in model.causes if c.effect in SENSOR_ERRORS for n in c.names]
+    names = [n for c in model.causes if EFFECTS[c.effect].sized for n in c.names]
     return [e for e in shooting.free(names).entries if _size(model, e) > sizes]
 
 

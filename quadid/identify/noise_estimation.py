@@ -55,17 +55,11 @@ def residual_noise(shooting: Shooting, polished: Polished, parameters: int | Non
 
 def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     """Everything the catalogue can free at once on these data: the model that leaves only noise."""
-    # Left out: what needs a time or height, or doubles another cause.
-    skip = {"wind", "ground_effect", "mass_change", "weak_rotor", "command_delay"}
-    if not shooting.has_velocity:
-        skip.add("parasitic_drag")
-    out = list(NOMINAL_NAMES)
-    for name in layout.entries:
-        effect = name.split(".")[0]
-        if effect in EFFECTS and effect not in skip and not name.endswith(".time"):
-            out.append(name)
+    kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
+    effects = [e for e in EFFECTS.values() if e.flexible in kinds]
+    out = [*NOMINAL_NAMES, *(n for e in effects for n in e.entries)]
     losses = [n for n, e in layout.entries.items() if e.index >= LOSS]
-    return [n for n in out if n != "thrust_drop.fraction"] + losses[1:]
+    return out + losses[1:]
 
 
 @dataclass(frozen=True)

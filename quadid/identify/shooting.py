@@ -14,6 +14,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.effects import EFFECTS
 from quadid.identify.elimination import Reduced, StatePrior
 from quadid.identify.elimination_kernel import reduce_segments
 from quadid.identify.initial_states import first_states, retract
@@ -22,9 +23,8 @@ from quadid.identify.parameterization import Free as Free
 from quadid.identify.segment_cost import Linearised as Linearised
 from quadid.identify.segment_cost import join
 from quadid.identify.segment_jacobian import Columns
-from quadid.model import layout as ix
 from quadid.model.kernel import LANES
-from quadid.model.layout import Layout
+from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout, Segments, shared_rollout
 from quadid.vehicle import Vehicle
@@ -43,10 +43,8 @@ LOCAL_SIGMA = 10.0
 """Standard deviation, in typical sizes, of parameters that are free in every segment (`Shooting.local`)."""
 VELOCITY_PRIOR = 4.0
 """Standard deviation [m/s] of a segment's initial velocity around dead reckoning where none is measured."""
-_VELOCITY_NAMES = ("rotor_drag.", "parasitic_drag.", "rotor_drag_moment.", "axial_inflow.", "ground_effect.", "wind.")
-_WARM_UP_NAMES = ("imu_lag.", "attitude_delay.")
-_WARM_UP_INDEX = (ix.IMU_PERIOD, ix.ATT_DELAY)
-_VELOCITY_INDEX = (ix.KX, ix.KY, ix.CPAR, ix.KZ, ix.GROUND)
+_WARM_UP = places(*(e.name for e in EFFECTS.values() if e.memory))
+_AIR = places(*(e.name for e in EFFECTS.values() if e.acts == "air"))
 _STEP_FRACTION = 1e-4
 
 
@@ -111,14 +109,14 @@ class Shooting:
 
     def _shape(self, theta: FloatArray, free: Free) -> tuple[int, int]:
         """Rows to roll before a segment and directions of its initial state that matter."""
-        warm = any(n.startswith(_WARM_UP_NAMES) for n in free.names) or any(theta[i] > 0.0 for i in _WARM_UP_INDEX)
-        moves = any(n.startswith(_VELOCITY_NAMES) for n in free.names) or any(theta[i] != 0.0 for i in _VELOCITY_INDEX)
+        warm = _uses(_WARM_UP, theta, free)
+        moves = _uses(_AIR, theta, free)
         tangents = {9: 9 if moves else 6, 12: 9, 15: 12}[self.channels]
         return (self.lead if warm else 1), tangents
 
     def finds_velocity(self, names: Sequence[str]) -> bool:
         """Whether initial velocities are found with the parameters `names`: airspeed matters and is not measured."""
-        return not self.has_velocity and any(n.startswith(_VELOCITY_NAMES) for n in names)
+        return not self.has_velocity and bool(np.isin(self.free(names).index, _AIR).any())
 
     @property
     def has_velocity(self) -> bool:
@@ -347,3 +345,8 @@ class Shooting:
 def _weights(rollout: Rollout, segments: Segments, channels: int) -> FloatArray:
     rows = segments.starts[:, None] + np.arange(segments.length)
     return np.asarray(rollout.valid[rows][..., :channels], dtype=np.float64)
+
+
+def _uses(places: tuple[int, ...], theta: FloatArray, free: Free) -> bool:
+    """Whether any of these entries acts at `theta` or may, being free."""
+    return bool(np.isin(free.index, places).any() or theta[list(places)].any())

@@ -20,7 +20,6 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]
-_INERTIAS = ("rotor_spin_up.", "product_of_inertia.")
 
 
 def with_uncertain_scale(
@@ -63,6 +62,6 @@ def _directions(free: Free, theta: FloatArray) -> FloatArray:
     for j, e in enumerate(free.entries):
         if e.name in NOMINAL_NAMES:
             out[j] = (1.0, 0.0 if e.name == "b" else 1.0)
-        elif e.name.startswith(_INERTIAS):
+        elif e.unit == "kg m^2":
             out[j] = theta[e.index] / e.typical
     return out

@@ -13,74 +13,57 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS, rotor_losses
+from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, rotor_losses
+from quadid.effects.kinds import Scale
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.vehicle import Vehicle
 
 FloatArray = NDArray[np.float64]
 
-(
-    B, D, JXX, JYY, JZZ, JR, TAU, DELAY, IMU_PERIOD, ATT_DELAY, KX, KY, CPAR, HX, HY, LP, MQ, KZ, WN, WE,
-    CGX, CGY, MASS_TIME, MASS_FRACTION, DROP_TIME, DROP_FRACTION, SAG, DEAD_SPEED, JXY, JXZ, JYZ, JSPIN,
-    GBX, GBY, GBZ, ABX, ABY, ABZ, GSX, GSY, GSZ, MAX_, MAY, MAZ, LAX, LAY, LAZ, AHRS_K, GROUND, LOSS,
-) = range(50)  # fmt: skip
-"""Indices into the vector; rotor i (from 0) has its loss at LOSS + i."""
+B, D, JXX, JYY, JZZ, JR = range(6)
+_ENTRIES: tuple[tuple[str, Effect, EffectParameter], ...] = tuple(
+    (f"{e.name}.{p.entry or p.name}", e, p) for e in EFFECTS.values() if e.name != "weak_rotor" for p in e.parameters
+)
+_INDEX = {dotted: len(NOMINAL_NAMES) + i for i, (dotted, _, _) in enumerate(_ENTRIES)}
+LOSS = len(NOMINAL_NAMES) + len(_ENTRIES)
+"""Rotor i (from 0) has its loss at LOSS + i."""
 
-_EFFECT_INDEX: dict[str, int] = {
-    "motor_lag.tau": TAU,
-    "command_delay.delay": DELAY,
-    "imu_lag.period": IMU_PERIOD,
-    "attitude_delay.delay": ATT_DELAY,
-    "rotor_drag.k_x": KX,
-    "rotor_drag.k_y": KY,
-    "parasitic_drag.c": CPAR,
-    "rotor_drag_moment.h_x": HX,
-    "rotor_drag_moment.h_y": HY,
-    "rate_damping.l_p": LP,
-    "rate_damping.m_q": MQ,
-    "axial_inflow.k_z": KZ,
-    "wind.north": WN,
-    "wind.east": WE,
-    "cg_offset.x": CGX,
-    "cg_offset.y": CGY,
-    "mass_change.time": MASS_TIME,
-    "mass_change.fraction": MASS_FRACTION,
-    "thrust_drop.time": DROP_TIME,
-    "thrust_drop.fraction": DROP_FRACTION,
-    "battery_sag.fraction": SAG,
-    "thrust_curve.dead_speed": DEAD_SPEED,
-    "product_of_inertia.J_xy": JXY,
-    "product_of_inertia.J_xz": JXZ,
-    "product_of_inertia.J_yz": JYZ,
-    "rotor_spin_up.J": JSPIN,
-    "gyro_bias.x": GBX,
-    "gyro_bias.y": GBY,
-    "gyro_bias.z": GBZ,
-    "accel_bias.x": ABX,
-    "accel_bias.y": ABY,
-    "accel_bias.z": ABZ,
-    "gyro_scale.x": GSX,
-    "gyro_scale.y": GSY,
-    "gyro_scale.z": GSZ,
-    "imu_misalignment.x": MAX_,
-    "imu_misalignment.y": MAY,
-    "imu_misalignment.z": MAZ,
-    "imu_lever_arm.x": LAX,
-    "imu_lever_arm.y": LAY,
-    "imu_lever_arm.z": LAZ,
-    "ahrs_acceleration_error.k": AHRS_K,
-    "ground_effect.radius_scale": GROUND,
-}
 
-IMU_PERIOD_UNIT = "s"
-NEVER = 1e9
-"""Stands for "no change in this log" in the times of mass_change and thrust_drop [s]."""
+def places(*effects: str) -> tuple[int, ...]:
+    """Indices of all entries of these effects, or of single entries (``mass_change.time``), in the given order."""
+    return tuple(i for e in effects for name, i in _INDEX.items() if e in (name, name.split(".")[0]))
+
+
+(TAU,) = places("motor_lag")
+(DELAY,) = places("command_delay")
+(IMU_PERIOD,) = places("imu_lag")
+(ATT_DELAY,) = places("attitude_delay")
+KX, KY = places("rotor_drag")
+(CPAR,) = places("parasitic_drag")
+HX, HY = places("rotor_drag_moment")
+LP, MQ = places("rate_damping")
+(KZ,) = places("axial_inflow")
+WN, WE = places("wind")
+CGX, CGY = places("cg_offset")
+MASS_TIME, MASS_FRACTION = places("mass_change")
+DROP_TIME, DROP_FRACTION = places("thrust_drop")
+(SAG,) = places("battery_sag")
+(DEAD_SPEED,) = places("thrust_curve")
+JXY, JXZ, JYZ = places("product_of_inertia")
+(JSPIN,) = places("rotor_spin_up")
+GBX, GBY, GBZ = places("gyro_bias")
+ABX, ABY, ABZ = places("accel_bias")
+GSX, GSY, GSZ = places("gyro_scale")
+MAX_, MAY, MAZ = places("imu_misalignment")
+LAX, LAY, LAZ = places("imu_lever_arm")
+(AHRS_K,) = places("ahrs_acceleration_error")
+(GROUND,) = places("ground_effect")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the vector: dotted name, index, unit, neutral value, bounds, typical size."""
+    """One entry of the vector: dotted name, index, unit, neutral value, bounds, typical size, sign (see the table)."""
 
     name: str
     index: int
@@ -89,6 +72,7 @@ class Entry:
     lower: float
     upper: float
     typical: float
+    sign: int = 0
 
 
 class Layout:
@@ -110,8 +94,8 @@ class Layout:
             entries.append(
                 Entry(name, index, NOMINAL_UNITS[name], math.nan, low, high, vehicle.parameters[name].initial)
             )
-        for dotted, index in _EFFECT_INDEX.items():
-            entries.append(_effect_entry(dotted, index, scale))
+        for dotted, _, parameter in _ENTRIES:
+            entries.append(_effect_entry(dotted, parameter, scale))
         loss = EFFECTS["weak_rotor"].parameter("loss")
         entries.extend(
             Entry(f"weak_rotor.loss_{i + 1}", LOSS + i, "", 0.0, loss.lower, loss.upper, loss.typical)
@@ -168,38 +152,27 @@ class Layout:
         if name == "imu_lag":
             period = float(theta[IMU_PERIOD])
             return {"cutoff": 1.0 / period if period > 0.0 else math.inf}
-        return {p.name: float(theta[_EFFECT_INDEX[f"{name}.{p.name}"]]) for p in EFFECTS[name].parameters}
+        return {p.name: float(theta[_INDEX[f"{name}.{p.name}"]]) for p in EFFECTS[name].parameters}
 
 
-@dataclass(frozen=True)
-class _Scales:
-    arm: float
-    inertia: float
-    rotor_inertia: float
-    hover_speed: float
-
-
-def _scales(vehicle: Vehicle) -> _Scales:
+def _scales(vehicle: Vehicle) -> dict[Scale, float]:
+    """Factors from the table's sizes, a Pelican's, to this airframe's."""
     arm = float(np.max(np.linalg.norm(vehicle.rotor_positions[:, :2], axis=1)))
     p = vehicle.parameters
-    return _Scales(arm, p["J_xx"].initial, p["J_r"].initial, vehicle.hover_speed())
+    return {
+        "": 1.0,
+        "arm": arm / 0.21,
+        "inertia": p["J_xx"].initial / 8e-3,
+        "rotor_inertia": p["J_r"].initial / 3e-5,
+        "hover_speed": vehicle.hover_speed() / 400.0,
+    }
 
 
-def _effect_entry(dotted: str, index: int, scale: _Scales) -> Entry:
-    effect, key = dotted.split(".")
-    if effect == "imu_lag":
-        return Entry(dotted, index, IMU_PERIOD_UNIT, 0.0, 0.0, 1.0, 0.03)
-    spec = EFFECTS[effect].parameter(key)
-    neutral, low, high, typical = spec.neutral, spec.lower, spec.upper, spec.typical
-    if key == "time":
+def _effect_entry(dotted: str, p: EffectParameter, scale: Mapping[Scale, float]) -> Entry:
+    index = _INDEX[dotted]
+    if index == IMU_PERIOD:
+        return Entry(dotted, index, "s", 0.0, 0.0, 1.0, 0.03)
+    if p.name == "time":
         return Entry(dotted, index, "s", NEVER, -NEVER, NEVER, 1.0)
-    # The table's sizes are those of a Pelican; other airframes scale with arm, inertia and hover speed.
-    factor = {
-        "cg_offset": scale.arm / 0.21,
-        "imu_lever_arm": scale.arm / 0.21,
-        "rotor_drag_moment": scale.arm / 0.21,
-        "product_of_inertia": scale.inertia / 8e-3,
-        "rotor_spin_up": scale.rotor_inertia / 3e-5,
-        "thrust_curve": scale.hover_speed / 400.0,
-    }.get(effect, 1.0)
-    return Entry(dotted, index, spec.unit, neutral, low * factor, high * factor, typical * factor)
+    factor = scale[p.scale]
+    return Entry(dotted, index, p.unit, p.neutral, p.lower * factor, p.upper * factor, p.typical * factor, p.sign)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
+from quadid.model.layout import places
 from quadid.model.simd import SOURCES, cached, jit
 
 FloatArray = NDArray[np.float64]
@@ -39,13 +40,14 @@ class Needs(NamedTuple):
     ahrs: bool
 
 
-AIR_ENTRIES = (ix.KX, ix.KY, ix.KZ)
-RARE_ENTRIES = (ix.CPAR, ix.GROUND)
-SOLID_ENTRIES = (
-    ix.HX, ix.HY, ix.LP, ix.MQ, ix.CGX, ix.CGY, ix.JXY, ix.JXZ, ix.JYZ, ix.JSPIN, ix.LAX, ix.LAY, ix.LAZ,
-)  # fmt: skip
-FACTOR_ENTRIES = (ix.SAG, ix.DROP_FRACTION, ix.MASS_FRACTION)
-ROTOR_ENTRIES = (ix.TAU, ix.DELAY, ix.DEAD_SPEED)
+AIR_ENTRIES = places("rotor_drag", "axial_inflow")
+RARE_ENTRIES = places("parasitic_drag", "ground_effect")
+SOLID_ENTRIES = places(
+    "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm"
+)
+FACTOR_ENTRIES = places("battery_sag", "thrust_drop.fraction", "mass_change.fraction")
+IMU_ENTRIES = places("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
+ROTOR_ENTRIES = places("motor_lag", "command_delay", "thrust_curve")
 
 
 @nb.njit(**jit)
@@ -66,7 +68,7 @@ def _needs_of(theta: FloatArray, channels: int) -> Needs:
             varied |= theta[lane, i] != theta[0, i]
         for i in range(ix.LOSS, theta.shape[1]):
             varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.GBX, ix.LAX):
+        for i in IMU_ENTRIES:
             imu_static |= theta[lane, i] != 0.0
         delayed |= theta[lane, ix.DELAY] > 0.0
         imu_lag |= theta[lane, ix.IMU_PERIOD] > 0.0

@@ -14,6 +14,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from quadid.effects import EFFECTS
+
 FloatArray = NDArray[np.float64]
 
 LANES = 16
@@ -43,7 +45,7 @@ inlined: dict[str, Any] = {**jit, "forceinline": True}
 
 
 def _sources() -> int:
-    """Checksum of the source of the kernels, and of the control law and rotations that one of them calls."""
+    """Checksum of the source of the kernels, of what one of them calls, and of the order of their parameters."""
     folder = resources.files("quadid.model")
     names = sorted(
         entry.name
@@ -51,7 +53,8 @@ def _sources() -> int:
         if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py"))
     )
     outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
-    return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside]))
+    order = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters).encode()
+    return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside, order]))
 
 
 SOURCES = _sources()

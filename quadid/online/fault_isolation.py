@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded, survival
+from quadid.effects import NEVER
 from quadid.errors import QuadidError
 from quadid.identify.gauss_newton import Prior, polish
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
-from quadid.model.layout import LOSS, NEVER, Layout
+from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import Change
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, OnlineFinding

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from quadid.effects import EFFECTS
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
-from quadid.report.advice import ADVICE
 from quadid.report.figures import MODELS, MOST_LOGS, channel_figures, error_figure, gain_figure
 from quadid.report.identify_page import noise_rows
 from quadid.report.page import number
@@ -65,9 +65,10 @@ def _named(result: JsonDict) -> tuple[list[str], list[str]]:
 
 def _next_steps(result: JsonDict) -> tuple[str, ...]:
     sure = [f for f in result["findings"] if f["confident"] and not f.get("ordinary")]
-    named = [f["effect"] for f in sure if f["effect"] in ADVICE][:3]
+    named = [f["effect"] for f in sure if f["effect"] in EFFECTS][:3]
     out = [
-        f"{effect.replace('_', ' ').capitalize()}: {ADVICE[effect][0].lower()}{ADVICE[effect][1:]}" for effect in named
+        f"{effect.replace('_', ' ').capitalize()}: {advice[0].lower()}{advice[1:]}"
+        for effect, advice in ((e, EFFECTS[e].advice) for e in named)
     ]
     if result["verdict"] in ("partly_explained", "unknown"):
         where = ", ".join(result["unexplained"]) or "no single channel"
@@ -127,7 +128,8 @@ _REMARKS = {
 
 def _advice(finding: JsonDict) -> str:
     """What to do about a cause, and what sets it apart."""
-    parts = [] if finding.get("ordinary") else [ADVICE.get(finding["effect"], "")]
+    known = EFFECTS.get(finding["effect"])
+    parts = [] if known is None or finding.get("ordinary") else [known.advice]
     return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
 
 

@@ -14,10 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.effects import EFFECTS, NEVER
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, settle_states
 from quadid.identify.shooting import Shooting
-from quadid.model.layout import NEVER, Layout
+from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import trace
 from quadid.vehicle import Vehicle
@@ -31,43 +32,16 @@ SLOPE_SECONDS = 0.1
 """Span over which a residual's rate of change is taken [s]."""
 MOST_SECONDS = 300.0
 """Flight that a map is made of, at most [s]."""
-P, Q, R, PHI, THETA, PSI, AX, AY, AZ = range(9)
-_TIMES = (("value", AZ, "time"), ("slope", P, "time"), ("slope", Q, "time"), ("slope", R, "time"))
-_LATE = (("value", P, "p_dot"), ("value", Q, "q_dot"), ("value", R, "r_dot"))
-_CORNER = (("slope", P, "thrust"), ("slope", Q, "thrust"), ("slope", R, "thrust"), ("slope", P, "time"))
-_AIR = (("value", AX, "v_x"), ("value", AY, "v_y"), ("value", AX, "time"), ("value", AY, "time"))
-PAIRS: dict[str, tuple[tuple[str, int, str], ...]] = {
-    "motor_lag": (*_LATE, ("value", AZ, "thrust_rate")),
-    "command_delay": (*_LATE, ("value", AZ, "thrust_rate")),
-    "imu_lag": (*_LATE, ("value", AZ, "thrust_rate")),
-    "attitude_delay": (("value", PHI, "p"), ("value", THETA, "q"), ("value", PSI, "r")),
-    "rotor_drag": _AIR,
-    "parasitic_drag": (*_AIR, ("value", AZ, "v_z")),
-    "wind": (*_AIR, ("value", AX, "heading"), ("value", AY, "heading")),
-    "rotor_drag_moment": (("slope", Q, "v_x"), ("slope", P, "v_y"), ("slope", P, "time"), ("slope", Q, "time")),
-    "rate_damping": (("slope", P, "p"), ("slope", Q, "q")),
-    "axial_inflow": (("value", AZ, "v_z"), ("value", AZ, "thrust"), ("value", AZ, "time")),
-    "weak_rotor": _CORNER,
-    "cg_offset": _CORNER,
-    "mass_change": _TIMES,
-    "thrust_drop": _TIMES,
-    "battery_sag": _TIMES,
-    "thrust_curve": (("value", AZ, "rotor_speed"), ("slope", P, "rotor_speed")),
-    "product_of_inertia": tuple(
-        ("slope", c, s) for c, s in ((P, "q_dot"), (P, "r_dot"), (Q, "p_dot"), (Q, "r_dot"), (R, "p_dot"), (R, "q_dot"))
-    ),
-    "rotor_spin_up": (("slope", R, "spin_rate"),),
-    "gyro_bias": tuple(("value", c, "time") for c in (P, Q, R, PHI, THETA, PSI)),
-    "accel_bias": tuple(("value", c, "time") for c in (AX, AY, AZ)),
-    "gyro_scale": (("value", P, "p"), ("value", Q, "q"), ("value", R, "r")),
-    "imu_misalignment": (
-        ("value", AX, "thrust"), ("value", AY, "thrust"), ("value", P, "q"), ("value", P, "r"), ("value", Q, "r"),
-        ("value", Q, "p"), ("value", R, "p"), ("value", R, "q"),
-    ),
-    "imu_lever_arm": tuple(("value", c, s) for c in (AX, AY, AZ) for s in ("p_dot", "q_dot", "r_dot")),
-    "ahrs_acceleration_error": (("value", PHI, "time"), ("value", THETA, "time"), ("value", THETA, "v_x")),
-    "ground_effect": (("value", AZ, "height"), ("value", AZ, "time")),
-}  # fmt: skip
+_CHANNELS = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z")
+
+
+def _pair(text: str) -> tuple[Mode, int, str]:
+    """How the residual is taken, its channel, and what it is drawn against, from the table's words."""
+    channel, against = text.split(": ")
+    return ("slope" if channel.endswith("'") else "value"), _CHANNELS.index(channel.rstrip("'")), against
+
+
+PAIRS = {e.name: tuple(_pair(text) for text in e.shows) for e in EFFECTS.values()}
 """Where each effect shows: how the residual is taken, its channel, and the quantity it is drawn against."""
 _NAMES = {
     "time": ("time", "s"), "p": ("roll rate", "rad/s"), "q": ("pitch rate", "rad/s"), "r": ("yaw rate", "rad/s"),

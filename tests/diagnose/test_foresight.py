@@ -11,9 +11,10 @@ from quadid_replay import open_log
 
 from quadid.diagnose import Diagnosis, diagnose
 from quadid.diagnose.candidates import candidates
-from quadid.diagnose.foresight import AHEAD, BETTER, STAND_INS, Foresight, _relative, refit_to_predict
+from quadid.diagnose.foresight import AHEAD, BETTER, Foresight, _relative, refit_to_predict
 from quadid.diagnose.models import Model, fit_model
 from quadid.diagnose.vehicle_file import extended_vehicle
+from quadid.effects import EFFECTS
 from quadid.flight import draw_truth, fly
 from quadid.grid import to_windows
 from quadid.identify.prediction import horizon_scores
@@ -109,7 +110,7 @@ def refitted(
 
 def test_effects_of_the_vehicle_file_are_no_stand_ins_and_stay(data_dir: Path) -> None:
     foresight, vehicle, _ = refitted(data_dir, [])
-    assert set(foresight.stand_ins) == set(STAND_INS) - set(vehicle.effects)
+    assert set(foresight.stand_ins) == {e.name for e in EFFECTS.values() if e.stand_in} - set(vehicle.effects)
     layout = Layout(vehicle)
     written = Vehicle.from_yaml(extended_vehicle(vehicle, layout, foresight.fitted))
     assert written.effects["rotor_drag"] == {"k_x": 0.4, "k_y": 0.4}

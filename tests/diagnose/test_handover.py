@@ -10,6 +10,7 @@ import pytest
 from quadid.diagnose import handover
 from quadid.diagnose.handover import LIKELY, hand_over, sensor_errors
 from quadid.diagnose.models import Model, extend
+from quadid.effects import EFFECTS
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 DEAD_SPEED = 26.0
@@ -68,6 +69,6 @@ def test_what_takes_over_comes_in_parts_and_is_no_error_of_a_sensor(monkeypatch:
     monkeypatch.setattr(handover, "exceeded", lambda *given: -1e9)
     tried = hand_over(problem.shooting, model, [joint, *problem.listed], TESTS)
     assert tried is not None
-    assert not {t.candidate.effect for t in tried.trials} & set(handover.SENSOR_ERRORS)
+    assert not any(EFFECTS[t.candidate.effect].sized for t in tried.trials)
     (both,) = [t for t in tried.trials if t.candidate.label == "both"]
     assert [c.label for c in both.model.causes] == ["accel_bias", "motor_lag", "command_delay"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.effects import EFFECTS
+from quadid.effects import EFFECTS, NEVER
 from quadid.flight import fly
 from quadid.grid import to_windows
-from quadid.model.layout import NEVER, Layout
+from quadid.model.layout import Layout
 from quadid.report.residual_maps import PAIRS, ResidualMap, map_figure, residual_map, switched_off
 from quadid.vehicle import Vehicle
 
@@ -73,6 +73,7 @@ def test_a_weak_rotor_is_an_angular_acceleration(pelican: Vehicle) -> None:
 
 def test_every_effect_has_its_place_and_every_time_is_switched_off(pelican: Vehicle) -> None:
     assert set(PAIRS) == set(EFFECTS)
+    assert all(PAIRS.values())
     layout = Layout(pelican)
     theta = layout.initial(pelican)
     theta[layout.entry("mass_change.time").index] = 12.0

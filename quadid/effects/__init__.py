@@ -1,0 +1,49 @@
+"""The effects a simulation may lack: everything that is said of each of them, in one table (`quadid.effects.table`).
+
+It is the vocabulary shared by the vehicle file, the model, the diagnosis, its reports and the flown truth.  It holds no
+equations: those of the model under test are in `quadid.model`, those of the flown vehicle in `quadid.flight`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from quadid.effects.kinds import Effect, EffectParameter
+from quadid.effects.table import NEVER, TABLE
+from quadid.errors import ParameterError
+
+__all__ = ["EFFECTS", "NEVER", "Effect", "EffectParameter", "effect_of", "known_keys", "rotor_losses"]
+
+EFFECTS: dict[str, Effect] = {e.name: e for e in TABLE}
+"""Every effect by name; `docs/effects.md` explains each."""
+
+
+def effect_of(entry: str) -> Effect | None:
+    """The effect to which an entry of the parameter vector belongs (``rotor_drag.k_x``); None for nominal ones."""
+    return EFFECTS.get(entry.split(".")[0])
+
+
+def known_keys(name: str, rotors: int) -> list[str]:
+    """Keys that effect `name` may have in a vehicle file; several weak rotors have ``loss_1``, ``loss_2`` and so on."""
+    keys = [p.name for p in EFFECTS[name].parameters]
+    return [*keys, *(f"loss_{i + 1}" for i in range(rotors))] if name == "weak_rotor" else keys
+
+
+def rotor_losses(numbers: Mapping[str, float], rotors: int) -> list[float]:
+    """Loss of every rotor, from the numbers of `weak_rotor`: `rotor` and `loss`, or ``loss_1`` … for several.
+
+    Raises:
+        ParameterError: no such rotor, or both ways at once.
+    """
+    rotor, loss = numbers.get("rotor", 0.0), numbers.get("loss", 0.0)
+    several = sorted(set(numbers) - {"rotor", "loss"})
+    if several and (rotor or loss):
+        raise ParameterError(f"weak_rotor: rotor {rotor:g} beside {several[0]}", "rotor and loss, or loss_1, loss_2, …")
+    absent = [key for key in several if key not in known_keys("weak_rotor", rotors)]
+    if absent:
+        raise ParameterError(f"weak_rotor: {absent[0]}", f"loss_1 to loss_{rotors}")
+    if loss and not rotor:
+        raise ParameterError(f"weak_rotor: loss {loss:g} of no rotor", "rotor beside it", f"say which, 1 to {rotors}")
+    if rotor not in range(rotors + 1):
+        raise ParameterError(f"weak_rotor: rotor {rotor:g}", f"a whole number from 1 to {rotors}")
+    return [numbers.get(f"loss_{i + 1}", loss if rotor == i + 1 else 0.0) for i in range(rotors)]

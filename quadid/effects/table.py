@@ -1,0 +1,210 @@
+"""The table itself: one entry an effect.  Order is that of the parameter vector and of result pages.
+
+Sizes are those of a Pelican (1.3 kg, 0.21 m arms); `scale` carries them to other airframes.
+"""
+
+from __future__ import annotations
+
+from quadid.effects.kinds import Effect, EffectParameter
+
+P = EffectParameter
+NEVER = 1e9
+"""Stands for "not in this log" in times of change [s]."""
+
+
+def _axes(names: str, unit: str, bound: float, typical: float, **more: object) -> tuple[EffectParameter, ...]:
+    return tuple(P(n, unit, 0.0, -bound, bound, typical, **more) for n in names.split())  # type: ignore[arg-type]
+
+
+def _change(*fractions: EffectParameter) -> tuple[EffectParameter, ...]:
+    return (P("time", "s", float("inf"), 0.0, float("inf"), 1.0), *fractions)
+
+
+_TURNS = ("p: p_dot", "q: q_dot", "r: r_dot")
+_STEPS = ("a_z: time", "p': time", "q': time", "r': time")
+_CORNER = ("p': thrust", "q': thrust", "r': thrust", "p': time")
+_DRAGS = ("a_x: v_x", "a_y: v_y", "a_x: time", "a_y: time")
+
+TABLE: tuple[Effect, ...] = (
+    Effect(
+        "motor_lag", "command", (P("tau", "s", 0.0, 0.0, 0.3, 0.03, start=0.02, factor=1e3),),
+        summary="The rotors follow their command with a lag.",
+        sentence="the rotors need {tau:.0f} ms to follow a command (first-order lag), seen as late rotation and thrust",
+        advice="Usual for real motors; a controller that knows it can lead it.",
+        family="late", stand_in=True, shows=(*_TURNS, "a_z: thrust_rate"),
+    ),
+    Effect(
+        "command_delay", "command", (P("delay", "s", 0.0, 0.0, 0.12, 0.02, start=0.015, factor=1e3),),
+        summary="Commands reach the rotors late.",
+        sentence="commands reach the rotors {delay:.0f} ms late, seen as a pure delay of rotation and thrust",
+        advice="Look for buffering between controller and speed controllers: protocol, loop rates, filters.",
+        family="late", flexible="never", shows=(*_TURNS, "a_z: thrust_rate"),
+    ),
+    Effect(
+        "imu_lag", "sensor", (P("cutoff", "Hz", float("inf"), 1.0, float("inf"), 8.0, start=0.10, entry="period"),),
+        summary="The IMU is filtered and late.",
+        sentence="gyro and accelerometer are low-passed at {cutoff:.1f} Hz and so lag behind the attitude",
+        advice="Check the gyro's low-pass and notch filters; log unfiltered where possible.",
+        family="late", memory=True, shows=(*_TURNS, "a_z: thrust_rate"),
+    ),
+    Effect(
+        "attitude_delay", "sensor", (P("delay", "s", 0.0, 0.0, 0.12, 0.03, start=0.02, factor=1e3),),
+        summary="The attitude estimate is late.",
+        sentence="the attitude estimate arrives {delay:.0f} ms late against the integrated gyro",
+        advice="Check the attitude estimator's rate and the telemetry path.",
+        family="late", memory=True, shows=("phi: p", "theta: q", "psi: r"),
+    ),
+    Effect(
+        "rotor_drag", "air",
+        tuple(P(n, "1/s", 0.0, -0.1, 3.0, 0.25, start=0.2, sign=1) for n in ("k_x", "k_y")),
+        summary="The turning rotors drag against sideways flight.",
+        sentence="the rotors drag against sideways flight by {k_x:.2f} and {k_y:.2f} m/s^2 for each m/s",
+        advice="Usual; leaving it out makes a simulated vehicle glide too far.",
+        family="drag", stand_in=True, shows=_DRAGS,
+    ),
+    Effect(
+        "parasitic_drag", "air", (P("c", "1/m", 0.0, 0.0, 0.5, 0.03, start=0.03),),
+        summary="The frame has air drag.",
+        sentence="the frame's air drag grows with the square of speed, {c:.3f} 1/m",
+        advice="Usual at speed; leaving it out makes a simulated vehicle too fast.",
+        family="drag", flexible="with_velocity", shows=(*_DRAGS, "a_z: v_z"),
+    ),
+    Effect(
+        "rotor_drag_moment", "air", _axes("h_x h_y", "m", 0.3, 0.02, scale="arm", factor=1e3),
+        summary="Rotor drag acts above or below the CG.",
+        sentence="rotor drag acts {h_x:.1f} and {h_y:.1f} mm off the centre of gravity and tilts the vehicle in "
+        "sideways flight",
+        advice="The rotors sit above or below the centre of gravity; moving the battery changes it.",
+        requires="rotor_drag", stand_in=True, shows=("q': v_x", "p': v_y", "p': time", "q': time"),
+    ),
+    Effect(
+        "rate_damping", "body", _axes("l_p m_q", "1/s", 30.0, 1.0, sign=1),
+        summary="Rotation is damped by the air.",
+        sentence="the air damps roll and pitch rotation by {l_p:.2f} and {m_q:.2f} 1/s",
+        advice="Usual for large propellers.",
+        stand_in=True, shows=("p': p", "q': q"),
+    ),
+    Effect(
+        "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1),),
+        summary="Thrust falls when climbing.",
+        sentence="thrust falls by {k_z:.2f} m/s^2 for each m/s of climb",
+        advice="Usual; matters for climbs and descents.",
+        stand_in=True, shows=("a_z: v_z", "a_z: thrust", "a_z: time"),
+    ),
+    Effect(
+        "wind", "air", _axes("north east", "m/s", 30.0, 3.0),
+        summary="The air moves.",
+        sentence="the air moved by {north:.1f} m/s north and {east:.1f} m/s east",
+        advice="Belongs to that day. Fly in calm air, or in several directions.",
+        per_log=True, needs=("velocity",), requires="rotor_drag", flexible="never",
+        shows=(*_DRAGS, "a_x: heading", "a_y: heading"),
+    ),
+    Effect(
+        "weak_rotor", "rotor",
+        (P("rotor", "", 0.0, 1.0, 12.0, 1.0), P("loss", "", 0.0, -0.6, 0.6, 0.05, factor=1e2)),
+        summary="One rotor gives less thrust than the others.",
+        sentence="rotor {rotor:.0f} gives {loss:.1f} % less thrust and drag torque than the others",
+        advice="Check that rotor: propeller, motor, speed controller, arm.",
+        family="corner", flexible="never", shows=_CORNER,
+    ),
+    Effect(
+        "cg_offset", "body", _axes("x y", "m", 0.1, 0.005, scale="arm", factor=1e3),
+        summary="The centre of gravity is off centre.",
+        sentence="the centre of gravity lies {x:.1f} mm forward and {y:.1f} mm to the right of the geometric centre",
+        advice="Move the battery or the payload, or tell the controller.",
+        family="corner", stand_in=True, shows=_CORNER,
+    ),
+    Effect(
+        "mass_change", "flight", _change(P("fraction", "", 0.0, -0.6, 1.0, 0.1, factor=1e2)),
+        summary="Mass was taken up or dropped in flight.",
+        sentence="at {time:.1f} s the mass changed by {fraction:.1f} %",
+        advice="Check the payload and its release.",
+        family="step", per_log=True, flexible="never", shows=_STEPS,
+    ),
+    Effect(
+        "thrust_drop", "flight", _change(P("fraction", "", 0.0, -0.6, 0.6, 0.1, factor=1e2)),
+        summary="All rotors lost thrust at one moment.",
+        sentence="at {time:.1f} s all rotors lost {fraction:.1f} % of their thrust",
+        advice="Look for a voltage drop or a thermal limit at that moment.",
+        family="step", per_log=True, flexible="never", shows=_STEPS,
+    ),
+    Effect(
+        "battery_sag", "flight", (P("fraction", "", 0.0, -0.6, 0.6, 0.1, factor=1e2),),
+        summary="Thrust fades over the flight.",
+        sentence="thrust at the same command faded by {fraction:.1f} % from the first to the last sample",
+        advice="Compensate thrust for voltage, or log measured rotor speeds.",
+        family="step", per_log=True, shows=_STEPS,
+    ),
+    Effect(
+        "thrust_curve", "rotor", (P("dead_speed", "rad/s", 0.0, -1000.0, 1000.0, 40.0, scale="hover_speed"),),
+        summary="Thrust is not purely quadratic.",
+        sentence="thrust follows (speed - {dead_speed:.0f} rad/s)^2 rather than speed^2",
+        advice="Measure thrust against command on a stand, or log measured rotor speeds.",
+        shows=("a_z: rotor_speed", "p': rotor_speed"),
+    ),
+    Effect(
+        "product_of_inertia", "body", _axes("J_xy J_xz J_yz", "kg m^2", 1e-2, 1e-3, scale="inertia"),
+        summary="The inertia axes are tilted.",
+        sentence="the inertia axes are tilted: a moment about one axis also turns another",
+        advice="The mass is not symmetric; check the mounting of battery and payload.",
+        shows=("p': q_dot", "p': r_dot", "q': p_dot", "q': r_dot", "r': p_dot", "r': q_dot"),
+    ),
+    Effect(
+        "rotor_spin_up", "body", (P("J", "kg m^2", 0.0, -1e-3, 1e-3, 5e-5, sign=1, scale="rotor_inertia"),),
+        summary="Speeding up the rotors turns the vehicle in yaw.",
+        sentence="speeding the rotors up or down turns the vehicle in yaw (rotor inertia {J:.2e} kg m^2)",
+        advice="Usual; it makes yaw quicker than drag torque alone would.",
+        stand_in=True, shows=("r': spin_rate",),
+    ),
+    Effect(
+        "gyro_bias", "sensor", _axes("x y z", "rad/s", 0.5, 0.02),
+        summary="The gyro has an offset.",
+        sentence="the gyro reads {x:.4f}, {y:.4f}, {z:.4f} rad/s too much",
+        advice="Calibrate the gyro before take-off, warm.",
+        per_log=True, sized=True, constant_on="gyro",
+        shows=tuple(f"{c}: time" for c in ("p", "q", "r", "phi", "theta", "psi")),
+    ),
+    Effect(
+        "accel_bias", "sensor", _axes("x y z", "m/s^2", 5.0, 0.2),
+        summary="The accelerometer has an offset.",
+        sentence="the accelerometer reads {x:.2f}, {y:.2f}, {z:.2f} m/s^2 too much",
+        advice="Calibrate the accelerometer.",
+        per_log=True, sized=True, constant_on="force", shows=tuple(f"{c}: time" for c in ("a_x", "a_y", "a_z")),
+    ),
+    Effect(
+        "gyro_scale", "sensor", _axes("x y z", "", 0.5, 0.03, factor=1e2),
+        summary="The gyro has a wrong scale.",
+        sentence="the gyro's scale is off by {x:.1f}, {y:.1f}, {z:.1f} %",
+        advice="Calibrate the gyro's scale on a turntable.",
+        sized=True, shows=("p: p", "q: q", "r: r"),
+    ),
+    Effect(
+        "imu_misalignment", "sensor", _axes("x y z", "rad", 0.5, 0.04, factor=57.29578),
+        summary="The IMU is mounted askew.",
+        sentence="the IMU is turned against the body by {x:.1f}, {y:.1f}, {z:.1f} degrees",
+        advice="Check the mounting, or set the board rotation.",
+        sized=True,
+        shows=("a_x: thrust", "a_y: thrust", "p: q", "p: r", "q: r", "q: p", "r: p", "r: q"),
+    ),
+    Effect(
+        "imu_lever_arm", "sensor", _axes("x y z", "m", 0.5, 0.04, scale="arm", factor=1e3),
+        summary="The IMU sits away from the centre.",
+        sentence="the accelerometer sits {x:.0f}, {y:.0f}, {z:.0f} mm from the geometric centre",
+        advice="Tell the estimator where the IMU sits.",
+        shows=tuple(f"{c}: {s}" for c in ("a_x", "a_y", "a_z") for s in ("p_dot", "q_dot", "r_dot")),
+    ),
+    Effect(
+        "ahrs_acceleration_error", "sensor", (P("k", "1/s", 0.0, 0.0, 3.0, 0.2),),
+        summary="The attitude filter is pulled by acceleration.",
+        sentence="the attitude filter is pulled towards the accelerometer's level with {k:.2f} 1/s",
+        advice="Lower the accelerometer's weight in the attitude estimator.",
+        shows=("phi: time", "theta: time", "theta: v_x"),
+    ),
+    Effect(
+        "ground_effect", "air", (P("radius_scale", "", 0.0, -10.0, 10.0, 1.0, start=1.0),),
+        summary="Thrust rises near the ground.",
+        sentence="thrust rises near the ground (rotor radius scale {radius_scale:.2f})",
+        advice="Fly higher to identify, or keep it in the model for landing.",
+        needs=("position",), flexible="never", shows=("a_z: height", "a_z: time"),
+    ),
+)  # fmt: skip
