@@ -74,10 +74,14 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
 def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channel | None, tuple[str, ...]]:
     """Picks the channel that drives the rotors, as `rotor_signal` says; None where there is none.
 
+    Mixer inputs go through the vehicle's mixer where neither speeds nor commands of rotors are logged.
+
     Returns:
         ``rotor_speed`` or ``motor_command`` as logged, and why measured speeds were passed over, if they were.
     """
-    speed, command = (_usable(recording, name) for name in ("rotor_speed", "motor_command"))
+    speed, command, mixed = (_usable(recording, name) for name in ("rotor_speed", "motor_command", "mixer_input"))
+    if command is None and mixed is not None and vehicle is not None:
+        command = _after_mixer(recording, mixed, vehicle)
     why = "" if speed is None else _passed_over(speed, command, vehicle)
     if speed is not None and why:
         return command, (f"measured speeds ({speed.source}) {why}",)
@@ -96,6 +100,22 @@ def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | Non
     if period > 2.0 * sample_period(command.t) or period > 1.0 / SLOWEST_RATE:
         return f"come too slowly; motor commands ({command.source}) used"
     return ""
+
+
+def _after_mixer(recording: Recording, mixed: Channel, vehicle: Vehicle) -> Channel:
+    """Motor commands of logged mixer inputs, as the vehicle file's mixer makes them."""
+    if vehicle.mixer is None:
+        raise LogError(
+            f"{recording.name}: holds mixer inputs ({mixed.source}), but '{vehicle.name}' has no mixer",
+            "a vehicle file with `mixer:`", "add it, for example mixer: crazyflie",
+        )  # fmt: skip
+    matrix = vehicle.mixing
+    if mixed.values.shape[1] != matrix.shape[1]:
+        raise LogError(
+            f"{recording.name}: {mixed.values.shape[1]} mixer inputs ({mixed.source})",
+            f"{matrix.shape[1]}, the columns of the mixer of '{vehicle.name}'", "correct `mixer:`",
+        )  # fmt: skip
+    return Channel("motor_command", mixed.t, mixed.values @ matrix.T, f"{mixed.source}, mixed")
 
 
 def _usable(recording: Recording, name: str) -> Channel | None:

@@ -25,6 +25,11 @@ DEFAULT_BOUND_FACTOR = 4.0
 """A bare initial guess may be wrong by this factor each way."""
 MOST_ROTORS = 16
 
+MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "crazyflie": ((1.0, -0.5, 0.5, 1.0), (1.0, -0.5, -0.5, -1.0), (1.0, 0.5, -0.5, 1.0), (1.0, 0.5, 0.5, -1.0)),
+}
+"""Mixers by name: rows are rotors, columns the inputs.  Crazyflie takes thrust, roll, pitch, yaw."""
+
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
@@ -50,13 +55,14 @@ class Command(_Strict):
     """What the rotor columns of a log mean.
 
     Attributes:
-        kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1] or ``pwm`` [us].
+        kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1], ``thrust`` [0..1, proportional to thrust, where the
+            flight controller undoes the motor's curve] or ``pwm`` [us].
         sampling: ``held``: a row acts until the next; ``instant``: a reading, linear in between.
         max_speed: rotor speed at full command [rad/s]; normalized and pwm need it, exports of hover thrust use it.
         range: pulse widths of zero and full command [us], for pwm.
     """
 
-    kind: Literal["rotor_speed", "normalized", "pwm"] = "rotor_speed"
+    kind: Literal["rotor_speed", "normalized", "thrust", "pwm"] = "rotor_speed"
     sampling: Literal["held", "instant"] = "held"
     max_speed: PositiveFloat | None = None
     range: tuple[PositiveFloat, PositiveFloat] = (1000.0, 2000.0)
@@ -77,7 +83,20 @@ class Command(_Strict):
         if self.kind == "pwm":
             low, high = self.range
             values = (values - low) / (high - low)
+        if self.kind == "thrust":
+            values = np.sqrt(np.maximum(values, 0.0))  # below zero a rotor stands still
         return values * self.max_speed
+
+    def from_rotor_speed(self, speed: FloatArray) -> FloatArray:
+        """Converts rotor speeds [rad/s], shape (n, rotors), to logged rotor columns."""
+        if self.kind == "rotor_speed":
+            return speed
+        assert self.max_speed is not None
+        share = speed / self.max_speed
+        if self.kind == "thrust":
+            return share**2
+        low, high = self.range if self.kind == "pwm" else (0.0, 1.0)
+        return low + share * (high - low)
 
 
 class ParameterPrior(_Strict):
@@ -140,6 +159,7 @@ class Vehicle(_Strict):
         effects: effects that are part of the model, name -> parameter -> value.
         noise: known sensor noise, or None.
         stabiliser: known stabiliser gains, or None.
+        mixer: from logged mixer inputs to rotors, a name of `MIXERS` or a matrix with a row a rotor; or None.
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
         arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
         thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
@@ -156,6 +176,7 @@ class Vehicle(_Strict):
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
+    mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -205,6 +226,10 @@ class Vehicle(_Strict):
                     f"thrust_stand gives b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
                     "check rad/s and N, one rotor a reading"
                 )
+        if isinstance(self.mixer, str) and self.mixer not in MIXERS:
+            raise ValueError(f"no mixer '{self.mixer}'; {nearest(self.mixer, MIXERS)}, or give its matrix")
+        if self.mixer is not None and self.mixing.shape[0] != len(self.rotors):
+            raise ValueError(f"mixer with {self.mixing.shape[0]} rows for {len(self.rotors)} rotors; one row a rotor")
         arms = np.array([r.position for r in self.rotors])[:, :2]
         spread = np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)
         if spread[-1] < 1e-4:
@@ -214,6 +239,16 @@ class Vehicle(_Strict):
         if len({r.spin for r in self.rotors}) == 1:
             raise ValueError("all rotors spin the same way: yaw cannot be balanced; give both +1 and -1")
         return self
+
+    @property
+    def mixing(self) -> FloatArray:
+        """Mixer matrix, shape (rotors, inputs): command of each rotor = matrix x mixer input; raises VehicleError."""
+        if self.mixer is None:
+            raise VehicleError(f"'{self.name}' has no mixer", "mixer: a name or a matrix", "add it to the vehicle file")
+        rows = MIXERS[self.mixer] if isinstance(self.mixer, str) else self.mixer
+        if len({len(row) for row in rows}) != 1:
+            raise ValueError("mixer with rows of different lengths; one number an input in every row")
+        return np.array(rows, dtype=np.float64)
 
     @property
     def rotor_positions(self) -> FloatArray:

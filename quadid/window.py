@@ -23,14 +23,21 @@ CHANNELS: dict[str, tuple[int | None, str]] = {
     "attitude": (4, "quaternion wxyz, body to world"),
     "rotor_speed": (None, "rad/s"),
     "motor_command": (None, "normalized 0..1 or us"),
+    "mixer_input": (None, "as the vehicle file's mixer takes it"),
     "attitude_reference": (4, "rad, rad, rad, throttle 0..1"),
     "velocity": (3, "m/s, NED"),
     "position": (3, "m, NED"),
     "battery": (1, "V"),
+    "accel_z": (1, "m/s^2"),
+    "accel_world": (3, "m/s^2, NED"),
 }
 _MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
 """Channels of a window that may be missing."""
-"""Known channels: number of columns (None: one per rotor) and unit.  ``accel`` is specific force (-g on z at rest)."""
+"""Known channels: number of columns (None: as many as the vehicle asks for) and unit.
+
+``accel`` is specific force (-g on z at rest); ``accel_z`` its z alone, ``accel_world`` the same in world axes, from
+logs that hold no more.
+"""
 
 
 @dataclass(frozen=True)
@@ -110,7 +117,7 @@ class Recording:
 
     Attributes:
         name: name for people (file name).
-        format: how it was recognised: csv, mcap, tlog, dataflash, ulog.
+        format: how it was recognised: csv, mcap, tlog, dataflash, ulog, usdlog.
         channels: by name; absent channels are absent keys.
         breaks: times [s] across which nothing may be joined (reboots, clock steps).
         warnings: what was wrong with the log and what was done about it.

@@ -210,9 +210,6 @@ def as_recording(window: Window, vehicle: Vehicle) -> Recording:
     if command.kind == "rotor_speed":
         channels["rotor_speed"] = Channel("rotor_speed", window.t, column, "simulated")
     else:
-        assert command.max_speed is not None
-        column = column / command.max_speed
-        if command.kind == "pwm":
-            column = command.range[0] + column * (command.range[1] - command.range[0])
+        column = command.from_rotor_speed(column)
         channels["motor_command"] = Channel("motor_command", window.t, column, "simulated")
     return Recording(window.name, "simulated", channels, grid=window.dt)

@@ -14,7 +14,7 @@ from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
 LARGE: Mapping[Format, int] = MappingProxyType(
-    {"mcap": 4 << 20, "tlog": 64 << 20, "dataflash": 64 << 20, "ulog": 64 << 20, "csv": 64 << 20}
+    {"mcap": 4 << 20, "tlog": 64 << 20, "dataflash": 64 << 20, "ulog": 64 << 20, "usdlog": 64 << 20, "csv": 64 << 20}
 )
 """Files of this size [bytes] are read in a child process with limits; MCAP earlier, because it may inflate."""
 
@@ -65,6 +65,8 @@ def _reader(kind: Format) -> Callable[[Path], Recording]:
         from quadid_replay.dataflash_reader import read_dataflash as read
     elif kind == "ulog":
         from quadid_replay.ulog_reader import read_ulog as read
+    elif kind == "usdlog":
+        from quadid_replay.usd_reader import read_usd as read
     else:
         from quadid_replay.tlog_reader import read_tlog as read
     return read

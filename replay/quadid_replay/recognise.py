@@ -6,14 +6,18 @@ from typing import Literal
 
 from quadid.errors import LogError
 
-Format = Literal["mcap", "tlog", "dataflash", "ulog", "csv"]
+Format = Literal["mcap", "tlog", "dataflash", "ulog", "usdlog", "csv"]
 HEAD_BYTES = 65536
 """How much of the file is looked at."""
-ALLOWED = "ROS 2 MCAP, MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, CSV with a header row and a column t"
+ALLOWED = (
+    "ROS 2 MCAP, MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, Crazyflie µSD log, "
+    "CSV with a header row and a column t"
+)
 
 _MAGIC: tuple[tuple[bytes, Format], ...] = (
     (b"\x89MCAP0\r\n", "mcap"),
     (b"ULog\x01\x12\x35", "ulog"),
+    (b"\xbc\x02\x00", "usdlog"),
 )
 _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"#ROSBAG V2.0", "a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst DIR, then to MCAP"),
@@ -24,6 +28,7 @@ _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"\x89HDF\r\n", "HDF5", "export it as CSV"),
     (b"MATLAB 5.0", "a MATLAB file", "export it as CSV, or give the .bin it was made from"),
     (b"FMT, 128,", "a DataFlash text log", "give the binary .bin log"),
+    (b"\xbc\x01\x00", "a Crazyflie µSD log of version 1", "record it with newer firmware"),
 )
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 

@@ -1,0 +1,147 @@
+"""Crazyflie µSD logs: which of the firmware's variables are which channel, in core units and frames.
+
+The firmware's body frame is x forward, y left, z up and its world z up; what its `controller` group holds is in the
+frame of the old controllers: roll and pitch positive to the right and nose up, yaw positive to the left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import LogError
+from quadid.sanitise import plain
+from quadid.window import Recording
+from quadid_replay.clocks import LogClock
+from quadid_replay.columns import RawChannel, assemble
+from quadid_replay.frames import GRAVITY, flip_body, from_euler
+from quadid_replay.motors import RPM
+from quadid_replay.usd_records import collect_usd_records
+
+FloatArray = NDArray[np.float64]
+FULL_SCALE = 65535.0
+"""The firmware's full motor command."""
+
+
+class Source(NamedTuple):
+    """How a channel is made of variables: its name, the variables in order, and the conversion of rows (n, k)."""
+
+    channel: str
+    variables: tuple[str, ...]
+    convert: Callable[[FloatArray], FloatArray]
+
+
+def _axes(prefix: str, names: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}{name}" for name in names.split())
+
+
+def _scaled(factor: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda rows: rows * factor
+
+
+def _level(rows: FloatArray) -> FloatArray:
+    """World vectors, z up to z down about the x axis, which stays."""
+    return flip_body(rows)
+
+
+def _specific_force(rows: FloatArray) -> FloatArray:
+    """Acceleration without gravity [g], world, z up, to specific force [m/s²], z down."""
+    return flip_body((rows + np.array([0.0, 0.0, 1.0])) * GRAVITY)
+
+
+def _attitude(rows: FloatArray) -> FloatArray:
+    """Roll, pitch (nose up), yaw (to the left) [deg] to quaternions."""
+    return from_euler(np.deg2rad(rows) * np.array([1.0, 1.0, -1.0]))
+
+
+def _quaternion(rows: FloatArray) -> FloatArray:
+    """Body FLU to a world with z up, to body FRD to a world with z down: y and z change their signs."""
+    return np.asarray(rows * np.array([1.0, 1.0, -1.0, -1.0]))
+
+
+def _reference(rows: FloatArray) -> FloatArray:
+    """Desired roll, pitch, yaw [deg] and thrust (16 bit)."""
+    return np.column_stack([np.deg2rad(rows[:, :3]) * np.array([1.0, 1.0, -1.0]), rows[:, 3] / FULL_SCALE])
+
+
+SOURCES: tuple[Source, ...] = (
+    Source("gyro", _axes("gyro.", "x y z"), lambda rows: flip_body(np.deg2rad(rows))),
+    Source("gyro", _axes("controller.r_", "roll pitch yaw"), lambda rows: rows * np.array([1.0, 1.0, -1.0])),
+    Source("accel", _axes("acc.", "x y z"), lambda rows: flip_body(rows * GRAVITY)),
+    Source("accel_z", ("controller.accelz",), _scaled(-GRAVITY)),
+    Source("accel_world", _axes("stateEstimate.", "ax ay az"), _specific_force),
+    Source("attitude", _axes("stateEstimate.", "qw qx qy qz"), _quaternion),
+    Source("attitude", _axes("stateEstimate.", "roll pitch yaw"), _attitude),
+    Source("attitude", _axes("stabilizer.", "roll pitch yaw"), _attitude),
+    Source("velocity", _axes("stateEstimate.", "vx vy vz"), _level),
+    Source("position", _axes("stateEstimate.", "x y z"), _level),
+    Source("rotor_speed", _axes("rpm.", "m1 m2 m3 m4"), _scaled(RPM)),
+    Source("motor_command", _axes("motor.", "m1 m2 m3 m4"), _scaled(1.0 / FULL_SCALE)),
+    Source("motor_command", _axes("pwm.", "m1_pwm m2_pwm m3_pwm m4_pwm"), _scaled(1.0 / FULL_SCALE)),
+    Source("mixer_input", _axes("controller.cmd_", "thrust roll pitch yaw"), _scaled(1.0 / FULL_SCALE)),
+    Source("attitude_reference", (*_axes("controller.", "roll pitch yaw"), "controller.actuatorThrust"), _reference),
+    Source("battery", ("pm.vbatMV",), _scaled(1e-3)),
+    Source("battery", ("pm.vbat",), _scaled(1.0)),
+)
+"""In order of preference: of several sources of one channel the first that a log holds is taken."""
+
+
+def read_usd(path: Path) -> Recording:
+    """Reads a Crazyflie µSD log by the variables that it holds.
+
+    Raises:
+        LogError: a damaged list of variables, or no variable that is known.
+    """
+    records = collect_usd_records(path.read_bytes(), path.name)
+    clock = LogClock()
+    raw: list[RawChannel] = []
+    left: list[str] = []
+    for title, table in records.tables.items():
+        if title != "fixedFrequency" and not any(_holds(table, s) for s in SOURCES):
+            continue  # an event, such as a change of mode
+        t, accepted = clock.times(table["t"].astype(np.float64) * 1e-6)
+        rows, refused = table[accepted], len(t) - int(np.count_nonzero(accepted))
+        used = {"id", "t"}
+        for source in SOURCES:
+            if _holds(rows, source) and source.channel not in {entry.name for entry in raw}:
+                values = np.column_stack([rows[v].astype(np.float64) for v in source.variables])
+                shown = " ".join(source.variables)
+                raw.append(RawChannel(source.channel, t[accepted], source.convert(values), shown, refused))
+                used |= set(source.variables)
+        left += [name for name in table.dtype.names or () if name not in used]
+    if not raw:
+        raise LogError(
+            f"{path.name}: none of its variables is known ({plain(', '.join(left))[:120] or 'no record'})",
+            "motor.m1 … m4 or controller.cmd_thrust, cmd_roll, cmd_pitch, cmd_yaw; gyro.x y z; acc.x y z; pm.vbatMV",
+            "list them in the µSD card's config.txt",
+        )
+    notes = [*records.notes, *_partial(left)]
+    return assemble(path.name, "usdlog", raw, clock, notes)
+
+
+def _holds(table: NDArray[np.void], source: Source) -> bool:
+    return set(source.variables) <= set(table.dtype.names or ())
+
+
+_PARTIAL: Mapping[str, tuple[str, ...]] = {
+    "attitude": _axes("stateEstimate.", "roll pitch yaw"),
+    "gyro": _axes("gyro.", "x y z"),
+    "accel": _axes("acc.", "x y z"),
+    "motor_command": _axes("motor.", "m1 m2 m3 m4"),
+}
+"""Groups of which some variables are of no use without the others."""
+
+
+def _partial(left: list[str]) -> list[str]:
+    """Says which groups of variables are incomplete, and therefore not used."""
+    out = []
+    for channel, group in _PARTIAL.items():
+        there = [name for name in group if name in left]
+        missing = [name for name in group if name not in left]
+        if there and missing:
+            out.append(f"{channel}: {', '.join(missing)} is missing, so {', '.join(there)} is not used")
+    return out
