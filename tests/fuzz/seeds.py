@@ -17,6 +17,7 @@ from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import EPOCH, MAVROS, PX4, header, imu, with_parts
 from tests.replay.test_tlog import MAV, Tlog, attitude, heartbeat
 from tests.replay.test_ulog import Ulog
+from tests.replay.test_usd import controller_log, motor_log
 
 ROWS = 4
 
@@ -166,8 +167,18 @@ def _ulog_seeds() -> list[bytes]:
     return [*seeds, bytes(nested.data)]
 
 
+def _usd_seeds() -> list[bytes]:
+    return [controller_log(ROWS).closed(), motor_log(ROWS).closed()]
+
+
 @lru_cache(maxsize=8)
 def seeds(kind: str) -> tuple[bytes, ...]:
-    """The seeds of a format: mcap, tlog, dataflash or ulog."""
-    make = {"mcap": _mcap_seeds, "tlog": _tlog_seeds, "dataflash": _dataflash_seeds, "ulog": _ulog_seeds}
+    """The seeds of a format: mcap, tlog, dataflash, ulog or usdlog."""
+    make = {
+        "mcap": _mcap_seeds,
+        "tlog": _tlog_seeds,
+        "dataflash": _dataflash_seeds,
+        "ulog": _ulog_seeds,
+        "usdlog": _usd_seeds,
+    }
     return tuple(make[kind]())
