@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser, CDPSession, sync_playwright
 from plotly.offline import get_plotlyjs
-from quadid_cli.demo import html, run
 
 from quadid.report import plotly_source
+from quadid.workflow.demo import html, run
 
 
 class Opening(NamedTuple):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from importlib import resources
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from quadid.effects import EFFECTS, known_keys, rotor_losses
 from quadid.errors import ParameterError, VehicleError, nearest
@@ -177,6 +178,7 @@ class Vehicle(_Strict):
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
+    _remark: str = PrivateAttr("")
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -331,7 +333,20 @@ class Vehicle(_Strict):
         for name in ("mass_sigma", "arm_sigma", "thrust_stand"):
             if not data[name]:
                 del data[name]
-        return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
+        head = "".join(f"# {line}\n" for line in self._remark.splitlines())
+        return head + str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
+
+    def with_remark(self, remark: str) -> Vehicle:
+        """The same vehicle with lines that head its file as comments: where its values come from."""
+        out = self.model_copy()
+        out._remark = remark
+        return out
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the vehicle file; returns its absolute path."""
+        target = Path(path).absolute()
+        target.write_text(self.to_yaml(), encoding="utf-8")
+        return target
 
 
 def _first_problem(error: ValidationError) -> str:

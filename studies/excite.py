@@ -19,9 +19,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from quadid_cli.excite import knowledge
-from quadid_cli.exciting import Limits, Proposal, Simulator, propose
 
+from quadid.experiment import Limits, Proposal, Simulator, propose
 from quadid.flight import Flight, draw_truth, fly
 from quadid.identify.fit import FitOptions, fit
 from quadid.identify.optimal_input import halfwidths
@@ -29,6 +28,7 @@ from quadid.identify.result import fitted_vehicle
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
+from quadid.workflow.excite import knowledge
 from studies.page import put_section
 from studies.truth import poor_guess
 
@@ -75,7 +75,7 @@ def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
 
 def held(flown: Flight, proposal: Proposal) -> bool:
     """Whether the true vehicle stayed within a tenth of the limits that its simulation kept."""
-    from quadid_cli.exciting import peaks
+    from quadid.experiment import peaks
 
     peak = peaks(flown)
     return peak.tilt < 1.1 * LIMITS.tilt and peak.rate < 1.1 * LIMITS.rate

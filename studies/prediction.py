@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from quadid_cli.loading import load_logs, load_vehicle
 
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.prediction import rate_errors
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
+from quadid.workflow.loading import load_logs, load_vehicle
 from studies import regression
 
 FloatArray = NDArray[np.float64]

@@ -18,9 +18,6 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from quadid_cli.identify import GRID
-from quadid_cli.loading import load_logs, load_vehicle
-
 from quadid.diagnose import Diagnosis, Workings, diagnose
 from quadid.errors import QuadidError
 from quadid.identify.open_loop import QUANTITIES, mean_errors, no_change
@@ -28,6 +25,7 @@ from quadid.identify.prediction import horizon_scores
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
+from quadid.workflow.loading import GRID, load_logs, load_vehicle
 from studies.page import put_section
 from studies.real_logs import HERE
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,10 +17,9 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from quadid_cli.identify import GRID, run
-from quadid_cli.loading import load_logs, load_vehicle
-
 from quadid.errors import QuadidError
+from quadid.workflow.identify import identify
+from quadid.workflow.loading import GRID, load_logs, load_vehicle
 from studies.page import put_section
 from studies.prediction import rate_prediction
 
@@ -142,8 +140,7 @@ def section(case: Case, data: Path) -> str:
     try:
         train = load_logs([str(data / n) for n in case.train], vehicle, GRID)
         held = load_logs([str(data / n) for n in case.validate], vehicle, GRID)
-        with tempfile.TemporaryDirectory() as folder:
-            done = run(vehicle, train, held, "pso_polish", 1, Path(folder) / "fitted.yaml", lambda stage, share: None)
+        done = identify(train, held)
     except QuadidError as error:
         return "\n".join([*text, f"Refused with exit code {error.exit_code}: {error}", "", case.remark]).rstrip()
     text += [*parameter_rows(done.result["parameters"], case.known), "", *score_rows(done.result["sets"]), ""]

@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-import numpy as np
 import typer
 
-from quadid.errors import ParameterError
-from quadid_cli.identify import GRID, file_name
+from quadid.workflow.loading import GRID
 from quadid_cli.options import JsonTarget, OutFolder, Preset, Rate, ReportFile, Seed, Unchecked, VehicleName
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from quadid.identify.noise_model import NoiseModel
-    from quadid.vehicle import Vehicle
-    from quadid_cli.exciting import Limits, Proposal
-    from quadid_cli.terminal import Advance
-
-MOST_SECONDS = 600.0
 
 
 def excite(
@@ -40,91 +28,30 @@ def excite(
     out: OutFolder = Path(),
 ) -> None:
     """Propose the manoeuvre that shrinks the intervals most, within tilt and rate limits; write it to a file."""
-    from quadid_cli import loading, output, terminal
-    from quadid_cli.exciting import Limits
+    from quadid.workflow.excite import check_limits, propose
+    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid_cli import output, terminal
 
     check_limits(seconds, tilt, rate_limit)
     output.check_file(json, "--json")
     output.check_file(report, "--report")
-    described = loading.load_vehicle(vehicle)
+    described = load_vehicle(vehicle)
     folder = output.out_folder(out)
-    opened = loading.load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked)
-    limits = Limits(math.radians(tilt), math.radians(rate_limit))
+    opened = load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked)
     with terminal.progress() as advance:
-        believed, known, noise = knowledge(described, [w for log in opened for w in log.windows], seed, advance)
-        proposal, result = run(believed, known, noise, limits, seconds, seed, folder, advance)
-    result["logs"] = [str(log.path) for log in opened]
+        done = propose(
+            opened, vehicle=described, seconds=seconds, tilt=tilt, rate_limit=rate_limit, seed=seed, advance=advance
+        )
+    result = done.result
+    target = folder / f"{output.file_name(described.name)}.manoeuvre.yaml"
+    result["manoeuvre_file"] = str(output.write_text(target, done.text))
     if report is not None:
         from quadid.report.excite_page import excite_html
 
-        result["report"] = str(output.write_text(report, excite_html(result, proposal.flight.window)))
+        result["report"] = str(output.write_text(report, excite_html(result, done.proposal.flight.window)))
     output.write_json(result, json)
     show(result, quiet=json == "-")
     terminal.warn([text for log in opened for text in log.warnings])
-
-
-def check_limits(seconds: float, tilt: float, rate_limit: float) -> None:
-    """Raises ParameterError for a manoeuvre that nobody can fly."""
-    if not 6.5 <= seconds <= MOST_SECONDS:
-        raise ParameterError(f"--seconds {seconds:g}", f"6.5 to {MOST_SECONDS:g} s")
-    if not 2.0 <= tilt <= 60.0:
-        raise ParameterError(f"--tilt {tilt:g} degrees", "2 to 60 degrees")
-    if not 10.0 <= rate_limit <= 1000.0:
-        raise ParameterError(f"--rate-limit {rate_limit:g} deg/s", "10 to 1000 deg/s")
-
-
-def knowledge(
-    vehicle: Vehicle, windows: Sequence[Any], seed: int, advance: Advance
-) -> tuple[Vehicle, NDArray[np.float64], NoiseModel | None]:
-    """What is known so far: vehicle with believed values, information (6, 6) of the log parameters, sensor noise.
-
-    Without logs that is the vehicle file: its sigma, else half of its bounds on the log scale.
-    """
-    from quadid.identify.result import fitted_vehicle
-    from quadid.parameters import NOMINAL_NAMES
-    from quadid_cli.searching import search
-
-    if windows:
-        fit = search("pso_polish", windows, vehicle, seed, advance)
-        return fitted_vehicle(fit), np.asarray(np.linalg.inv(fit.uncertainty.covariance), dtype=np.float64), fit.noise
-    sigma = []
-    for name in NOMINAL_NAMES:
-        prior = vehicle.parameters[name]
-        low, high = prior.limits
-        sigma.append(prior.sigma / prior.initial if prior.sigma else 0.5 * math.log(high / low))
-    return vehicle, np.diag(1.0 / np.array(sigma) ** 2), None
-
-
-def run(
-    vehicle: Vehicle, known: NDArray[np.float64], noise: NoiseModel | None, limits: Limits, seconds: float, seed: int,
-    folder: Path, advance: Advance,
-) -> tuple[Proposal, dict[str, Any]]:  # fmt: skip
-    """Proposes a manoeuvre, writes its file, and returns both it and the result of the form ``quadid.excite/1``."""
-    from quadid.parameters import NOMINAL_NAMES
-    from quadid_cli.exciting import Simulator, manoeuvre_file, propose
-    from quadid_cli.output import write_text
-
-    proposal = propose(Simulator(vehicle, noise, seed), known, limits, seconds, advance)
-    target = folder / f"{file_name(vehicle.name)}.manoeuvre.yaml"
-    written = write_text(target, manoeuvre_file(vehicle.name, proposal))
-    rows = zip(NOMINAL_NAMES, proposal.now, proposal.pilot, proposal.after, strict=True)
-    worst = int(np.argmax(proposal.pilot))
-    return proposal, {
-        "schema": "quadid.excite/1",
-        "vehicle": vehicle.name,
-        "seconds": proposal.seconds,
-        "limits": {"tilt_deg": math.degrees(limits.tilt), "rate_deg_s": math.degrees(limits.rate)},
-        "peak": {"tilt_deg": math.degrees(proposal.peak.tilt), "rate_deg_s": math.degrees(proposal.peak.rate)},
-        "movements": [
-            {"name": m.name, "amplitudes": {s.axis: s.amplitude for s in m.segments}} for m in proposal.movements
-        ],
-        "parameters": [
-            {"name": n, "now": float(a), "gentle_flight": float(b), "manoeuvre": float(c)} for n, a, b, c in rows
-        ],
-        "worst": NOMINAL_NAMES[worst],
-        "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),
-        "manoeuvre_file": str(written),
-    }
 
 
 def show(result: Mapping[str, Any], quiet: bool) -> None:

@@ -31,35 +31,27 @@ def export(
     out: OutFolder = Path(),
 ) -> None:
     """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
-    from quadid.report.programs import export as written_as
-    from quadid_cli import loading, output, terminal
-    from quadid_cli.identify import file_name
+    from quadid.workflow.export import export as exported
+    from quadid.workflow.loading import load_vehicle
+    from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
-    described, source = loading.load_vehicle(vehicle), Path(vehicle).name
+    described, source = load_vehicle(vehicle), Path(vehicle).name
     if history is not None:
         described, source = _accepted(described, history, name or described.name)
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
-    texts = written_as(described, form, source)
+    done = exported(described, form, source=source)
     folder = output.out_folder(out)
-    targets = {folder / f"{file_name(described.name)}{ending}": text for ending, text in texts.items()}
-    for path in targets:
+    for path in (folder / file for file in done.texts):
         if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
             raise output.OutputError(f"the export would overwrite {vehicle}", "another folder", "give --out")
-    files = [str(output.write_text(path, text)) for path, text in targets.items()]
-    guessed = [n for n, p in described.parameters.items() if p.sigma is None]
-    warnings = [f"not from data but the guess of the vehicle file: {', '.join(guessed)}"] if guessed else []
-    if form in ("px4", "ardupilot") and described.command.max_speed is None:
-        warnings.append("no hover thrust: give command.max_speed, the rotor speed at full command, in the vehicle file")
-    result = {
-        "schema": "quadid.export/1", "vehicle": described.name, "format": form, "files": files, "warnings": warnings,
-    }  # fmt: skip
-    output.write_json(result, json)
+    done.result["files"] = [str(path) for path in done.save(folder)]
+    output.write_json(done.result, json)
     console = terminal.console(quiet=json == "-")
-    for file in files:
+    for file in done.result["files"]:
         console.print(f"Written: {file}", soft_wrap=True)
-    terminal.warn(warnings)
+    terminal.warn(done.result["warnings"])
 
 
 def _accepted(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:

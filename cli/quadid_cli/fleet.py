@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from quadid_cli.identify import GRID
+from quadid.workflow.loading import GRID
 from quadid_cli.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
+    from quadid.workflow.fleet import Job
+    from quadid.workflow.progress import Advance
     from quadid_cli.fleet_folder import Found
     from quadid_cli.fleet_store import Store
-    from quadid_cli.fleet_work import Job
-    from quadid_cli.terminal import Advance
 
 
 def fleet(
@@ -51,12 +51,13 @@ def fleet(
     out: OutFolder = Path(),
 ) -> None:
     """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
-    from quadid_cli import fleet_folder, loading, output, terminal
+    from quadid.workflow.loading import load_vehicle
+    from quadid_cli import fleet_folder, output, terminal
     from quadid_cli.fleet_store import open_store
 
     output.check_file(json, "--json")
     target = output.out_folder(out)
-    default = None if vehicle is None else loading.load_vehicle(vehicle).to_yaml()
+    default = None if vehicle is None else load_vehicle(vehicle).to_yaml()
     found = fleet_folder.find_jobs(folder.resolve(), default, rate, seed, diagnose, target)
     begin = time.perf_counter()
     with open_store(target / "fleet.sqlite") as store:
@@ -96,17 +97,17 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
     from quadid.report.fleet_page import fleet_page
     from quadid.report.fleet_summary import summarise
     from quadid.report.page import render
-    from quadid_cli.output import write_text
-    from quadid_cli.reporting import provenance
+    from quadid.workflow.reporting import provenance
+    from quadid_cli import output
 
     logs, parameters, findings = (store.rows(table) for table in ("logs", "parameters", "findings"))
     summary = summarise(logs, parameters, findings)
-    page = fleet_page(summary, logs, parameters, provenance([]), "Report of a fleet")
+    page = fleet_page(summary, logs, parameters, provenance([], output.command_line()), "Report of a fleet")
     files = [target / "fleet.sqlite", *store.write_parquet(target)]
     return {
         "schema": "quadid.fleet/1", "logs": len(logs), "worked": worked, "seconds": seconds, **summary,
         "other_files": list(found.others), "files": [str(f) for f in files],
-        "report": str(write_text(target / "fleet.html", render(page))),
+        "report": str(output.write_text(target / "fleet.html", render(page))),
     }  # fmt: skip
 
 
@@ -116,6 +117,7 @@ def show(result: dict[str, Any], quiet: bool) -> None:
     from rich.text import Text
 
     from quadid.report.fleet_page import fleet_verdict
+    from quadid.report.result_tables import number
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
@@ -126,7 +128,7 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         for i, p in enumerate(unit["parameters"] or [None]):
             head = (Text(unit["unit"]), str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
             tail = ("", "", "", "") if p is None else (
-                p["parameter"], tables.number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
+                p["parameter"], number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
             )  # fmt: skip
             table.add_row(*head, *tail)
     console.print(table)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from quadid.errors import QuadidError
-from quadid_cli.fleet_work import Job, Row, blank, identify_one
+from quadid.workflow.fleet import Job, Row, blank, identify_one
 
 AHEAD = 4
 """Jobs handed out for each worker, so that the scheduler's memory does not grow with the number of logs."""

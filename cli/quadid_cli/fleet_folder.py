@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from quadid.errors import LogError, VehicleError
-from quadid_cli.fleet_work import Job
+from quadid.workflow.fleet import Job
 
 VEHICLE_FILE = "vehicle.yaml"
 SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
@@ -96,7 +96,7 @@ def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Pat
         if file in texts:
             return texts[file]
         if file.is_file():
-            from quadid_cli.loading import load_vehicle
+            from quadid.workflow.loading import load_vehicle
 
             texts[file] = load_vehicle(str(file)).to_yaml()
             return texts[file]

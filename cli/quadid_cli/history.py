@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from quadid.report.result_tables import number
 from quadid_cli.options import JsonTarget, shipped_names
-from quadid_cli.tables import number
 
 
 def history(
@@ -38,8 +38,8 @@ def history(
     from quadid_node.store_file import StoreError, read_history
 
     from quadid.errors import VehicleError
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output
-    from quadid_cli.loading import load_vehicle
 
     output.check_file(json, "--json")
     path, name = file or default_path(), vehicle

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from quadid.errors import QuadidError
-from quadid.jsonable import jsonable
-
-
-class OutputError(QuadidError):
-    """A place that cannot be written to."""
+from quadid.workflow.files import OutputError as OutputError
+from quadid.workflow.files import file_name as file_name
+from quadid.workflow.files import write_text as write_text
+from quadid.workflow.outcome import json_text as json_text
 
 
 def out_folder(folder: Path) -> Path:
@@ -46,19 +44,9 @@ def check_file(path: Path | str | None, option: str) -> None:
         raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
 
 
-def write_text(path: Path, text: str) -> Path:
-    """Writes a file whole or not at all; returns its absolute path."""
-    target = path.absolute()
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, target)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(
-            f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
-        ) from error
-    return target
+def command_line() -> str:
+    """The command as it was typed, for reports."""
+    return shlex.join(["quadid", *sys.argv[1:]])
 
 
 def write_json(result: Mapping[str, Any], target: str | None) -> None:
@@ -70,8 +58,3 @@ def write_json(result: Mapping[str, Any], target: str | None) -> None:
         sys.stdout.write(text)
     else:
         write_text(Path(target), text)
-
-
-def json_text(result: Mapping[str, Any]) -> str:
-    """A result as JSON for people and programs; numbers that JSON has no word for become null."""
-    return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

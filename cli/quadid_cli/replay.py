@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from quadid_node.service import Output, Service
 
     from quadid.window import Recording, Sample
-    from quadid_cli.terminal import Advance
+    from quadid.workflow.progress import Advance
 
 BATCH = 200
 """Samples between two looks at the session."""
@@ -71,8 +71,8 @@ def replay(
     from quadid_node.worker import InlineWorker
     from quadid_replay import open_log
 
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
-    from quadid_cli.loading import load_vehicle
 
     output.check_file(json, "--json")
     output.check_file(out, "--out")

@@ -12,7 +12,7 @@ import typer
 from quadid_cli.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
-    from quadid_cli.reproducing import Plan, Reproduced
+    from quadid.workflow.reproduction import Plan, Reproduced
 
 JsonDict = dict[str, Any]
 _SPENT = ("quasi_newton", "pso", "pso_polish")
@@ -27,7 +27,8 @@ def reproduce(
     out: OutFolder = Path(),
 ) -> None:
     """Fly the paper's three sets, fit as it does and better; write Tables 1 and 2, Figures 3 to 8, and one page."""
-    from quadid_cli import output, reproducing, terminal
+    from quadid.workflow import reproduction as reproducing
+    from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
     folder = output.out_folder(out)
@@ -47,7 +48,7 @@ def reproduce(
 def summary(done: Reproduced, plan: Plan, seed: int, seconds: float, command: str) -> JsonDict:
     """All numbers as JSON, of the form ``quadid.reproduce/1``."""
     from quadid import __version__
-    from quadid_cli.reproducing import EFFECTS, STABILISER_RATE, correlations
+    from quadid.workflow.reproduction import EFFECTS, STABILISER_RATE, correlations
 
     return {
         "schema": "quadid.reproduce/1",

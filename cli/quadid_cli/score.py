@@ -25,22 +25,16 @@ def score(
     out: OutFolder = Path(),
 ) -> None:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
-    from quadid.identify.prediction import horizon_scores
-    from quadid.identify.result import score_result
-    from quadid.model.layout import Layout
-    from quadid_cli import loading, output, tables, terminal
+    from quadid.workflow import score as work
+    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid_cli import output, tables, terminal
 
     output.check_file(json, "--json")
     wanted = parse_horizons(horizons)
-    described = loading.load_vehicle(vehicle)
-    opened = loading.load_logs(logs, described, rate, start, stop, preset, unchecked)
-    theta = Layout(described).initial(described)
-    pooled, each = horizon_scores([log.windows for log in opened], described, theta, wanted)
-    files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]
-    result = score_result(described.name, pooled, files)
-    output.write_json(result, json)
-    tables.print_horizons(terminal.console(quiet=json == "-"), result)
-    terminal.warn([text for log in opened for text in log.warnings])
+    opened = load_logs(logs, load_vehicle(vehicle), rate, start, stop, preset, unchecked)
+    done = work.score(opened, horizons=wanted, rate=rate)
+    output.write_json(done.result, json)
+    tables.print_outcome(terminal.console(quiet=json == "-"), done)
 
 
 def parse_horizons(text: str) -> list[int]:

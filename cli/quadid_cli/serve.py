@@ -72,8 +72,8 @@ def serve(
     from quadid_node.store import Store, default_path
     from quadid_node.worker import ProcessWorker, with_ground
 
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
-    from quadid_cli.loading import load_vehicle
     from quadid_cli.replay import parse_pairs
 
     output.check_file(json, "--json")

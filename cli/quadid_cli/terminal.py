@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from quadid.sanitise import one_line
+from quadid.workflow.progress import Advance as Advance
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-Advance = Callable[[str, float], None]
-"""Called with the name of a stage and the share of it done, 0..1."""
 _PIPE_WIDTH = 120
 
 

@@ -48,7 +48,7 @@ class ScoredSet:
 
 
 def identify_result(
-    fit: Fit, optimizer: str, seed: int, seconds: float, sets: Sequence[ScoredSet], vehicle_file: str,
+    fit: Fit, optimizer: str, seed: int, seconds: float, sets: Sequence[ScoredSet], vehicle_file: str | None,
     warnings: Sequence[str] = (),
 ) -> JsonDict:  # fmt: skip
     """The result of an identification.
@@ -59,7 +59,7 @@ def identify_result(
         seed: of all random numbers.
         seconds: wall time of the fit, on the caller's clock.
         sets: training and validation sets with their scores.
-        vehicle_file: absolute path of the written vehicle file.
+        vehicle_file: absolute path of the written vehicle file; None when none was written.
         warnings: beyond those of the fit, from reading the logs.
     """
     return {

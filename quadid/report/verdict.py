@@ -41,6 +41,10 @@ class Verdict:
     details: tuple[str, ...]
     next_steps: tuple[str, ...]
 
+    def lines(self) -> list[str]:
+        """Headline, details and next steps, a line each."""
+        return [self.headline, *self.details, *(f"Next: {step}" for step in self.next_steps)]
+
 
 def identify_verdict(result: JsonDict) -> Verdict:
     """Judges the result of ``quadid identify``.

@@ -52,11 +52,12 @@ def hostile_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report that `quadid demo --quick` writes."""
-    from quadid_cli import demo, output
+    from quadid.workflow import demo
+    from quadid.workflow.files import write_text
 
     folder = tmp_path_factory.mktemp("demo")
     shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
-    return output.write_text(folder / "report.html", demo.html(shown, 1))
+    return write_text(folder / "report.html", demo.html(shown, 1))
 
 
 @pytest.fixture(scope="session")
@@ -64,12 +65,12 @@ def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of a flight that could not be used."""
     from dataclasses import replace
 
-    from quadid_cli.reporting import failure_html
     from quadid_replay import write_csv
 
     from quadid.errors import LogError
     from quadid.flight import fly
     from quadid.vehicle import Vehicle
+    from quadid.workflow.reporting import failure_html
 
     pelican = Vehicle.shipped("pelican")
     folder = tmp_path_factory.mktemp("failure")

@@ -14,12 +14,12 @@ import pytest
 from quadid_cli.fleet_cluster import ClusterError, cluster, results
 from quadid_cli.fleet_folder import find_jobs
 from quadid_cli.fleet_store import open_store
-from quadid_cli.fleet_work import Job, Row, identify_one
 from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
+from quadid.workflow.fleet import Job, Row, identify_one
 from tests.cli.conftest import Cli, one_line
 
 DAY_NS = 86_400 * 10**9

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 from quadid_cli.reproduce import summary, write
-from quadid_cli.reproducing import Plan, reproduce
 
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 from quadid.report.paper_tables import PAPER_GAIN, PAPER_MSE
+from quadid.workflow.reproduction import Plan, reproduce
 
 pytestmark = [pytest.mark.xdist_group("reproduce"), pytest.mark.timeout(900)]
 

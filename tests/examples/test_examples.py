@@ -6,11 +6,13 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_replay import write_mcap
+from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import WindowError
 from quadid.flight import fly
@@ -18,35 +20,69 @@ from quadid.model.simulate import simulate
 from quadid.vehicle import GRAVITY, Vehicle
 
 
-def run(repository: Path, name: str, *arguments: str | Path) -> str:
-    """Output of an example in a process of its own."""
+def run(
+    repository: Path, name: str, *arguments: str | Path, cwd: Path | None = None, code: int = 0
+) -> subprocess.CompletedProcess[str]:
+    """An example in a process of its own."""
     done = subprocess.run(
-        [sys.executable, str(repository / "examples" / name), *map(str, arguments)],
-        capture_output=True, text=True, timeout=280, check=False, env={**os.environ, "PYTHONPATH": str(repository)},
+        [sys.executable, str(repository / "examples" / name), *map(str, arguments)], cwd=cwd,
+        capture_output=True, text=True, timeout=280, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])},
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stderr
+    return done
 
 
 def test_identify_in_ten_lines(repository: Path, tmp_path: Path) -> None:
     write_mcap(tmp_path / "flight.mcap", fly(Vehicle.shipped("pelican"), seconds=30.0, seed=4).recording)
-    lines = run(repository, "identify.py", tmp_path / "flight.mcap").splitlines()
-    assert [line.split()[0] for line in lines] == ["b", "d", "J_xx", "J_yy", "J_zz", "J_r"]
-    assert float(lines[0].split()[1]) == pytest.approx(2.33e-5, rel=0.01)
+    out = run(repository, "identify.py", tmp_path / "flight.mcap", cwd=tmp_path).stdout
+    assert float(re.findall(r"Thrust coefficient b +([0-9.e-]+)", out)[0]) == pytest.approx(2.33e-5, rel=0.01)
+    assert Vehicle.from_yaml((tmp_path / "fitted.yaml").read_text(encoding="utf-8")).name == "pelican"
     text = (repository / "examples" / "identify.py").read_text(encoding="utf-8")
     code = [line for line in text.splitlines() if line.strip() and not line.startswith(('"""', "#"))]
-    assert len(code) <= 11  # ten statements; the import of sys is one
+    assert len(code) <= 10
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [("degrees", "deg/s"), ("rpm", "rpm"), ("swapped", "order")],
+)
+def test_the_example_refuses_what_the_command_refuses(
+    wrong: str, reason: str, repository: Path, tmp_path: Path
+) -> None:
+    recording = fly(Vehicle.shipped("pelican"), seconds=30.0, seed=4).recording
+    name = "gyro" if wrong == "degrees" else "rotor_speed"
+    channel = recording.channels[name]
+    wrongly: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "degrees": np.degrees,
+        "rpm": lambda speed: speed * 60.0 / (2.0 * np.pi),
+        "swapped": lambda speed: speed[:, [1, 0, 3, 2]],
+    }
+    values = wrongly[wrong](channel.values)
+    spoilt = replace(recording, channels={**recording.channels, name: replace(channel, values=values)})
+    write_csv(tmp_path / "flight.csv", spoilt)
+    done = run(repository, "identify.py", tmp_path / "flight.csv", cwd=tmp_path, code=1)
+    command = subprocess.run(
+        [sys.executable, "-c", "import sys; from quadid_cli.main import app_main; sys.exit(app_main())",
+         "identify", str(tmp_path / "flight.csv"), "--vehicle", "pelican", "--out", str(tmp_path)],
+        capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+    assert command.returncode == 2
+    line = command.stderr.strip().removeprefix("quadid: ")
+    assert reason in line
+    assert line in done.stderr
+    assert not (tmp_path / "fitted.yaml").exists()
 
 
 def test_the_extended_model_in_ones_own_simulator(repository: Path) -> None:
-    out = run(repository, "own_simulator.py")
+    out = run(repository, "own_simulator.py").stdout
     assert "effects in the file: motor_lag" in out
     nominal, extended = (int(t) for t in re.findall(r"after (\d+) ms", out))
     assert extended > nominal + 10
 
 
 def test_an_effect_of_ones_own(repository: Path) -> None:
-    out = run(repository, "own_effect.py")
+    out = run(repository, "own_effect.py").stdout
     knee, true, share = (float(v) for v in re.findall(r"(?:knee|true|share) ([0-9.]+)", out)[:3])
     before, after = (float(v) for v in re.findall(r"([0-9.]+) with", out))
     assert knee == pytest.approx(true, rel=0.01)

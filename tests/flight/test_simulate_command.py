@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_cli.main import app_main
-from quadid_cli.simulate import SimulateError, check_target, parse_effects, read_manoeuvre, stream
+from quadid_cli.simulate import check_target, stream
 from quadid_replay import open_log
 
 from quadid.errors import ParameterError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
+from quadid.workflow.simulate import SimulateError, parse_effects, read_manoeuvre
 
 PELICAN = Vehicle.shipped("pelican")
 

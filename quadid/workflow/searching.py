@@ -1,4 +1,4 @@
-"""The searches that `quadid identify` offers, behind one call."""
+"""The searches that an identification offers, behind one call."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from quadid.identify.fit import Fit
     from quadid.vehicle import Vehicle
     from quadid.window import Window
-    from quadid_cli.terminal import Advance
+    from quadid.workflow.progress import Advance
 
 OPTIMIZERS = (
     "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",

@@ -1,52 +1,46 @@
-"""What a report says beside the result: the quality of the logs and where everything came from."""
+"""Reports of results: the pages, the quality of the logs and where everything came from."""
 
 from __future__ import annotations
 
 import datetime
 import importlib.metadata
 import platform
-import shlex
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
+from quadid.workflow.loading import LONGEST, beginning, open_recording, parse_cut
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
-    from quadid.identify.result import ScoredSet
     from quadid.inspection import Inspection
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
-    from quadid_cli.diagnose import Diagnosed
-    from quadid_cli.loading import Log
+    from quadid.workflow.diagnose import Diagnosed
+    from quadid.workflow.identify import Identified
+    from quadid.workflow.loading import Log
 
+LIBRARY = "a call of the library"
+"""Stands for the command line where there is none."""
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
-def identify_html(
-    result: Mapping[str, Any],
-    fit: Fit,
-    sets: Sequence[ScoredSet],
-    logs: Sequence[Log],
-    truth: Mapping[str, float] | None = None,
-) -> str:
-    """The HTML report of an identification."""
+def identify_html(done: Identified, truth: Mapping[str, float] | None = None, command: str = LIBRARY) -> str:
+    """The HTML report of an identification; `truth` where a simulation knows it."""
     from quadid.report.identify_page import identify_page
     from quadid.report.page import render
 
-    rows = provenance(logs) + [
+    result, fit = done.result, done.fit
+    rows = provenance(done.logs, command) + [
         {"name": "seed", "value": str(result["seed"])},
         {
             "name": "search",
             "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
         },
-        {"name": "vehicle file", "value": result["vehicle_file"]},
+        {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
     ]
-    page = identify_page(result, sets, fit.noise, [quality(log) for log in logs], rows, truth)
-    page["excitation"] = told(fit, [log for log, s in zip(logs, sets, strict=True) if s.role == "train"])
+    page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows, truth)
+    page["excitation"] = told(fit, [log for log, s in zip(done.logs, done.sets, strict=True) if s.role == "train"])
     return render(page)
 
 
@@ -54,51 +48,24 @@ def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
     """What the fitted logs can tell about each parameter, from `LONGEST` s of them at most."""
     from quadid.identify.excitation import excitation
     from quadid.report.excitation_part import excitation_part
-    from quadid_cli.loading import LONGEST, beginning
 
     windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)
     return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
 
 
-@contextmanager
-def explained(
-    report: Path | None, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str
-) -> Iterator[None]:  # fmt: skip
-    """When the block fails for want of good data, the report says why and shows the data; the error goes on.
-
-    Args:
-        report: file to write; None for none.
-        what: what was asked for, for the title.
-        texts: logs as given on the command line.
-        vehicle: its description.
-        preset: topic names of ROS logs.
-    """
-    try:
-        yield
-    except QuadidError as error:
-        if report is not None:
-            from quadid_cli.output import write_text
-            from quadid_cli.terminal import warn
-
-            file = write_text(report, failure_html(error, what, texts, vehicle, preset))
-            warn([f"no answer; why, and the data as they are: {file}"])
-        raise
-
-
-def failure_html(error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str) -> str:
+def failure_html(
+    error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str, command: str = LIBRARY
+) -> str:
     """The HTML report of an attempt that failed."""
-    from quadid_replay import open_log
-
     from quadid.inspection import inspect
     from quadid.report.failure_page import failure_page
     from quadid.report.page import render
-    from quadid_cli.loading import parse_cut
 
-    rows = provenance([])
+    rows = provenance([], command)
     read: list[tuple[Recording, Inspection | None]] = []
     for text in texts:
         try:
-            recording = open_log(parse_cut(text).path, preset)
+            recording = open_recording(parse_cut(text).path, preset)
         except (QuadidError, OSError) as unreadable:
             rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
             continue
@@ -111,18 +78,20 @@ def failure_html(error: QuadidError, what: str, texts: Sequence[str], vehicle: V
     return render(failure_page(what, error.found, error.fix, read, rows, error.allowed))
 
 
-def diagnose_html(done: Diagnosed, vehicle: str, seed: int) -> str:
+def diagnose_html(done: Diagnosed, command: str = LIBRARY) -> str:
     """The HTML report of a diagnosis."""
     from quadid.report.diagnose_page import diagnose_page
     from quadid.report.page import render
 
-    rows = provenance(done.logs) + [
-        {"name": "seed", "value": str(seed)},
-        {"name": "vehicle file", "value": done.result["vehicle_file"]},
+    rows = provenance(done.logs, command) + [
+        {"name": "seed", "value": str(done.result["seed"])},
+        {"name": "vehicle file", "value": done.result["vehicle_file"] or "not written"},
     ]
     logs = [quality(log) for log in done.logs]
     warnings = done.result["warnings"]
-    return render(diagnose_page(done.result, vehicle, done.sets, done.noise, logs, rows, warnings, done.maps()))
+    return render(
+        diagnose_page(done.result, done.nominal.name, done.sets, done.noise, logs, rows, warnings, done.maps())
+    )
 
 
 def quality(log: Log) -> dict[str, Any]:
@@ -149,11 +118,11 @@ def quality(log: Log) -> dict[str, Any]:
     return {"name": log.recording.name, "format": log.recording.format, "summary": summary, "channels": channels}
 
 
-def provenance(logs: Sequence[Log]) -> list[dict[str, str]]:
+def provenance(logs: Sequence[Log], command: str = LIBRARY) -> list[dict[str, str]]:
     """Files with hashes, versions, command line and time."""
     from quadid import __version__
 
-    rows = [{"name": "command", "value": shlex.join(["quadid", *sys.argv[1:]])}]
+    rows = [{"name": "command", "value": command}]
     rows.append({"name": "made", "value": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")})
     versions = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
     rows.append(

@@ -6,15 +6,11 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
 from quadid.sanitise import one_line
-
-if TYPE_CHECKING:
-    from quadid.identify.fit import Fit
-    from quadid.vehicle import Vehicle
-    from quadid_cli.loading import Log
+from quadid.workflow.loading import Log, load
 
 Row = dict[str, Any]
 EARLIEST = 946_684_800.0
@@ -77,45 +73,31 @@ def blank(job: Job) -> Row:
 
 
 def _identified(job: Job) -> Row:
-    from quadid.identify.result import answered
-    from quadid.identify.score import mse_score
-    from quadid.model.layout import Layout
     from quadid.vehicle import Vehicle
-    from quadid_cli.identify import out_of_reach
-    from quadid_cli.loading import load_log
-    from quadid_cli.searching import search
+    from quadid.workflow.identify import identify
 
     vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
     if Path(job.path).stat().st_size == 0:
         raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
-    log = load_log(job.path, vehicle, job.rate)
-    fit = _bounded(search("pso_polish", log.windows, vehicle, job.seed, lambda stage, share: None), out_of_reach([log]))
-    if not answered(fit.parameters):
-        raise NotIdentifiableError("the data say nothing about any parameter", "a flight that moves about all axes")
-    initial = Layout(vehicle).initial(vehicle)
-    before, after = (mse_score(log.windows, vehicle, theta, fit.noise).mse for theta in (initial, fit.theta))
+    log = load(job.path, vehicle, rate=job.rate)
+    result = identify(log, seed=job.seed).result
+    error = result["sets"][0]["mse"]
     row: Row = {
         "vehicle": vehicle.name,
         "sha256": log.recording.sha256,
         "format": log.recording.format,
         "seconds": log.grid.seconds_used,
-        "mse_initial": before,
-        "mse_fitted": after,
+        "mse_initial": error["initial"],
+        "mse_fitted": error["fitted"],
         "parameters": [
-            {"parameter": p.name, "unit": p.unit, "value": p.value, "low": p.ci95[0], "high": p.ci95[1],
-             "status": p.status.value}
-            for p in fit.parameters
+            {"parameter": p["name"], "unit": p["unit"], "value": p["value"], "low": p["ci95"][0], "high": p["ci95"][1],
+             "status": p["status"]}
+            for p in result["parameters"]
         ],
         "warnings": log.warnings,
         **_when(log),
     }  # fmt: skip
-    return row | (_diagnosed(job, log, vehicle) if job.diagnose else {})
-
-
-def _bounded(fit: Fit, missing: dict[str, str]) -> Fit:
-    from quadid.identify.result import bound_by_file, mask_unidentifiable
-
-    return bound_by_file(mask_unidentifiable(fit, missing))
+    return row | (_diagnosed(job, log) if job.diagnose else {})
 
 
 def _when(log: Log) -> Row:
@@ -124,17 +106,12 @@ def _when(log: Log) -> Row:
     return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
 
 
-def _diagnosed(job: Job, log: Log, vehicle: Vehicle) -> Row:
-    from quadid.diagnose import diagnose
+def _diagnosed(job: Job, log: Log) -> Row:
+    from quadid.workflow.diagnose import diagnose
 
-    found, _ = diagnose(log.windows, vehicle, (), job.seed)
-    findings = [
-        {"effect": f.effect, "confident": f.confident, "parameter": p.name, "unit": p.unit, "value": p.value,
-         "low": p.ci95[0], "high": p.ci95[1], "mse_before": f.gain.mse_before, "mse_after": f.gain.mse_after}
-        for f in found.findings
-        for p in f.parameters
-    ]  # fmt: skip
-    return {"verdict": found.verdict.value, "findings": findings}
+    done = diagnose(log, seed=job.seed)
+    kept = ("effect", "confident", "parameter", "unit", "value", "low", "high", "mse_before", "mse_after")
+    return {"verdict": done.result["verdict"], "findings": [{k: row[k] for k in kept} for row in done.records()]}
 
 
 def _line(error: Exception) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from quadid.identify.paper_objective import PaperProblem, PaperScore
     from quadid.vehicle import Vehicle
     from quadid.window import Window
-    from quadid_cli.terminal import Advance
+    from quadid.workflow.progress import Advance
 
     FloatArray = NDArray[np.float64]
 
@@ -154,25 +154,23 @@ def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduc
 
 def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
     """Flies the three sets, writes them as logs, and reads them back as any other log."""
-    from quadid_replay import write_mcap
-
     from quadid.flight import fly as fly_once
     from quadid.model.layout import Layout
     from quadid.parameters import NOMINAL_NAMES
     from quadid.vehicle import Stabiliser
-    from quadid_cli.identify import GRID
-    from quadid_cli.loading import load_log, load_vehicle
-    from quadid_cli.output import out_folder, write_text
+    from quadid.workflow.files import write_text
+    from quadid.workflow.loading import GRID, load, load_vehicle, write_recording
 
     base, sets, logs = load_vehicle(VEHICLE), [], []
-    place = out_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    place = folder.resolve()
     for i in range(3):
         advance(f"fly set {i + 1}", i / 3)
         flight = fly_once(base, seconds=plan.seconds, seed=10 * seed + i, effects=EFFECTS, command_rate=STABILISER_RATE)
         path = place / f"set{i + 1}.mcap"
-        write_mcap(path, flight.recording)
+        write_recording(path, flight.recording)
         flown = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=STABILISER_RATE)})
-        sets.append(load_log(str(path), flown, GRID).windows)
+        sets.append(load(path, flown, rate=GRID).windows)
         logs.append(str(path))
     vehicle = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=SIMULATED_RATE)})
     write_text(place / "pelican.yaml", vehicle.to_yaml())

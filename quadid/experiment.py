@@ -20,9 +20,9 @@ from quadid.identify.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 
 if TYPE_CHECKING:
+    from quadid.identify.fit import Progress as Advance
     from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
-    from quadid_cli.terminal import Advance
 
 FloatArray = NDArray[np.float64]
 BLOCK = 6.0

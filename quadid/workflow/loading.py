@@ -1,11 +1,12 @@
-"""From names on the command line to a vehicle and to windows on a grid."""
+"""From names of logs and vehicles to checked windows on a grid."""
 
 from __future__ import annotations
 
+import importlib
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
+GRID = 50.0
+"""Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
 """Excitation is computed from this much flight at most [s]."""
 _FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order")
@@ -26,35 +29,64 @@ _FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order
 
 @dataclass(frozen=True)
 class Cut:
-    """Part of a log that was asked for: seconds after its first IMU sample; None for open ends."""
+    """Part of a log that was asked for: seconds after its first IMU sample; None for open ends; units to be checked."""
 
     path: Path
     start: float | None = None
     stop: float | None = None
+    checked: bool = True
 
 
 @dataclass(frozen=True)
 class Log:
-    """A log on the grid.
+    """A log that was read, checked and brought onto the grid.
 
     Attributes:
         path: absolute path.
         recording: as read, each channel at its own rate.
+        vehicle: whose log it is; says what the rotor columns mean.
         windows: on one grid, without gaps.
         grid: how the windows were made.
+        cut: the part that is used.
         doubts: what looks wrong about units, frames, motors or clock, each with what to do.
     """
 
     path: Path
     recording: Recording
+    vehicle: Vehicle
     windows: list[Window]
     grid: GridReport
+    cut: Cut
     doubts: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the file."""
+        return self.recording.name
 
     @property
     def warnings(self) -> list[str]:
         """What was wrong with the log and its gridding, each with the log's name."""
         return [f"{self.path.name}: {text}" for text in (*self.recording.warnings, *self.doubts, *self.grid.notes)]
+
+    def at(self, rate: float | None) -> Log:
+        """The same log on a grid of another rate [Hz]; None for the log's own."""
+        windows, grid = _gridded(self.recording, self.vehicle, rate, self.cut)
+        return replace(self, windows=windows, grid=grid)
+
+    def of(self, vehicle: str | Path | Vehicle) -> Log:
+        """The same log read with another description of its vehicle: checked anew, on a grid of the same rate."""
+        described = as_vehicle(vehicle)
+        if described == self.vehicle:
+            return self
+        doubts = check_conventions(self.recording, described) if self.cut.checked else ()
+        windows, grid = _gridded(self.recording, described, self.grid.rate, self.cut)
+        return replace(self, vehicle=described, windows=windows, grid=grid, doubts=doubts)
+
+    def __repr__(self) -> str:
+        used, whole = self.grid.seconds_used, self.grid.seconds_log
+        head = f"{self.name}: {self.recording.format}, {used:.1f} of {whole:.1f} s used at {self.grid.rate:.4g} Hz"
+        return "\n".join((f"{head}, vehicle {self.vehicle.name}", *(f"warning: {text}" for text in self.warnings)))
 
 
 def load_vehicle(name: str) -> Vehicle:
@@ -105,44 +137,68 @@ def parse_cut(text: str, start: float | None = None, stop: float | None = None) 
     return cut
 
 
-def load_log(
-    text: str, vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
-    preset: str = "auto", unchecked: bool = False,
+def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:
+    """The vehicle itself, or that of a shipped name or a YAML file; see `load_vehicle` for errors."""
+    return load_vehicle(str(vehicle)) if isinstance(vehicle, str | Path) else vehicle
+
+
+def load(
+    log: str | Path, vehicle: str | Path | Vehicle, *, rate: float | None = GRID, start: float | None = None,
+    stop: float | None = None, preset: str = "auto", unchecked: bool = False,
 ) -> Log:  # fmt: skip
-    """Opens a log and brings it onto the grid.
+    """Opens a log of any kind, checks it, and brings it onto the grid.
 
     Args:
-        text: path, or path with a span as in `parse_cut`.
-        vehicle: says what the rotor columns mean.
+        log: path, or path with a span as in ``flight.bin@76:216`` [s].
+        vehicle: a shipped name, a YAML file or a `Vehicle`; says what the rotor columns mean.
         rate: of the grid [Hz]; None for the log's own.
         start: first time to use [s], after the log's first IMU sample.
         stop: last time to use [s], likewise.
         preset: topic names of ROS logs.
-        unchecked: use the log even when its units or frames look wrong.
+        unchecked: use the log even when its units, frames or motors look wrong.
 
     Raises:
-        LogError: not readable, in wrong units or frames, or nothing left of it.
+        LogError: not readable, in wrong units or frames, motors in another order, or nothing left of it.
+        VehicleError: no such vehicle.
         NotIdentifiableError: no rotor signal that means anything.
     """
-    from quadid_replay import open_log
-
-    from quadid.grid import grid_recording
-
-    cut = parse_cut(text, start, stop)
-    recording = open_log(cut.path, preset)
-    doubts = () if unchecked else check_conventions(recording, vehicle)
-    zero = first_imu_time(recording)
-    limits = [None if limit is None else zero + limit for limit in (cut.start, cut.stop)]
-    windows, report = grid_recording(recording, vehicle, rate, limits[0], limits[1])
-    return Log(cut.path.resolve(), recording, windows, report, doubts)
+    described = as_vehicle(vehicle)
+    cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
+    recording = open_recording(cut.path, preset)
+    doubts = () if unchecked else check_conventions(recording, described)
+    windows, report = _gridded(recording, described, rate, cut)
+    return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
 
 
 def load_logs(
     texts: Sequence[str], vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
     preset: str = "auto", unchecked: bool = False,
 ) -> list[Log]:  # fmt: skip
-    """Opens several logs, see `load_log`."""
-    return [load_log(text, vehicle, rate, start, stop, preset, unchecked) for text in texts]
+    """Opens several logs, see `load`."""
+    return [
+        load(text, vehicle, rate=rate, start=start, stop=stop, preset=preset, unchecked=unchecked) for text in texts
+    ]
+
+
+def open_recording(path: Path, preset: str = "auto") -> Recording:
+    """Reads a log of any kind; the reader is a package of its own and is looked up by name only here."""
+    recording: Recording = importlib.import_module("quadid_replay").open_log(path, preset)
+    return recording
+
+
+def write_recording(path: str | Path, recording: Recording) -> Path:
+    """Writes a log as MCAP, tlog or CSV by suffix; returns its absolute path."""
+    kind = Path(path).suffix.lower()[1:]
+    getattr(importlib.import_module("quadid_replay"), f"write_{kind}")(path, recording)
+    return Path(path).absolute()
+
+
+def _gridded(recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> tuple[list[Window], GridReport]:
+    from quadid.grid import grid_recording
+
+    zero = first_imu_time(recording)
+    limits = [None if limit is None else zero + limit for limit in (cut.start, cut.stop)]
+    return grid_recording(recording, vehicle, rate, limits[0], limits[1])
 
 
 def beginning(windows: Iterable[Window], longest: float) -> tuple[list[Window], float]:

@@ -1,0 +1,93 @@
+"""Tables as text that fits a width: columns that matter less go, values are never cut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Literal, NamedTuple
+
+Tone = Literal["", "good", "fair", "poor", "title", "head", "dim"]
+"""What a piece of text is, for whoever has colours."""
+SPACE = "  "
+
+
+class Cell(NamedTuple):
+    """A value with its tone."""
+
+    text: str
+    tone: Tone = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column.
+
+    Attributes:
+        heading: its heading, with the unit where all values share one.
+        right: numbers stand at the right.
+        rank: 0 always stays; of the others the highest goes first where the width does not hold all.
+    """
+
+    heading: str
+    right: bool = False
+    rank: int = 0
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A titled table; `rows` have one text or `Cell` a column."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str | Cell, ...], ...]
+
+    def lines(self, width: int) -> list[tuple[Cell, ...]]:
+        """Lines of pieces with their tones, for a terminal of `width` columns."""
+        kept = self._fitting(width)
+        widths = [self._width(i) for i in kept]
+        shown = [self.columns[i] for i in kept]
+        out: list[tuple[Cell, ...]] = [(Cell(line, "title"),) for line in _folded(self.title, width)]
+        out.append(tuple(Cell(_put(c.heading, w, c.right), "head") for c, w in zip(shown, widths, strict=True)))
+        for row in self.rows:
+            cells = [_cell(row[i]) for i in kept]
+            put = zip(cells, shown, widths, strict=True)
+            out.append(tuple(Cell(_put(cell.text, w, c.right), cell.tone) for cell, c, w in put))
+        return out
+
+    def text(self, width: int = 80) -> str:
+        """The table as plain text."""
+        return "\n".join(SPACE.join(cell.text for cell in line).rstrip() for line in self.lines(width))
+
+    def html(self) -> str:
+        """The table as HTML, all columns."""
+        head = "".join(f"<th>{escape(c.heading)}</th>" for c in self.columns)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{escape(_cell(value).text)}</td>" for value in row) + "</tr>" for row in self.rows
+        )
+        return f"<table><caption>{escape(self.title)}</caption><tr>{head}</tr>{body}</table>"
+
+    def _fitting(self, width: int) -> list[int]:
+        """Indices of the columns that fit `width`, those of rank 0 in any case."""
+        kept = list(range(len(self.columns)))
+        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: -self.columns[i].rank)
+        while going and sum(self._width(i) for i in kept) + len(SPACE) * (len(kept) - 1) > width:
+            kept.remove(going.pop(0))
+        return kept
+
+    def _width(self, i: int) -> int:
+        return max(len(self.columns[i].heading), *(len(_cell(row[i]).text) for row in self.rows), 0)
+
+
+def _cell(value: str | Cell) -> Cell:
+    return value if isinstance(value, Cell) else Cell(value)
+
+
+def _put(text: str, width: int, right: bool) -> str:
+    return text.rjust(width) if right else text.ljust(width)
+
+
+def _folded(text: str, width: int) -> Sequence[str]:
+    import textwrap
+
+    return textwrap.wrap(text, max(width, 20)) or [""]

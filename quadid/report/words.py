@@ -1,0 +1,31 @@
+"""Names of parameters and statuses as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+PARAMETER_NAMES: dict[str, str] = {
+    "b": "Thrust coefficient",
+    "d": "Drag coefficient",
+    "J_xx": "Roll inertia",
+    "J_yy": "Pitch inertia",
+    "J_zz": "Yaw inertia",
+    "J_r": "Rotor inertia",
+}
+STATUS_WORDS: dict[str, str] = {
+    "identified": "identified",
+    "ratio_only": "only its ratio to {}",
+    "prior_dominated": "guess kept",
+    "unreliable": "unreliable",
+}
+
+
+def parameter_name(symbol: str) -> str:
+    """``Thrust coefficient b`` for ``b``; names of effects as they are."""
+    return f"{PARAMETER_NAMES[symbol]} {symbol}" if symbol in PARAMETER_NAMES else symbol
+
+
+def status_words(parameter: Mapping[str, Any]) -> str:
+    """A parameter's status for people; `parameter` as in ``quadid.identify/1``."""
+    return STATUS_WORDS[parameter["status"]].format(parameter.get("relative_to", "another"))

@@ -1,0 +1,154 @@
+"""Diagnosis: what the simulation gets wrong, why, and what the better model gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from quadid.workflow.files import file_name, write_text
+from quadid.workflow.identify import origin_remark
+from quadid.workflow.logs import Given, settled
+from quadid.workflow.outcome import Outcome
+from quadid.workflow.progress import Advance, silent
+from quadid.workflow.searching import check_length
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from quadid.diagnose import Diagnosis
+    from quadid.diagnose.pipeline import Workings
+    from quadid.identify.noise_model import NoiseModel
+    from quadid.identify.result import ScoredSet
+    from quadid.report.residual_maps import ResidualMap
+    from quadid.report.text_table import TextTable
+    from quadid.report.verdict import Verdict
+    from quadid.vehicle import Vehicle
+    from quadid.workflow.loading import Log
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosed(Outcome):
+    """What a diagnosis found.
+
+    Attributes:
+        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` is None until a file is written.
+        found: the diagnosis itself.
+        sets: logs scored without and with the findings.
+        noise: estimated sensor noise.
+        logs: as loaded, diagnosed ones first.
+        nominal: vehicle that was given.
+        workings: everything that led to the result.
+    """
+
+    result: dict[str, Any]
+    found: Diagnosis
+    sets: list[ScoredSet]
+    noise: NoiseModel
+    logs: list[Log]
+    nominal: Vehicle
+    workings: Workings
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The fitted vehicle with the findings in it; ``vehicle.save("mine.yaml")`` writes it."""
+        from quadid.vehicle import Vehicle
+
+        train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+        return Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name).with_remark(origin_remark(train))
+
+    @property
+    def file_name(self) -> str:
+        """``pelican+motor_lag.yaml``, or ``pelican.fitted.yaml`` without findings."""
+        return f"{file_name(self.found.vehicle_name)}{'' if self.found.findings else '.fitted'}.yaml"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model may be used, and what to do next."""
+        from quadid.report.diagnose_page import diagnose_verdict
+
+        return diagnose_verdict(self.result)
+
+    def tables(self) -> list[TextTable]:
+        """The findings; none, no table."""
+        from quadid.report.result_tables import finding_table
+
+        return [finding_table(self.result["findings"])] if self.result["findings"] else []
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a number of a finding."""
+        return [
+            {"effect": f["effect"], "confident": f["confident"], "parameter": p["name"], "unit": p["unit"],
+             "value": p["value"], "low": low, "high": high, "mse_before": f["gain"]["mse_before"],
+             "mse_after": f["gain"]["mse_after"], "p_value": f["p_value"]}
+            for f in self.result["findings"]
+            for p in f["parameters"]
+            for low, high in [p["ci95"] or (None, None)]
+        ]  # fmt: skip
+
+    def plot(self, log: int = -1, group: str = "rates") -> Any:
+        """Measured and simulated outputs of one log, without and with the findings, as a plotly figure."""
+        from quadid.report.figures import MODELS
+        from quadid.report.plotly_figure import channel_plot
+
+        return channel_plot(self.sets[log], group, MODELS)
+
+    def report(self, path: str | Path, command: str | None = None) -> Path:
+        """Writes the HTML report; `command` is the command line that led to it, if one did."""
+        from quadid.workflow.reporting import LIBRARY, diagnose_html
+
+        return write_text(path, diagnose_html(self, command=command or LIBRARY))
+
+    def maps(self) -> dict[str, ResidualMap]:
+        """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
+        from quadid.report.residual_maps import residual_map
+
+        count = sum(s.role == "train" for s in self.sets)
+        windows = [w for log in self.logs[:count] for w in log.windows]
+        model = self.workings.search.model
+        drawn = {
+            c.effect: residual_map(windows, self.nominal, model.theta, c.effect, c.names, self.noise)
+            for c in model.causes
+        }
+        return {effect: one for effect, one in drawn.items() if one is not None}
+
+
+def diagnose(
+    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, seed: int = 1,
+    advance: Advance = silent,
+) -> Diagnosed:  # fmt: skip
+    """Names what the simulation gets wrong, extends the model by it, and measures the gain on unseen data.
+
+    Args:
+        logs: a log or several to diagnose, from `load`.
+        validate: flights to measure the gain on; without any, held-out blocks of `logs` serve.
+        vehicle: nominal vehicle; default the one that the first log was loaded with.
+        seed: of all random numbers.
+        advance: told how far it is.
+
+    Raises:
+        NotIdentifiableError: too little data.
+        LogError: a log that does not fit the vehicle.
+    """
+    from quadid.diagnose.pipeline import diagnose as diagnose_windows
+
+    described, train, held = settled(logs, validate, vehicle)
+    windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
+    check_length(windows)
+    found, workings = diagnose_windows(windows, described, unseen, seed, advance)
+    result = found.to_dict()
+    result["warnings"] = [*result.get("warnings", []), *(text for log in (*train, *held) for text in log.warnings)]
+    result["seed"] = seed
+    sets = [
+        scored(log, role, described, workings) for role, part in (("train", train), ("validate", held)) for log in part
+    ]
+    return Diagnosed(result, found, sets, workings.decisive.noise, [*train, *held], described, workings)
+
+
+def scored(log: Log, role: str, vehicle: Vehicle, workings: Workings) -> ScoredSet:
+    """Scores the model without and with the findings on one log."""
+    from quadid.identify.result import ScoredSet
+    from quadid.identify.score import mse_score
+
+    models = workings.search.nominal.theta, workings.search.model.theta
+    before, after = (mse_score(log.windows, vehicle, theta, workings.decisive.noise) for theta in models)
+    return ScoredSet(log.recording.name, role, before, after)

@@ -1,0 +1,60 @@
+"""The parameters of a vehicle for another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.workflow.files import file_name, write_text
+from quadid.workflow.loading import as_vehicle
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files for another program.
+
+    Attributes:
+        result: of the form ``quadid.export/1``; ``files`` is empty until they are written.
+        texts: content by file name.
+    """
+
+    result: dict[str, Any]
+    texts: dict[str, str]
+
+    def __repr__(self) -> str:
+        return "\n".join(self.texts.values())
+
+    def save(self, folder: str | Path = ".") -> list[Path]:
+        """Writes the files; returns their absolute paths."""
+        return [write_text(Path(folder) / name, text) for name, text in self.texts.items()]
+
+
+def export(vehicle: str | Path | Vehicle, form: str = "yaml", *, source: str | None = None) -> Exported:
+    """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
+
+    Args:
+        vehicle: a shipped name, a YAML file or a `Vehicle`.
+        form: yaml, px4, ardupilot, gazebo, rotorpy or agilicious.
+        source: where the values come from, for the file; default the vehicle's file or name.
+
+    Raises:
+        ParameterError: an unknown form.
+        VehicleError: no such vehicle.
+    """
+    from quadid.report.programs import export as written_as
+
+    described = as_vehicle(vehicle)
+    origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
+    texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, form, origin).items()}
+    guessed = [n for n, p in described.parameters.items() if p.sigma is None]
+    warnings = [f"not from data but the guess of the vehicle file: {', '.join(guessed)}"] if guessed else []
+    if form in ("px4", "ardupilot") and described.command.max_speed is None:
+        warnings.append("no hover thrust: give command.max_speed, the rotor speed at full command, in the vehicle file")
+    result = {
+        "schema": "quadid.export/1", "vehicle": described.name, "format": form, "files": [], "warnings": warnings,
+    }  # fmt: skip
+    return Exported(result, texts)

@@ -1,0 +1,110 @@
+"""Inspection: what a log holds, whether it can be true, what it allows, and how to log what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import LogError, QuadidError
+from quadid.workflow.loading import LONGEST, Log, as_vehicle, beginning, first_imu_time, open_recording, parse_cut
+from quadid.workflow.outcome import Outcome
+
+if TYPE_CHECKING:
+    from quadid.inspection import Inspection
+    from quadid.report.text_table import TextTable
+    from quadid.vehicle import Vehicle
+    from quadid.window import Recording
+
+
+@dataclass(frozen=True, repr=False)
+class Inspected(Outcome):
+    """What a log holds; `result` has the form ``quadid.inspect/1``."""
+
+    result: dict[str, Any]
+    found: Inspection
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the reader had to say."""
+        return list(self.found.warnings)
+
+    def tables(self) -> list[TextTable]:
+        """Channels, checks, parameters, and what is missing."""
+        from quadid.report.inspect_tables import inspect_tables
+
+        return inspect_tables(self.found)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a channel."""
+        return list(self.result["channels"])
+
+
+def inspect(
+    log: str | Path | Log, vehicle: str | Path | Vehicle | None = None, *, start: float | None = None,
+    stop: float | None = None, preset: str = "auto",
+) -> Inspected:  # fmt: skip
+    """Inspects a log, and never refuses one that can be read.
+
+    Args:
+        log: path, path with a span as in ``flight.bin@76:216``, or a log from `load`.
+        vehicle: with it, motors and excitation are checked too; default the one a loaded log has.
+        start: first time to look at [s], after the log's first IMU sample.
+        stop: last time [s], likewise.
+        preset: topic names of ROS logs.
+
+    Raises:
+        LogError: not readable, or nothing in the span.
+        VehicleError: no such vehicle.
+    """
+    from quadid.inspection import inspect as inspect_recording
+
+    if isinstance(log, Log):
+        cut, whole, vehicle = log.cut, log.recording, log.vehicle if vehicle is None else vehicle
+    else:
+        cut = parse_cut(str(log), start, stop)
+        whole = None
+    described = None if vehicle is None else as_vehicle(vehicle)
+    recording = _part(open_recording(cut.path, preset) if whole is None else whole, cut.start, cut.stop)
+    rows = () if described is None else _excitation(recording, described)
+    found = inspect_recording(recording, described, rows)
+    return Inspected({**found.to_dict(), "log": str(cut.path.resolve()), "files": []}, found)
+
+
+def _part(recording: Recording, start: float | None, stop: float | None) -> Recording:
+    """Cuts all channels to seconds after the first IMU sample."""
+    if start is None and stop is None:
+        return recording
+    zero = first_imu_time(recording)
+    low = -float("inf") if start is None else zero + start
+    high = float("inf") if stop is None else zero + stop
+    channels = {}
+    for name, channel in recording.channels.items():
+        inside = (channel.t >= low) & (channel.t <= high)
+        if inside.any():
+            channels[name] = replace(channel, t=channel.t[inside], values=channel.values[inside])
+    if not channels:
+        raise LogError(f"{recording.name}: nothing between {start} and {stop} s", "a span inside the log")
+    return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
+
+def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any], ...]:
+    """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
+    from quadid.grid import to_windows
+    from quadid.identify.excitation import excitation
+    from quadid.parameters import NOMINAL_UNITS
+
+    try:
+        windows, _ = beginning(to_windows(recording, vehicle), LONGEST)
+        found = excitation(windows, vehicle)
+    except QuadidError:
+        return ()  # the inspection itself says what is missing or too slow
+    return tuple(
+        {
+            "name": name,
+            "unit": NOMINAL_UNITS[name],
+            "relative_sigma": float(bound),
+            "relative_sigma_alone": float(alone),
+        }
+        for name, bound, alone in zip(found.names, found.bound, found.alone, strict=True)
+    )

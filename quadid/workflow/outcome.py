@@ -1,0 +1,89 @@
+"""What every result of the library offers: tables as text and HTML, a data frame, JSON."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import QuadidError
+from quadid.jsonable import jsonable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from quadid.report.text_table import TextTable
+    from quadid.report.verdict import Verdict
+
+
+class Outcome(ABC):
+    """A result that prints as its command prints it.
+
+    Attributes:
+        result: plain data of the command's JSON, without the files that only the command writes.
+    """
+
+    result: dict[str, Any]
+
+    @abstractmethod
+    def tables(self) -> list[TextTable]:
+        """The tables that the command prints, in order."""
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What the result means and what to do next; None where the numbers speak alone."""
+        return None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know, from logs and from the work itself."""
+        return list(self.result.get("warnings", ()))
+
+    def text(self, width: int = 100) -> str:
+        """Tables, verdict and warnings, for a page of `width` columns."""
+        parts = [table.text(width) for table in self.tables()]
+        if self.verdict is not None:
+            parts.append("\n".join(self.verdict.lines()))
+        parts += [f"warning: {warning}" for warning in self.warnings]
+        return "\n\n".join(parts)
+
+    def __repr__(self) -> str:
+        return self.text()
+
+    def _repr_html_(self) -> str:
+        parts = [table.html() for table in self.tables()]
+        if self.verdict is not None:
+            head, *more = (escape(line) for line in self.verdict.lines())
+            parts.append(f"<p><b>{head}</b></p>" + "".join(f"<p>{line}</p>" for line in more))
+        return "".join([*parts, *(f"<p>warning: {escape(warning)}</p>" for warning in self.warnings)])
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """The result as JSON text; with `path` also written there."""
+        text = json_text(self.result)
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def to_frame(self) -> pd.DataFrame:
+        """The main table with plain numbers as a pandas data frame."""
+        return data_frame(self.records())
+
+    @abstractmethod
+    def records(self) -> list[dict[str, Any]]:
+        """Rows of the main table with plain numbers."""
+
+
+def json_text(result: Any) -> str:
+    """A result as JSON for people and programs; numbers that JSON has no word for become null."""
+    return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def data_frame(records: list[dict[str, Any]]) -> pd.DataFrame:
+    """Rows as a data frame; raises QuadidError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise QuadidError("pandas is not installed", fix="pip install 'quadid[notebook]', or use .records()") from error
+    return pandas.DataFrame(records)

@@ -1,0 +1,71 @@
+"""Open-loop prediction error of a vehicle on logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from quadid.workflow.logs import Given, settled
+from quadid.workflow.outcome import Outcome
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from quadid.report.text_table import TextTable
+    from quadid.vehicle import Vehicle
+
+HORIZONS = (1, 10, 50)
+
+
+@dataclass(frozen=True, repr=False)
+class Scored(Outcome):
+    """Prediction errors; `result` has the form ``quadid.score/1``."""
+
+    result: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with the logs."""
+        return list(self.notes)
+
+    def tables(self) -> list[TextTable]:
+        """Errors after every horizon, pooled and a log."""
+        from quadid.report.result_tables import horizon_table
+
+        return [horizon_table(self.result)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a log and horizon, the pooled ones with the log None."""
+        entries = [*self.result["files"], {"log": None, **self.result}]
+        return [{"log": e["log"], "after": int(h), **errors} for e in entries for h, errors in e["horizons"].items()]
+
+
+def score(
+    logs: Given, *, vehicle: str | Path | Vehicle | None = None, horizons: Sequence[int] = HORIZONS,
+    rate: float | None = None,
+) -> Scored:  # fmt: skip
+    """Open-loop prediction error after h samples: every sample starts one run from the measured state.
+
+    Args:
+        logs: a log or several, from `load`.
+        vehicle: whose values are scored as they are; default the one that the first log was loaded with.
+        horizons: samples of the grid after the start of each run.
+        rate: of the grid [Hz]; None for each log's own, whatever it was loaded with.
+
+    Raises:
+        LogError: a log that does not fit the vehicle.
+        ParameterError: horizons that are no positive numbers.
+    """
+    from quadid.identify.prediction import horizon_scores
+    from quadid.identify.result import score_result
+    from quadid.model.layout import Layout
+
+    described, given, _ = settled(logs, (), vehicle)
+    opened = [log.at(rate) for log in given]
+    theta = Layout(described).initial(described)
+    pooled, each = horizon_scores([log.windows for log in opened], described, theta, list(horizons))
+    files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]
+    notes = tuple(text for log in opened for text in log.warnings)
+    return Scored(score_result(described.name, pooled, files), notes)
