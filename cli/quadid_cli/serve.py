@@ -13,7 +13,8 @@ from quadid_cli.options import JsonTarget, Seed, VehicleName
 
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
-    from quadid_node.service import Health, Output, Service
+    from quadid_node.publication import Output
+from quadid_node.service import Health, Service
     from rich.console import Console
 
 SAY_EVERY = 10.0
@@ -149,7 +150,7 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
     from quadid_node.codec import set_to_dict, status_to_dict
 
     health, traffic = service.health(), link.traffic()
-    force = service.session.active_set.in_force
+    force = service.published
     return {
         "schema": "quadid.serve/1",
         "vehicle": name,

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from quadid.online.records import Event, OnlineSet, Publish, SetState
 
 Action = Publish | Event
+MOST_HELD = 60
+"""Sets that wait and can still be approved by their numbers: at a refit a second, those of the last minute."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,6 @@ class ActiveSet:
 
     Attributes:
         in_force: the set that the parameter topic holds; None before the first.
-        pending: the set that waits for approval.
         baseline: set from which creeping is measured: the last one a person approved, else the first.
         approval: auto or manual; a rollback by a person makes it manual.
         seen: end of the data that the set in force rests on [s, session time]; minus infinity for none of this flight.
@@ -43,17 +44,22 @@ class ActiveSet:
             baseline: what creeping is measured from; default `restored`.
         """
         self.approval = approval
-        self.pending: OnlineSet | None = None
+        self._held: dict[int, tuple[OnlineSet, float]] = {}
         self.in_force: OnlineSet | None = None
         self._earlier: list[OnlineSet] = []
         self._next = max(next_sequence, restored.sequence + 1 if restored else 1)
         if restored is not None:
             reason = f"from an earlier run ({restored.reason}): not yet confirmed by this flight"
-            self.in_force = replace(restored, state=SetState.STALE, reason=reason)
+            # A number of its own: who uses the set already learns that it is stale now.
+            self.in_force = replace(restored, sequence=self._number(), state=SetState.STALE, reason=reason)
         self.baseline = baseline or self.in_force
         self.seen = -math.inf
-        self._pending_stop = -math.inf
         self._watched, self._watch_from = 0.0, math.inf
+
+    @property
+    def pending(self) -> OnlineSet | None:
+        """The newest set that waits for approval."""
+        return next(reversed(self._held.values()))[0] if self._held else None
 
     @property
     def predecessor(self) -> OnlineSet | None:
@@ -73,7 +79,8 @@ class ActiveSet:
         if self.in_force is not None and self.in_force.state is not SetState.STALE:
             self._earlier.append(self.in_force)
             del self._earlier[:-20]
-        self.in_force, self.pending = accepted, None
+        self.in_force = accepted
+        self._held.clear()
         if self.baseline is None or by != "auto":
             self.baseline = accepted
         self._watched, self._watch_from, self.seen = 0.0, stop, stop
@@ -83,25 +90,32 @@ class ActiveSet:
         ]
 
     def hold(self, item: OnlineSet, stop: float) -> OnlineSet:
-        """Keeps a set for approval and numbers it; a newer one takes the place of an older; `stop` as in `accept`."""
-        self._pending_stop = stop
-        number = self.pending.sequence if self.pending is not None else self._number()
-        self.pending = replace(item, sequence=number, state=SetState.PENDING)
-        return self.pending
+        """Keeps a set for approval, under a number that stands for it and no other; `stop` as in `accept`."""
+        held = replace(item, sequence=self._number(), state=SetState.PENDING)
+        self._held[held.sequence] = (held, stop)
+        if len(self._held) > MOST_HELD:
+            del self._held[next(iter(self._held))]
+        return held
 
     def drop_pending(self) -> None:
-        """Forgets the set that waits for approval."""
-        self.pending = None
+        """Forgets the sets that wait for approval."""
+        self._held.clear()
 
     def approve(self, t: float, by: str, sequence: int | None = None) -> Answer:
-        """A person approves the waiting set; a second approval, or one of another number, does nothing."""
+        """A person approves one of the sets that wait, by its number; without one the newest.
+
+        A second approval, or one of a number that does not wait, does nothing.
+        """
         if self.pending is None:
             return Answer(False, "nothing waits for approval")
-        if sequence is not None and sequence != self.pending.sequence:
-            return Answer(False, f"set {sequence} is not the one that waits ({self.pending.sequence})")
-        number = self.pending.sequence
-        item = replace(self.pending, reason=f"approved by {by}: {self.pending.reason}")
-        actions = self.accept(item, by, t, self._pending_stop)
+        number = self.pending.sequence if sequence is None else sequence
+        if number not in self._held:
+            return Answer(
+                False, f"set {number} does not wait for approval; the newest that does is {self.pending.sequence}"
+            )
+        waited, stop = self._held[number]
+        item = replace(waited, reason=f"approved by {by}: {waited.reason}")
+        actions = self.accept(item, by, t, stop)
         assert self.in_force is not None
         return Answer(True, f"set {number} approved, in force as set {self.in_force.sequence}", tuple(actions))
 
@@ -115,7 +129,7 @@ class ActiveSet:
         self.in_force = replace(
             good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by
         )
-        self.pending = None
+        self._held.clear()
         self._watch_from = math.inf
         if by != "auto":
             self.approval, self.baseline = "manual", self.in_force

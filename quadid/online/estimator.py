@@ -83,6 +83,11 @@ class Estimator:
         fused = self.fusion.estimate()
         return self._prior_sigma if fused is None else fused.sigma
 
+    @property
+    def mass(self) -> float:
+        """Mass of the vehicle file, on which every parameter rests [kg]."""
+        return self._vehicle.mass
+
     def value(self, name: str) -> float:
         """A nominal parameter, the best at hand."""
         return float(self.theta[NOMINAL_NAMES.index(name)])

@@ -130,8 +130,9 @@ def _excitation(case: Case, settings: GateSettings) -> str | None:
     return None if case.excited else "the newest window does not reveal roll and pitch dynamics: move the sticks more"
 
 
-def _bounds(case: Case, settings: GateSettings) -> str | None:
-    for p in case.parameters:
+def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
+    """Why no vehicle has these parameters, whoever estimated or stored them; None when one may."""
+    for p in parameters:
         if not math.isfinite(p.value) or not math.isfinite(p.sigma):
             return f"{p.name} = {p.value:g} {p.unit} with standard deviation {p.sigma:g} is not a number"
         if p.name in NOMINAL_NAMES and not p.value > 0.0:
@@ -140,9 +141,14 @@ def _bounds(case: Case, settings: GateSettings) -> str | None:
         slack = 1e-9 * abs(p.value)
         if not low + slack < p.value < high - slack and p.status is not Status.PRIOR_DOMINATED:
             return f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]"
-    why = impossible_inertia([case.parameters[n].value for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack)
+    why = impossible_inertia([parameters[n].value for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack)
+    return f"impossible inertia: {why}" if why else None
+
+
+def _bounds(case: Case, settings: GateSettings) -> str | None:
+    why = implausible(case.parameters, settings)
     if why:
-        return f"impossible inertia: {why}"
+        return why
     if not 0.8 < case.thrust_ratio < 1.25:
         return f"b would give {case.thrust_ratio:.2f} times the thrust that the accelerometer felt"
     return None

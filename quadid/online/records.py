@@ -49,6 +49,8 @@ class OnlineSet:
         input_hash: SHA-256 of the windows and the seed that led here.
         approved_by: ``auto``, a person, or empty.
         check: the gate's check that decided.
+        mass: of the vehicle that the set rests on [kg]; NaN: not noted.
+        outdated: why a set in force is known to be out of date; empty: it is not known to be.
     """
 
     sequence: int
@@ -63,6 +65,8 @@ class OnlineSet:
     input_hash: str = ""
     approved_by: str = ""
     check: str = ""
+    mass: float = float("nan")
+    outdated: str = ""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,8 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
         "sequence": item.sequence, "state": item.state.value, "check": item.check, "reason": item.reason,
         "approved_by": item.approved_by, "start": number(item.start), "stop": number(item.stop),
         "samples": item.samples, "mse": number(item.mse), "mse_held_out": number(item.mse_held_out),
-        "input_hash": item.input_hash, "parameters": parameters_to_dict(item.parameters),
+        "input_hash": item.input_hash, "mass": number(item.mass), "outdated": item.outdated,
+        "parameters": parameters_to_dict(item.parameters),
     }  # fmt: skip
     if covariance:
         out["covariance"] = item.parameters.covariance.tolist()
@@ -63,6 +64,7 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
         int(data["sequence"]), SetState(data["state"]), str(data["reason"]), found,
         _float(data["start"]), _float(data["stop"]), int(data["samples"]), _float(data["mse"]),
         _float(data["mse_held_out"]), str(data["input_hash"]), str(data["approved_by"]), str(data["check"]),
+        _float(data.get("mass")), str(data.get("outdated", "")),
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from quadid.online.records import OnlineSet
 from quadid.window import Sample
 from quadid_node.mavlink_decode import MavlinkDecoder
 from quadid_node.mavlink_wire import LinkError, Wire, dialect
-from quadid_node.service import Output
+from quadid_node.publication import Output
 
 COMPONENT = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER."""

@@ -29,9 +29,10 @@ from quadid_node.neighbours import Neighbours, Offer
 from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
 from quadid_node.polling import PollingNode
 from quadid_node.presets import Source, source
+from quadid_node.publication import Output
 from quadid_node.recorder import WRITTEN, Beginning, Recorder
 from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
-from quadid_node.service import Output, Service
+from quadid_node.service import Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker, with_ground
@@ -249,9 +250,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         yield
         self._neighbours.look(deaf)
         yield
-        force = service.session.active_set.in_force
-        if speaker.step(self._active) and force is not None:
-            self._put(Publish("parameters", force))
+        if speaker.step(self._active) and service.published is not None:
+            self._put(Publish("parameters", service.published))
         self._neighbours.note(speaker.ours, speaker.problem)
         yield
         health = service.health()
@@ -274,7 +274,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 if problem:
                     return SetParametersResult(successful=False, reason=problem)
                 if change.name == "approval":
-                    self._service.session.active_set.approval = change.value
+                    self._service.decide_approval(change.value)
         return SetParametersResult(successful=True)
 
     def _fit_now(self, request: Any, response: Any) -> Any:

@@ -96,7 +96,9 @@ def read_beginning(path: Path) -> Beginning | None:
         return None
     try:
         left = json.loads(found["restored"])
-        restored = Restored(_set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]))
+        restored = Restored(
+            _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", ""))
+        )
         settings = SessionSettings.model_validate_json(found["settings"])
         return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
     except (KeyError, TypeError, ValueError, QuadidError) as error:
@@ -108,6 +110,7 @@ def _to_strings(beginning: Beginning) -> Mapping[str, str]:
     restored = {
         "item": set_to_dict(left.item) if left.item is not None else None,
         "next_sequence": left.next_sequence,
+        "approval": left.approval,
         "baseline": set_to_dict(left.baseline) if left.baseline is not None else None,
     }
     return {

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from quadid_node.mavlink_link import MavlinkLink
-from quadid_node.service import Health, Output, Service
+from quadid_node.publication import Output
+from quadid_node.service import Health, Service
 
 IDLE = 0.005
 """Pause when nothing arrives [s]."""

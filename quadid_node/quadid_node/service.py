@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import math
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
 from quadid.online.outbox import Action
-from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+from quadid.online.records import Diagnosed, Event, OnlineSet, SetState
 from quadid.online.status import SessionStatus
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
+from quadid_node.publication import Output, Publication
 from quadid_node.store import Restored, Store
 from quadid_node.worker import Trouble, Worker
 
-Output = Publish | Diagnosed | Event
 SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
 """A channel that was there and is silent for this long [s] is worth a warning, an error."""
+DECISION_SECONDS = 2.0
+"""How long a person's decision waits to be on the disk before it is answered [s]."""
 RATE_MEMORY = 2.0
 """Time over which data rates are measured [s]."""
 
@@ -59,6 +62,7 @@ class Service:
         vehicle: as given.
         restored: what an earlier run had left.
         session: the session.
+        boot_id: of this run; with a set's number it never repeats, whatever becomes of history and clock.
     """
 
     def __init__(
@@ -76,9 +80,12 @@ class Service:
             restored: what an earlier run had left; default: what the history says.
         """
         if restored is None:
-            restored = store.restore() if store is not None else Restored(None, 1)
-        self.vehicle, self.restored = vehicle, restored
+            restored = store.restore(settings.gate) if store is not None else Restored(None, 1)
+        self.vehicle, self.restored, self.boot_id = vehicle, restored, uuid.uuid4().hex
         self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
+        self._configured = self._approval = settings.gate.approval
+        self._publication = Publication(store)
+        self._decided: list[Output] = []
         self._worker, self._store, self._clock = worker, store, clock
         self._studying: Worker | None = None
         self._arrived: dict[str, float] = {}
@@ -87,6 +94,16 @@ class Service:
         self._noted = 0
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
+
+        if restored.approval not in ("", self._configured):
+            self.session.active_set.approval = self._approval = restored.approval
+            text = f"approval is {restored.approval}, as a person decided in an earlier run, not {self._configured}"
+            self._decided = self._journalled([Event(math.nan, "warning", "approval", text)])
+
+    @property
+    def published(self) -> OnlineSet | None:
+        """The set that the parameter topic holds: in force, and on the disk where a history is kept."""
+        return self._publication.in_force
 
     @property
     def ready(self) -> bool:
@@ -120,7 +137,7 @@ class Service:
             seconds: no piece of the session's work begins later than this [s]; one always does.
 
         Returns:
-            What to publish and tell, already in the history.
+            What to publish and tell; numbered sets are on the disk by then, or come with a later step.
         """
         outputs, begin = list[Output](), self._clock()
         for piece in self.pieces():
@@ -170,17 +187,39 @@ class Service:
         return [*outputs, *self._history_trouble()]
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:
+        """Gives everything to the history; returns what may be published now."""
         for output in outputs:
             self._journal(output)
-        return outputs
+        approval = self.session.active_set.approval
+        if approval != self._approval:
+            self._approval = approval
+            if self._store is not None:
+                self._store.decision(self._configured, approval)
+        decided, self._decided = self._decided, []
+        return [*decided, *self._publication.take(outputs)]
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
-        """A person approves the set that waits; what follows comes with the next `step`."""
-        return self.session.approve(by, sequence)
+        """A person approves a set that waits; what follows comes with the next `step`."""
+        return self._on_disk(self.session.approve(by, sequence))
 
     def roll_back(self, by: str) -> Answer:
         """A person takes the set in force back; what follows comes with the next `step`."""
-        return self.session.roll_back(by)
+        return self._on_disk(self.session.roll_back(by))
+
+    def decide_approval(self, approval: str) -> Answer:
+        """A person makes approval auto or manual from now on, after a restart too."""
+        self.session.active_set.approval = approval
+        return self._on_disk(Answer(True, f"approval is {approval} from now on"))
+
+    def _on_disk(self, answer: Answer) -> Answer:
+        """The answer to a person's decision, once that is on the disk."""
+        if not answer.done:
+            return answer
+        self._decided = self._journalled(self._carried_out(self.session.poll(0)))
+        if self._store is None or self._store.flush(DECISION_SECONDS):
+            return answer
+        text = f"{answer.text}; NOT on the disk, and published only when it is: {self._store.problem or 'slow disk'}"
+        return replace(answer, text=text)
 
     def health(self) -> Health:
         """What a monitor wants to know."""
@@ -237,5 +276,5 @@ class Service:
         assert self._store is not None
         if topic == "candidate":
             self._store.candidate(item)
-        elif item.state.value != "stale":
+        if topic == "parameters" or item.state is SetState.PENDING:
             self._store.numbered(item)

@@ -1,16 +1,34 @@
-"""The history file: how it is opened, and how it is read without touching it."""
+"""The history file: how it is made, opened, set aside when damaged, and read without touching it."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import sqlite3
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from quadid.errors import QuadidError
 
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS sets (
+    vehicle TEXT NOT NULL, sequence INTEGER NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
+    approved_by TEXT NOT NULL, stop REAL, wall REAL NOT NULL, data TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS sets_by_number ON sets (vehicle, sequence);
+CREATE TABLE IF NOT EXISTS candidates (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, state TEXT NOT NULL, gate TEXT NOT NULL, reason TEXT NOT NULL,
+    stop REAL, wall REAL NOT NULL, data TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL, text TEXT NOT NULL,
+    t REAL, wall REAL NOT NULL, data TEXT);
+CREATE TABLE IF NOT EXISTS decisions (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, configured TEXT NOT NULL, approval TEXT NOT NULL,
+    wall REAL NOT NULL);
+"""
+VERSION = 2
+"""2: stamps are UNIX seconds; before, seconds of a day."""
 BUSY_SECONDS = 5.0
 """How long another program's lock is waited for [s]."""
 
@@ -76,3 +94,46 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     db.execute("PRAGMA journal_mode = WAL")
     db.execute("PRAGMA synchronous = FULL")
     return db
+
+
+def make_tables(path: Path) -> None:
+    """Makes what tables are missing; raises sqlite3.Error for a file that is damaged or cannot be written now."""
+    with contextlib.closing(connect(path)) as db:
+        if db.execute("PRAGMA quick_check(1)").fetchone()[0] != "ok":
+            raise sqlite3.DatabaseError("malformed: its pages do not add up")
+        db.executescript(SCHEMA)
+        db.execute(f"PRAGMA user_version = {VERSION}")
+        db.commit()
+
+
+def begin_anew(path: Path, error: sqlite3.Error) -> str:
+    """Makes the tables of a file found damaged; sets it aside under another name where it really is.
+
+    Returns:
+        What was done, or empty when the file had only been removed.
+    """
+    try:
+        make_tables(path)  # the file was removed, or another service has dealt with it
+    except sqlite3.DatabaseError as found:
+        if not is_damage(found):
+            raise
+        return set_aside(path, error)
+    return ""
+
+
+def set_aside(path: Path, error: sqlite3.Error) -> str:
+    """Gives a damaged file another name and makes a new one; returns what was done."""
+    name = f"{path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}"
+    taken = sum(p.name.startswith(name) for p in path.parent.iterdir())
+    aside = path.with_name(f"{name}-{taken}" if taken else name)
+    for suffix in ("", "-wal", "-shm"):
+        with contextlib.suppress(FileNotFoundError):
+            Path(f"{path}{suffix}").rename(f"{aside}{suffix}")
+    make_tables(path)
+    return f"the history was damaged ({error}); it was set aside as {aside.name}, a new one begins"
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Whether an error says that the file is no sound database, not that it cannot be reached now."""
+    told = str(error)
+    return "malformed" in told or "not a database" in told or "no such table" in told

@@ -25,7 +25,8 @@ import zenoh
 from quadid.errors import QuadidError
 from quadid.online import Diagnosed, Publish
 from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
-from quadid_node.service import Health, Output, Service
+from quadid_node.publication import Output
+from quadid_node.service import Health, Service
 
 ROOT = "quadid"
 KINDS = ("parameters", "candidate", "diagnosis", "health")

@@ -76,4 +76,16 @@ FAULTS: dict[int, Fault] = {
         "soak: 24 h equivalent at accelerated time, and 1 h in real time in a `make soak`",
         "flat memory, flat files, flat latency, no lost sample",
     ),
+    23: Fault(
+        "kill -9 before, at, after the commit of a set; disk full; history lost, damaged, none",
+        "nothing is published that is not on the disk, and said; a number never repeats",
+    ),
+    24: Fault(
+        "restart after a rollback, an approval, a change of the mode",
+        "a person's decision is on the disk before it is answered, and stands after the restart",
+    ),
+    25: Fault(
+        "history with an impossible set, used-up numbers, odd bytes; held exclusively at the start",
+        "not taken up, set aside, left out and said; the writer lives on; the start waits, then refuses",
+    ),
 }

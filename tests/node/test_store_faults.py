@@ -13,7 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from quadid_node.service import Output, Service
+from quadid_node.publication import Output
+from quadid_node.service import Service
 from quadid_node.store import Store
 from quadid_node.store_file import read_history
 from quadid_node.worker import InlineWorker

@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from quadid.online.active_set import ActiveSet, Answer
+from quadid.online.active_set import MOST_HELD, ActiveSet, Answer
 from quadid.online.records import Event, Publish, SetState
 from tests.online.test_gate import TRUE, online_set
 
@@ -43,8 +43,9 @@ def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
     ledger = ActiveSet("auto", restored=online_set(TRUE), next_sequence=9)
     assert ledger.in_force is not None
     assert ledger.in_force.state is SetState.STALE
+    assert ledger.in_force.sequence == 9, "a number of its own, so that who knows the set learns that it is stale"
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
-    assert ledger.in_force.sequence == 9
+    assert ledger.in_force.sequence == 10
     assert not ledger.roll_back(31.0, "bob").done, "a stale set is nothing to return to"
 
 
@@ -67,7 +68,7 @@ def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
     assert ledger.approve(1.0, "ann") == Answer(False, "nothing waits for approval")
     assert ledger.roll_back(1.0, "ann") == Answer(False, "there is no earlier set to return to")
     waits = ledger.hold(replace(online_set(TRUE), reason="3 windows agree"), 30.0)
-    assert ledger.approve(1.0, "ann", 7) == Answer(False, "set 7 is not the one that waits (1)")
+    assert ledger.approve(1.0, "ann", 7) == Answer(False, "set 7 does not wait for approval; the newest that does is 1")
     told = ledger.approve(31.0, "ann")
     first = ledger.in_force
     assert first is not None
@@ -102,7 +103,7 @@ def test_a_restored_set_says_where_it_is_from_and_is_the_baseline() -> None:
     assert ledger.baseline is ledger.in_force
     assert (ledger.seen, ledger.watched) == (-math.inf, 0.0)
     ledger.accept(online_set(TRUE), "auto", 30.0, 30.0)
-    assert ledger.in_force.sequence == 2, "one more than the restored set's"
+    assert ledger.in_force.sequence == 3, "the restored set's is 2: one more than it had"
     approved = replace(online_set(TRUE), sequence=5)
     assert ActiveSet("auto", restored=online_set(TRUE), baseline=approved).baseline is approved
 
@@ -118,14 +119,25 @@ def test_creeping_is_measured_from_the_first_set_or_the_last_one_a_person_approv
     assert ledger.baseline is ledger.in_force
 
 
-def test_a_newer_set_that_waits_takes_the_number_of_the_older_one() -> None:
+def test_a_number_stands_for_one_waiting_set_for_ever() -> None:
     ledger = ActiveSet("manual")
     older, newer = (ledger.hold(online_set({**TRUE, "b": b}), 30.0) for b in (2.3e-5, 2.4e-5))
-    assert (older.sequence, newer.sequence) == (1, 1)
+    assert (older.sequence, newer.sequence) == (1, 2)
     assert ledger.pending is newer
     assert newer.state is SetState.PENDING
-    ledger.accept(online_set(TRUE), "auto", 31.0, 31.0)
-    assert ledger.hold(online_set(TRUE), 32.0).sequence == 3
+    assert ledger.approve(31.0, "ann", 1).done, "the one that the person saw, though a newer one waits"
+    assert ledger.in_force is not None
+    assert ledger.in_force.parameters["b"].value == 2.3e-5
+    assert (ledger.in_force.sequence, ledger.pending) == (3, None)
+    assert not ledger.approve(31.0, "ann", 2).done, "it has not waited since"
+
+
+def test_the_sets_of_the_last_minute_can_be_approved() -> None:
+    ledger = ActiveSet("manual")
+    for k in range(MOST_HELD + 1):
+        ledger.hold(online_set(TRUE), float(k))
+    assert not ledger.approve(99.0, "ann", 1).done
+    assert ledger.approve(99.0, "ann", 2).done
 
 
 def test_twenty_sets_can_be_taken_back() -> None:
@@ -150,11 +162,13 @@ class Machine(RuleBasedStateMachine):
     def start(self, approval: str) -> None:
         self.ledger = ActiveSet(approval)
         self.numbers: list[int] = []
+        self.held: set[int] = set()
         self.t = 0.0
 
     def publish(self, actions: tuple[object, ...] | list[object]) -> None:
         for action in actions:
             if isinstance(action, Publish):
+                self.held.clear()
                 assert action.item.approved_by
                 assert action.item.state in (SetState.ACCEPTED, SetState.ROLLED_BACK)
                 self.numbers.append(action.item.sequence)
@@ -165,13 +179,13 @@ class Machine(RuleBasedStateMachine):
         if self.ledger.approval == "auto":
             self.publish(list(self.ledger.accept(online_set(TRUE), "auto", self.t, self.t)))
         else:
-            self.ledger.hold(online_set(TRUE), self.t)
+            self.held.add(self.ledger.hold(online_set(TRUE), self.t).sequence)
 
     @rule(number=st.none() | st.integers(0, 30))
     def approve(self, number: int | None) -> None:
-        waiting = self.ledger.pending
+        waiting = self.held and (number is None or number in self.held)
         answer = self.ledger.approve(self.t, "ann", number)
-        assert answer.done == (waiting is not None and number in (None, waiting.sequence))
+        assert answer.done == bool(waiting)
         self.publish(answer.actions)
 
     @rule(by=st.sampled_from(["auto", "bob"]))

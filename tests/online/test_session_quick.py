@@ -266,7 +266,7 @@ def test_a_window_that_reveals_nothing_is_named_and_nothing_is_published() -> No
 def test_a_restored_set_holds_as_stale_until_flight_confirms_it() -> None:
     session = Session(PELICAN, QUICK, restored=EARLIER, next_sequence=12)
     (stale,) = published(session.poll())
-    assert (stale.sequence, stale.state) == (7, SetState.STALE)
+    assert (stale.sequence, stale.state) == (12, SetState.STALE)
     assert "of yesterday" in stale.reason
     status = session.status()
     assert (status.in_force, status.stale) == (7, True)

@@ -1,0 +1,73 @@
+"""On the disk before on the wire: numbered sets, and what is said of them, wait until their row is committed."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+
+Output = Publish | Diagnosed | Event
+OF_SETS = ("accepted", "rollback")
+"""Kinds of events that say which set is in force."""
+MOST_WAITING = 64
+"""Outputs that wait for the disk; beyond, the oldest are never published, but the newest set in force always is."""
+
+
+class Disk(Protocol):
+    """What is asked of the history."""
+
+    def written(self, number: int) -> bool:
+        """Whether the set of that number is on the disk."""
+
+
+class Publication:
+    """Hands outputs out, in order, once they may be published.
+
+    Attributes:
+        in_force: the set that was handed out last for the parameter topic; None before the first.
+    """
+
+    def __init__(self, disk: Disk | None) -> None:
+        """Asks `disk`; without one nothing waits."""
+        self._disk = disk
+        self._waiting: list[Output] = []
+        self.in_force: OnlineSet | None = None
+
+    @property
+    def waiting(self) -> int:
+        """How many outputs wait for the disk."""
+        return len(self._waiting)
+
+    def take(self, outputs: list[Output]) -> list[Output]:
+        """Takes further outputs; returns those that may be published now."""
+        free = list[Output]()
+        for output in outputs:
+            (self._waiting if self._waits(output) else free).append(output)
+        out = [*self._released(), *free]
+        self._forget_oldest()
+        for output in out:
+            if isinstance(output, Publish) and output.topic == "parameters":
+                self.in_force = output.item
+        return out
+
+    def _waits(self, output: Output) -> bool:
+        if self._disk is None:
+            return False
+        if isinstance(output, Publish):
+            return output.item.sequence > 0
+        return isinstance(output, Event) and output.kind in OF_SETS and bool(self._waiting)
+
+    def _forget_oldest(self) -> None:
+        ours = [o for o in self._waiting if isinstance(o, Publish) and o.topic == "parameters"]
+        while len(self._waiting) > MOST_WAITING:
+            self._waiting.remove(next(o for o in self._waiting if not any(o is newest for newest in ours[-1:])))
+
+    def _released(self) -> list[Output]:
+        """What waits up to the first set that is not on the disk."""
+        out: list[Output] = []
+        while self._waiting and (self._disk is None or self._on_disk(self._waiting[0])):
+            out.append(self._waiting.pop(0))
+        return out
+
+    def _on_disk(self, output: Output) -> bool:
+        return not isinstance(output, Publish) or (self._disk is not None and self._disk.written(output.item.sequence))

@@ -1,0 +1,339 @@
+"""On the disk before on the wire: what was published has its row, and its number is never given again."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from quadid_node.publication import MOST_WAITING, Output, Publication
+from quadid_node.service import Service
+from quadid_node.store import LARGEST_NUMBER, Restored, Store
+from quadid_node.store_file import StoreError, connect, read_history
+from quadid_node.worker import InlineWorker
+
+from quadid.online import SessionSettings, SetState
+from quadid.online.records import Event, OnlineSet, Publish
+from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
+from tests.online.test_gate import TRUE, online_set
+
+ROOT = Path(__file__).resolve().parents[2]
+PELICAN = Vehicle.shipped("pelican")
+SETTINGS = SessionSettings(window=5.0, diagnose=0.0)
+SERVICE = """
+import os, signal, sys, time
+from pathlib import Path
+from quadid.online import SessionSettings
+from quadid.online.records import Publish
+from quadid.vehicle import Vehicle
+from quadid_node import history_writer
+from quadid_node.service import Service
+from quadid_node.store import Store
+from quadid_node.worker import InlineWorker
+from tests.online.test_gate import TRUE, online_set
+
+path, die, after = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+store = Store(path, "pelican")
+service = Service(Vehicle.shipped("pelican"), SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
+commit, commits = history_writer.HistoryWriter._commit, [0]
+
+def dying(self, batch):
+    commits[0] += 1
+    if die == "before" and commits[0] == after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    out = commit(self, batch)
+    if die == "between" and commits[0] == after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return out
+
+history_writer.HistoryWriter._commit = dying
+published = 0
+print("going", flush=True)
+for k in range(10**6):
+    service.session._outbox.act(*service.session.active_set.accept(online_set(TRUE), "auto", float(k), float(k)))
+    time.sleep(0.003)
+    for output in service.step():
+        if isinstance(output, Publish) and output.topic == "parameters":
+            print(output.item.sequence, flush=True)
+            published += 1
+            if die == "wire" and published == after:
+                os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def numbers_of(path: Path) -> list[int]:
+    return [s["sequence"] for s in read_history(path, "pelican")["sets"]]
+
+
+def killed(path: Path, die: str, after: int) -> list[int]:
+    """Runs a service that accepts set after set and is killed with -9; returns the numbers that it published."""
+    command = [sys.executable, "-c", SERVICE, str(path), die, str(after)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "going\n"
+        if die == "outside":
+            published = [int(child.stdout.readline()) for _ in range(after)]
+            child.send_signal(signal.SIGKILL)
+        else:
+            published = []
+        published += [int(line) for line in child.stdout if line.endswith("\n")]
+        assert child.wait() == -signal.SIGKILL
+    return published
+
+
+@pytest.mark.parametrize("die", ["before", "between", "wire", "outside"])
+def test_a_set_that_was_published_has_its_row_and_its_number_is_never_given_again(
+    tmp_path: Path, die: str, happened: Happened
+) -> None:
+    path, given, kills = tmp_path / "h.sqlite", list[int](), 3
+    for k in range(kills):
+        published = killed(path, die, 2 + 3 * k)
+        rows = numbers_of(path) if path.is_file() else []
+        assert set(published) <= set(rows), "on the wire, and not on the disk"
+        assert not set(published) & set(given), "a number twice"
+        given += published
+        assert len(rows) == len(set(rows))
+    assert given == sorted(given)
+    happened(23, f"{kills} kills with -9, {die}: {len(given)} sets published, every one has its row, no number twice")
+
+
+def service_with(store: Store | None) -> Service:
+    return Service(PELICAN, SETTINGS, InlineWorker(), store)
+
+
+def accept(service: Service, **changes: float) -> OnlineSet:
+    session = service.session
+    session._outbox.act(*session.active_set.accept(online_set({**TRUE, **changes}), "auto", 1.0, 1.0))
+    assert session.active_set.in_force is not None
+    return session.active_set.in_force
+
+
+def said(service: Service, seconds: float = 3.0) -> Iterator[Output]:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        yield from service.step()
+        time.sleep(0.01)
+
+
+def published(service: Service, number: int, seconds: float = 10.0) -> bool:
+    return any(isinstance(o, Publish) and o.item.sequence == number for o in said_until(service, number, seconds))
+
+
+def said_until(service: Service, number: int, seconds: float) -> Iterator[Output]:
+    for output in said(service, seconds):
+        yield output
+        if isinstance(output, Publish) and output.item.sequence == number:
+            return
+
+
+def test_nothing_is_published_that_a_full_disk_did_not_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    import quadid_node.history_writer as writing
+
+    store = Store(tmp_path / "h.sqlite", "pelican")
+    service = service_with(store)
+    first = accept(service)
+    assert published(service, first.sequence)
+
+    def full(path: Path, read_only: bool = False) -> sqlite3.Connection:
+        db = connect(path, read_only)
+        db.execute("PRAGMA max_page_count = 1")
+        return db
+
+    monkeypatch.setattr(writing, "connect", full)
+    held = [accept(service) for _ in range(2 * MOST_WAITING)]
+    outputs = list(said(service, 1.5))
+    assert not [o for o in outputs if isinstance(o, Publish)]
+    assert any(isinstance(o, Event) and o.kind == "history" and "full" in o.text for o in outputs)
+    assert service.published is not None
+    assert service.published.sequence == first.sequence, "who asks is told what is on the wire"
+    monkeypatch.setattr(writing, "connect", connect)
+    assert published(service, held[-1].sequence), "with room again the newest one comes"
+    store.close()
+    assert numbers_of(tmp_path / "h.sqlite") == [first.sequence, *(h.sequence for h in held)]
+    happened(23, "disk full: 128 sets accepted, none published, said as ERROR; with room again the newest came")
+
+
+def test_numbers_do_not_begin_anew_after_a_lost_history_or_without_one(tmp_path: Path, happened: Happened) -> None:
+    path, given = tmp_path / "h.sqlite", list[int]()
+    for loss in ("none", "deleted", "damaged", "kept"):
+        store = Store(path, "pelican")
+        service = service_with(store)
+        given.append(accept(service).sequence)
+        store.close()
+        if loss == "deleted":
+            for found in tmp_path.glob("h.sqlite*"):
+                found.unlink()
+        elif loss == "damaged":
+            path.write_bytes(b"no history" * 1000)
+        time.sleep(0.002)
+    assert given == sorted(set(given))
+    ids = {service_with(None).boot_id for _ in range(3)}
+    assert len(ids) == 3
+    happened(23, "history kept, deleted, damaged between runs: numbers rise on; each run has a boot id of its own")
+
+
+def test_a_restored_set_has_a_row_and_a_new_number(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    before = accept(first := service_with(store))
+    first.step()
+    store.close()
+    store = Store(path, "pelican")
+    service = service_with(store)
+    stale = service.session.active_set.in_force
+    assert stale is not None
+    assert stale.state is SetState.STALE
+    assert stale.sequence > before.sequence, "a consumer that has the set learns that it is stale"
+    assert published(service, stale.sequence)
+    store.close()
+    assert numbers_of(path) == [before.sequence, stale.sequence]
+
+
+def test_a_decision_of_a_person_outlives_the_service(tmp_path: Path, happened: Happened) -> None:
+    path = tmp_path / "h.sqlite"
+
+    def next_run() -> Service:
+        return service_with(Store(path, "pelican"))
+
+    service = next_run()
+    accept(service)
+    accept(service, b=2.4e-5)
+    answer = service.roll_back("bob")
+    assert answer.done
+    assert "NOT on the disk" not in answer.text
+    rolled = numbers_of(path)[-1]
+    assert service.session.active_set.approval == "manual"
+    os_kill_like_end(service)
+    again = next_run()
+    assert again.session.active_set.approval == "manual", "a rollback asks for approval from then on, a restart or not"
+    assert any(isinstance(o, Event) and o.kind == "approval" for o in said(again, 0.2))
+    force = again.session.active_set.in_force
+    assert force is not None
+    assert force.parameters["b"].value == TRUE["b"]
+    held = again.session.active_set.hold(online_set(TRUE), 1.0)
+    assert again.approve("ann", held.sequence).done
+    assert numbers_of(path)[-1] > rolled, "approved: on the disk before the answer"
+    assert again.decide_approval("auto").done
+    os_kill_like_end(again)
+    last = next_run()
+    assert last.session.active_set.approval == "auto"
+    assert last.session.active_set.baseline is not None
+    assert last.session.active_set.baseline.approved_by == "ann"
+    os_kill_like_end(last)
+    happened(24, "rollback, approval and mode each on the disk before the answer, and there after a restart")
+
+
+def os_kill_like_end(service: Service) -> None:
+    """Ends a service without what an orderly end writes: only the lock is let go, as the kernel does."""
+    store = service._store
+    assert store is not None
+    assert store._lock is not None
+    store._lock.close()
+
+
+def test_a_waiting_set_is_on_the_disk_before_its_number_is_told(tmp_path: Path) -> None:
+    service = service_with(Store(tmp_path / "h.sqlite", "pelican"))
+    held = service.session.active_set.hold(online_set(TRUE), 1.0)
+    service.session._outbox.act(Publish("candidate", held))
+    assert published(service, held.sequence)
+    assert numbers_of(tmp_path / "h.sqlite") == [held.sequence]
+    service.close()
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf])
+def test_a_restored_set_is_checked_as_a_fresh_estimate(tmp_path: Path, value: float, happened: Happened) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=7, approved_by="auto"))
+    store.close()
+    with sqlite3.connect(path) as db:
+        (data,) = db.execute("SELECT data FROM sets").fetchone()
+        text = "null" if not math.isfinite(value) else repr(value)
+        db.execute("UPDATE sets SET data = ?", (data.replace(f'"value": {TRUE["b"]!r}', f'"value": {text}', 1),))
+    store = Store(path, "pelican")
+    service = service_with(store)
+    assert service.session.active_set.in_force is None
+    outputs = list(said(service, 0.2))
+    assert not [o for o in outputs if isinstance(o, Publish)]
+    assert any(isinstance(o, Event) and "is not taken up again" in o.text for o in outputs)
+    store.close()
+    happened(25, f"b = {value} written into the stored set: not taken up, not published, said")
+
+
+def test_the_writer_outlives_what_no_history_can_hold(tmp_path: Path, happened: Happened) -> None:
+    store = Store(tmp_path / "h.sqlite", "pelican")
+    store.event(Event(1.0, "info", "test", "odd \udcff bytes"))
+    store.numbered(replace(online_set(TRUE), sequence=2**63 + 5, approved_by="auto"))
+    store.event(Event(2.0, "info", "test", "afterwards"))
+    assert store.flush(10.0)
+    store.close()
+    found = read_history(tmp_path / "h.sqlite", "pelican", events=10)
+    assert [e["text"] for e in found["events"]] == ["afterwards"]
+    assert sum("no history can hold" in note for note in store.notes) == 2
+    with pytest.raises(StoreError, match="no text"):
+        Store(tmp_path / "h.sqlite", "quad\udcff")
+    happened(25, "an entry with odd bytes and one with number 2^63 + 5: left out, said; the rest is written")
+
+
+@pytest.mark.parametrize("number", [2**63 - 1, LARGEST_NUMBER])
+def test_a_history_whose_numbers_are_used_up_is_set_aside(tmp_path: Path, number: int) -> None:
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=number, approved_by="auto"))
+    store.close()
+    store = Store(path, "pelican")
+    assert "set aside" in store.notes[0]
+    assert store.restore().next_sequence < LARGEST_NUMBER
+    store.numbered(replace(online_set(TRUE), sequence=5, approved_by="auto"))
+    store.close()
+    assert numbers_of(path) == [5]
+
+
+def test_a_history_held_at_the_start_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    import quadid_node.store_file as files
+
+    path = tmp_path / "h.sqlite"
+    Store(path, "pelican").close()
+    monkeypatch.setattr(files, "BUSY_SECONDS", 0.3)
+    holder = sqlite3.connect(path)
+    holder.execute("PRAGMA journal_mode = DELETE")
+    holder.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(StoreError, match="another program holds"):
+        Store(path, "pelican")
+    holder.rollback()
+    holder.close()
+    Store(path, "pelican").close()
+    happened(25, "history held exclusively at the start: waited for, then refused with the fix; no number is given")
+
+
+def test_outputs_that_need_no_row_wait_for_nothing() -> None:
+    class Never:
+        def written(self, number: int) -> bool:
+            return False
+
+    publication = Publication(Never())
+    refused = Publish("candidate", replace(online_set(TRUE, SetState.REJECTED), sequence=0))
+    warning = Event(1.0, "warning", "change", "thrust stepped")
+    assert publication.take([refused, warning]) == [refused, warning]
+    numbered = Publish("parameters", online_set(TRUE))
+    told = Event(1.0, "info", "accepted", "set 1 in force")
+    assert publication.take([numbered, told, warning]) == [warning]
+    assert publication.waiting == 2
+    assert Publication(None).take([numbered, told]) == [numbered, told]
+
+
+def test_a_service_without_history_begins_where_it_is_told() -> None:
+    service = Service(PELICAN, SETTINGS, InlineWorker(), None, restored=Restored(None, 41))
+    assert accept(service).sequence == 41
