@@ -14,9 +14,9 @@ from quadid_cli.options import JsonTarget, Preset, Seed, VehicleName
 
 if TYPE_CHECKING:
     from quadid_node.messages import Clock
-    from quadid_node.recorder import Beginning
     from quadid_node.publication import Output
-from quadid_node.service import Service
+    from quadid_node.recorder import Beginning
+    from quadid_node.service import Service
 
     from quadid.window import Recording, Sample
     from quadid.workflow.progress import Advance

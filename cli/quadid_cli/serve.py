@@ -14,7 +14,7 @@ from quadid_cli.options import JsonTarget, Seed, VehicleName
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
     from quadid_node.publication import Output
-from quadid_node.service import Health, Service
+    from quadid_node.service import Health, Service
     from rich.console import Console
 
 SAY_EVERY = 10.0

@@ -83,7 +83,8 @@ class Service:
             restored = store.restore(settings.gate) if store is not None else Restored(None, 1)
         self.vehicle, self.restored, self.boot_id = vehicle, restored, uuid.uuid4().hex
         self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
-        self._configured = self._approval = settings.gate.approval
+        self._configured: str = settings.gate.approval
+        self._approval: str = self._configured
         self._publication = Publication(store)
         self._decided: list[Output] = []
         self._worker, self._store, self._clock = worker, store, clock

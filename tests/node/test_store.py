@@ -43,8 +43,9 @@ def test_a_set_survives_the_round_trip_bit_for_bit() -> None:
     assert back.parameters.values.tobytes() == item.parameters.values.tobytes()
     assert back.parameters.covariance.tobytes() == item.parameters.covariance.tobytes()
     assert np.isnan(back.mse)
-    numbers = {"mse": 0.0, "mse_held_out": 0.0, "mass": 1.3}
-    assert replace(back, parameters=item.parameters, **numbers) == replace(item, **numbers)
+    assert replace(back, parameters=item.parameters, mse=0.0, mse_held_out=0.0, mass=1.3) == replace(
+        item, mse=0.0, mse_held_out=0.0, mass=1.3
+    )
 
 
 def test_everything_is_there_after_a_restart(tmp_path: Path) -> None:

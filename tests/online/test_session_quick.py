@@ -269,12 +269,12 @@ def test_a_restored_set_holds_as_stale_until_flight_confirms_it() -> None:
     assert (stale.sequence, stale.state) == (12, SetState.STALE)
     assert "of yesterday" in stale.reason
     status = session.status()
-    assert (status.in_force, status.stale) == (7, True)
+    assert (status.in_force, status.stale) == (12, True)
     actions = works(session, between(FLIGHT, 0.0, 9.7), tells())
     assert fits(actions)[0].theta[:6] == pytest.approx(EARLIER.parameters.values), "the search starts there"
     (confirmed,) = published(actions)
-    assert (confirmed.sequence, confirmed.state, confirmed.stop) == (12, SetState.ACCEPTED, 8.0)
-    assert (session.status().in_force, session.status().stale) == (12, False)
+    assert (confirmed.sequence, confirmed.state, confirmed.stop) == (13, SetState.ACCEPTED, 8.0)
+    assert (session.status().in_force, session.status().stale) == (13, False)
 
 
 def test_creeping_is_measured_from_the_baseline_of_earlier_runs() -> None:
