@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.intersample import follow_feedback
 from quadid.resample import COINCIDENT, sample_period
-from quadid.resampling_plan import REQUIRED, Plan, make_plan, on_grid, reach
+from quadid.resampling_plan import REQUIRED, Plan, holes, make_plan, on_grid, reach
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
@@ -44,6 +44,7 @@ class GridReport:
         rotor_source: where the rotor speeds came from.
         rotor_rate: their own rate in the log [Hz].
         filtered: whether the channels were low-passed for the grid.
+        bridged: number of holes in rotor signal, gyro and accelerometer too short for a gap, read between neighbours.
         notes: sentences for people.
     """
 
@@ -57,6 +58,7 @@ class GridReport:
     rotor_source: str
     rotor_rate: float
     filtered: bool
+    bridged: int = 0
     notes: tuple[str, ...] = ()
 
 
@@ -145,6 +147,7 @@ def _report(
         rotor_source=rotor.source,
         rotor_rate=1.0 / sample_period(rotor.t),
         filtered=plan.filtered,
+        bridged=sum(holes(plan.tracks[name].t, plan.step) for name in REQUIRED if name in plan.tracks),
         notes=(*rotor.notes, *_notes(plan, rotor.t)),
     )
 

@@ -25,12 +25,12 @@ from quadid.window import Recording, Sampling
 
 FloatArray = NDArray[np.float64]
 
-CSV_GAP = 1.5
-"""In a log that is a grid itself, a step longer than this many median steps is a gap."""
 GAP = 3.5
-"""In logs whose channels come each at its own pace, a step longer than this many periods is a gap."""
-_BRIDGED = 0.5
-"""There a step no longer than this fraction of the grid's is never a gap: hardly anything shows of it on the grid."""
+"""A step longer than this many median ones is a gap."""
+BRIDGED = 0.5
+"""A step no longer than this fraction of the grid's is never a gap: hardly anything shows of it on the grid."""
+HOLE = 1.5
+"""A step longer than this many median ones, and no gap, is a hole: it is bridged and counted."""
 _FAST = 0.77
 """A channel whose period is below this many grid steps must be low-passed before it is read on the grid."""
 REQUIRED = ("rotor_speed", "gyro", "accel")
@@ -84,19 +84,29 @@ def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling:
     own = periods.get("gyro", periods["rotor_speed"])
     step = round(own, 9) if rate is None else 1.0 / rate
     filtered = min(periods[n] for n in REQUIRED if n in raw) < _FAST * step
-    gap, bridged = (CSV_GAP, 0.0) if recording.format == "csv" else (GAP, _BRIDGED * step)
     tracks = {}
     for name, (times, values) in raw.items():
-        period, longest = periods[name], max(gap * median(np.diff(times)), bridged)
+        period, longest = periods[name], longest_step(times, step)
         if filtered and name in ("attitude", "velocity", "position", "gyro"):
             rows = fresh_rows(values)
             if len(rows) < len(times):
                 times, values = times[rows], values[rows]
                 period = sample_period(times)
-                longest = GAP * median(np.diff(times)) if len(times) > 1 else period  # stuck: there is no period
+                longest = longest_step(times, step) if len(times) > 1 else period  # stuck: there is no period
         cuts = tuple(split_stretches(times, longest, recording.breaks))
         tracks[name] = Track(times, values, period, cuts, name == "rotor_speed" and sampling == "held")
     return Plan(step, filtered, tracks, "instant" if filtered else sampling)
+
+
+def longest_step(t: FloatArray, grid_step: float) -> float:
+    """Returns the longest step [s] between samples at `t` that is no gap on a grid of `grid_step` [s]."""
+    return max(GAP * median(np.diff(t)), BRIDGED * grid_step)
+
+
+def holes(t: FloatArray, grid_step: float) -> int:
+    """Counts the lost samples that are bridged: steps longer than `HOLE` median ones that are no gap."""
+    steps = np.diff(t)
+    return int(np.count_nonzero((steps > HOLE * median(steps)) & (steps <= longest_step(t, grid_step))))
 
 
 def _distinct(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,15 +7,17 @@ from typing import Any
 
 from quadid.inspection.airborne import Spans, flying_spans
 from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
-from quadid.inspection.findings import ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
+from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
+from quadid.inspection.rotor_checks import rotor_speed_check
+from quadid.inspection.rotor_timing import rotor_timing_check
 from quadid.inspection.timing import channel_facts, timing_checks
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 
-__all__ = ["ChannelFacts", "Check", "Inspection", "Missing", "Outlook", "Verdict", "inspect"]
+__all__ = ["FATAL", "ChannelFacts", "Check", "Inspection", "Missing", "Outlook", "Verdict", "inspect"]
 
 
 def inspect(
@@ -53,9 +55,13 @@ def inspect(
 def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[Check]:
     """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
     lagged = lagged_motion(recording, vehicle, spans)
+    speeds = rotor_speed_check(recording, vehicle, spans)
+    if speeds.verdict is Verdict.ERROR:
+        return [speeds]
     hover, order = hover_check(recording, vehicle, spans), motor_order_check(lagged, vehicle)
-    checks = [hover, order]
-    if Verdict.ERROR not in (hover.verdict, order.verdict):
+    time = rotor_timing_check(recording, vehicle, spans)
+    checks = [speeds, hover, order, time]
+    if Verdict.ERROR not in (hover.verdict, order.verdict, time.verdict):
         mass = mass_check(recording, vehicle, spans, hover.numbers.get("b_from_hover"))
         checks += [check for check in (mass, geometry_check(lagged, vehicle)) if check is not None]
     return checks

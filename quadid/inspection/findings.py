@@ -9,6 +9,11 @@ from typing import Any
 
 from quadid.jsonable import jsonable
 
+FATAL = (
+    "gravity", "gyro_attitude", "velocity_attitude", "rotor_speed", "hover", "motor_order", "rotor_timing",
+)  # fmt: skip
+"""Checks whose error means that nothing may be fitted to the log."""
+
 
 class Verdict(StrEnum):
     """Outcome of one check."""
@@ -33,6 +38,7 @@ class ChannelFacts:
         jitter: standard deviation of the step over its median (gaps left out).
         gaps: steps longer than the gap limit.
         longest_gap: [s], 0 when there is none.
+        bridged: lost samples too few for a gap.
         repeated: fraction of rows equal to the row before.
         stuck: longest time without any change [s].
         saturated: samples at a limit that the channel hits several times.
@@ -49,6 +55,7 @@ class ChannelFacts:
     jitter: float
     gaps: int
     longest_gap: float
+    bridged: int
     repeated: float
     stuck: float
     saturated: int
@@ -60,7 +67,8 @@ class Check:
     """One question put to the data.
 
     Attributes:
-        name: what was asked: gravity, gyro_attitude, velocity_attitude, hover, motor_order, clock, timing.
+        name: what was asked: gravity, gyro_attitude, velocity_attitude, rotor_speed, hover, motor_order, rotor_timing,
+            geometry, mass, clock, timing.
         verdict: the answer.
         message: one sentence with numbers and units.
         fix: what to do, empty when nothing.

@@ -26,7 +26,7 @@ _MASS_OFF, _ARM_OFF = 0.08, 0.2
 """Relative differences that are told: of mass; of arm, whose effect slow motors weaken."""
 _TURNED = math.radians(20.0)
 _CLEAR = 0.1
-"""Share of the motion's variance that rotor torques must explain before geometry is judged by them."""
+"""Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
 
 
 def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
@@ -92,14 +92,16 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
         _map(squares @ np.column_stack([-place[:, 1], place[:, 0]]), motion[:, :2] * inertia)
         for squares, motion in lagged
     ]
-    share, a = max(fits, key=lambda fit: fit[0])
-    if share < _CLEAR:
+    share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
+    if float(np.min(share)) < _CLEAR:
+        axis = ("roll", "pitch")[int(np.argmin(share))]
         return Check(
-            name, Verdict.UNKNOWN, f"rotor torques explain only {share:.0%} of roll and pitch: too little to judge"
-        )
+            name, Verdict.UNKNOWN,
+            f"rotor torques explain only {np.min(share):.0%} of the {axis} motion: too little to judge positions",
+        )  # fmt: skip
     angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
     scale = 0.5 * math.hypot(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
-    numbers = {"turned_rad": angle, "explained": share}
+    numbers = {"turned_rad": angle, "explained": float(np.min(share))}
     if abs(angle) > _TURNED:
         degrees = math.degrees(angle)
         return Check(
@@ -109,11 +111,11 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     return _judge_scale(vehicle, scale, numbers)
 
 
-def _map(torque: FloatArray, answer: FloatArray) -> tuple[float, FloatArray]:
-    """Least-squares map (2, 2) from torque (n, 2) to answer (n, 2), and the share of variance it explains."""
+def _map(torque: FloatArray, answer: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least-squares map (2, 2) from torque (n, 2) to answer (n, 2), and the share of variance it explains per axis."""
     a = np.asarray(np.linalg.lstsq(torque, answer, rcond=None)[0], dtype=np.float64)
-    total = float(np.sum(answer**2))
-    return (1.0 - float(np.sum((answer - torque @ a) ** 2)) / total if total > 0.0 else 0.0), a
+    total = np.maximum(np.sum(answer**2, axis=0), 1e-300)
+    return np.asarray(1.0 - np.sum((answer - torque @ a) ** 2, axis=0) / total), a
 
 
 def _judge_scale(vehicle: Vehicle, scale: float, numbers: dict[str, float]) -> Check:

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
 from quadid.resample import sample_period
-from quadid.resampling_plan import CSV_GAP, GAP
+from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
 from quadid.window import CHANNELS, Channel, Recording
 
 FloatArray = NDArray[np.float64]
 
+_GRID = 0.02
+"""Step of the grid [s] for which gaps are told, that of the fit."""
 _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
 _UNSTEADY = 0.25
@@ -21,14 +23,13 @@ _UNSTEADY = 0.25
 
 def channel_facts(recording: Recording) -> tuple[ChannelFacts, ...]:
     """Returns the facts of all channels of a recording."""
-    gap = CSV_GAP if recording.format == "csv" else GAP
-    return tuple(_facts(recording.channels[name], gap) for name in CHANNELS if name in recording.channels)
+    return tuple(_facts(recording.channels[name]) for name in CHANNELS if name in recording.channels)
 
 
-def _facts(channel: Channel, gap: float) -> ChannelFacts:
+def _facts(channel: Channel) -> ChannelFacts:
     steps = np.diff(channel.t)
     median = float(np.median(steps)) if len(steps) else np.nan
-    long = steps > gap * median
+    long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
     usual = steps[~long]
     same = np.all(np.diff(channel.values, axis=0) == 0.0, axis=1)
     return ChannelFacts(
@@ -41,6 +42,7 @@ def _facts(channel: Channel, gap: float) -> ChannelFacts:
         last=float(channel.t[-1]),
         jitter=float(np.std(usual) / median) if len(usual) else np.nan,
         gaps=int(np.count_nonzero(long)),
+        bridged=holes(channel.t, _GRID) if len(steps) else 0,
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
         stuck=_longest_rest(channel.t, same),

@@ -23,8 +23,6 @@ GRID = 50.0
 """Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
 """Excitation is computed from this much flight at most [s]."""
-_FATAL = ("gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order")
-"""Checks of units, frames and motors; what fails them would give numbers that look fine and mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +221,12 @@ def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]
     Raises:
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
-    from quadid.inspection import Verdict, inspect
+    from quadid.inspection import FATAL, Verdict, inspect
 
     doubts = []
     for check in inspect(recording, vehicle).checks:
         # A check without numbers could not be made; what comes next says why, and better.
-        if check.verdict is Verdict.ERROR and check.name in _FATAL and check.numbers:
+        if check.verdict is Verdict.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
         if check.verdict in (Verdict.ERROR, Verdict.WARNING):

@@ -56,21 +56,29 @@ def test_times_rounded_to_microseconds_still_pass() -> None:
     np.testing.assert_array_equal(window.gyro, recording.channels["gyro"].values)
 
 
-def test_a_gap_of_csv_is_more_than_one_and_a_half_steps() -> None:
-    whole = FLIGHT.recording(seconds=6.0)
-    cut = without_rows(whole, np.array([100]))  # one row lost: a step of 2
+@pytest.mark.parametrize("kind", ["csv", "mcap"])
+def test_a_gap_is_more_than_three_and_a_half_steps_in_every_format(kind: str) -> None:
+    whole = FLIGHT.recording(seconds=6.0, kind=kind)
+    cut = without_rows(whole, np.array([100, 101, 102]))  # three rows lost: a step of 4
     report = grid_recording(cut, PELICAN, 50.0)
-    assert [len(w) for w in report.windows] == [100, 199]
-    assert report.windows[1].t0 == pytest.approx(2.02)
-    assert report.report.gaps == 1
-    assert report.report.seconds_used == pytest.approx(99 * 0.02 + 198 * 0.02)
-    np.testing.assert_array_equal(report.windows[1].gyro, whole.channels["gyro"].values[101:])
+    assert [len(w) for w in report.windows] == [100, 197]
+    assert report.windows[1].t0 == pytest.approx(2.06)
+    assert (report.report.gaps, report.report.bridged) == (1, 0)
+    assert report.report.seconds_used == pytest.approx(99 * 0.02 + 196 * 0.02)
+    np.testing.assert_array_equal(report.windows[1].gyro, whole.channels["gyro"].values[103:])
 
 
-def test_other_logs_bridge_a_lost_sample_but_no_gap() -> None:
-    whole = FLIGHT.recording(seconds=6.0, kind="mcap")
-    assert len(to_windows(without_rows(whole, np.array([100])), PELICAN)) == 1
-    assert len(to_windows(without_rows(whole, np.arange(100, 105)), PELICAN)) == 2
+@pytest.mark.parametrize("kind", ["csv", "mcap"])
+def test_single_lost_rows_are_bridged_and_counted(kind: str) -> None:
+    whole = FLIGHT.recording(seconds=6.0, kind=kind)
+    gridded = grid_recording(without_rows(whole, np.array([50, 100, 101])), PELICAN, 50.0)
+    (window,) = gridded.windows
+    assert (gridded.report.gaps, gridded.report.bridged) == (0, 6)  # two holes in each of three channels
+    assert window.gyro is not None
+    np.testing.assert_allclose(window.gyro, whole.channels["gyro"].values, atol=0.02)
+    held = whole.channels["rotor_speed"].values
+    np.testing.assert_allclose(window.rotor_speed[51:100], held[51:100], rtol=1e-9)
+    np.testing.assert_allclose(window.rotor_speed[100:102], held[[99, 99]], rtol=1e-9)  # a held value goes on acting
 
 
 def test_nothing_is_joined_across_a_break() -> None:
@@ -243,7 +251,7 @@ def test_start_and_stop_cut_in_recording_time() -> None:
 
 def test_short_windows_are_dropped_and_counted() -> None:
     whole = FLIGHT.recording(seconds=6.0)
-    cut = without_rows(whole, np.array([20, 21]))
+    cut = without_rows(whole, np.array([20, 21, 22]))
     gridded = grid_recording(cut, PELICAN)
     assert len(gridded.windows) == gridded.report.windows == 1
     assert gridded.report.dropped == 1

@@ -48,8 +48,9 @@ def check(inspection: Inspection, name: str) -> Check:
 def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
     found = inspect(clean, PELICAN)
     assert {c.name: c.verdict for c in found.checks} == dict.fromkeys(
-        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "hover", "motor_order", "geometry"), Verdict.OK
-    )
+        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "rotor_speed", "hover", "motor_order",
+         "rotor_timing", "geometry"), Verdict.OK,
+    )  # fmt: skip
     assert found.usable
     np.testing.assert_allclose(found.flying, [(0.0, 19.98)])
     assert found.missing == ()

@@ -1,0 +1,175 @@
+"""Rotor signals against each other, the thrust felt and the motion: dead, stuck, halved, and out of time.
+
+All checks need flight only, no fit: a rotor that reads nothing, holds one value or half its speed, thrust per speed
+squared that changes by more than any battery or payload makes it, and torque that does not stand in one fixed place in
+time before the angular acceleration that it causes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import QuadidError
+from quadid.inspection.airborne import Spans
+from quadid.inspection.findings import Check, Verdict
+from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+_BIN = 0.5
+"""Means over this long [s] are compared: fast motion has passed by then."""
+_DEAD, _DEAD_SHARE = 0.1, 0.05
+"""A rotor below this share of the median speed for this share of the flight is dead; cut throttle is shorter."""
+_STUCK = 1.0
+"""A rotor that holds one value this long [s] while the vehicle moves is stuck."""
+_IMBALANCE, _UNBALANCED = 0.72, 0.1
+"""Mean moment of the squares about roll and pitch, over that of one hovering rotor at its arm, and how long it stands.
+
+One of four that reads half its speed makes 0.75; one that lost 45 % of its thrust, and turns faster for it, 0.64.
+"""
+_THRUST_RANGE = 1.8
+"""Thrust felt per speed squared: 90 % over 10 % quantile.  A payload of half the weight makes 1.5."""
+
+Bins = tuple[FloatArray, NDArray[np.bool_]]
+"""Means (m, columns) and which bins hold samples (m,)."""
+
+
+def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
+    name = "rotor_speed"
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check(name, Verdict.UNKNOWN, error.found)
+    edges = _edges(spans)
+    inside = _flying(signal.t, spans)
+    if len(edges) < 4 or np.count_nonzero(inside) < 20:
+        return Check(name, Verdict.UNKNOWN, "too little flight to compare the rotors")
+    squares, known = _means(signal.t, signal.values**2, edges, spans)
+    problem = (
+        _dead(signal.values[inside])
+        or _stuck(signal, recording, inside)
+        or (_unbalanced(squares[known], vehicle) if known.any() else None)
+        or _against_thrust(recording, squares, known, edges, spans)
+    )
+    fix = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
+    if problem is not None:
+        return Check(name, Verdict.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
+    return Check(name, Verdict.OK, "the rotors agree with each other and with the thrust felt")
+
+
+def _flying(t: FloatArray, spans: Spans) -> NDArray[np.bool_]:
+    return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0)) if spans else np.zeros(len(t), np.bool_)
+
+
+def _edges(spans: Spans) -> FloatArray:
+    return np.arange(spans[0][0], spans[-1][1] + 0.5 * _BIN, _BIN) if spans else np.empty(0)
+
+
+def _means(t: FloatArray, values: FloatArray, edges: FloatArray, spans: Spans) -> Bins:
+    """Means of columns over the bins that lie in flight."""
+    row = np.digitize(t, edges)
+    count = np.bincount(row, minlength=len(edges) + 1)[1:-1]
+    sums = [np.bincount(row, column, minlength=len(edges) + 1)[1:-1] for column in values.T]
+    inside = np.any([(edges[:-1] >= a) & (edges[1:] <= b) for a, b in spans], axis=0)
+    return np.column_stack(sums) / np.maximum(count, 1)[:, None], np.asarray(inside & (count > 2))
+
+
+Problem = tuple[str, dict[str, float]]
+
+
+def _dead(speeds: FloatArray) -> Problem | None:
+    turning = speeds[speeds > 0.0]
+    share = np.mean(speeds < _DEAD * np.median(turning), axis=0) if len(turning) else np.ones(speeds.shape[1])
+    if share.max() < _DEAD_SHARE:
+        return None
+    rotor = int(np.argmax(share))
+    return (
+        f"rotor {rotor + 1} reads nothing for {share[rotor]:.0%} of the flight: its speed signal is dead",
+        {"rotor": rotor + 1.0, "dead_share": float(share[rotor])},
+    )
+
+
+def _stuck(signal: RotorSignal, recording: Recording, inside: NDArray[np.bool_]) -> Problem | None:
+    """A value held while the vehicle moves, unless it is a limit that all rotors share."""
+    gyro = recording.channels.get("gyro")
+    t, values = signal.t[inside], signal.values[inside]
+    low, high = np.min(values), np.max(values)
+    for rotor, column in enumerate(values.T):
+        same = np.append(column[1:] == column[:-1], False) & (column > low) & (column < high)
+        begin, end = _longest(t, same)
+        if end - begin > _STUCK and gyro is not None and _moves(gyro, begin, end):
+            return (
+                f"rotor {rotor + 1} holds {column[np.searchsorted(t, begin)]:.4g} rad/s for {end - begin:.2g} s of "
+                "moving flight: its speed signal is stuck",
+                {"rotor": rotor + 1.0, "stuck_s": end - begin},
+            )
+    return None
+
+
+def _longest(t: FloatArray, same: NDArray[np.bool_]) -> tuple[float, float]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    if not len(edges):
+        return 0.0, 0.0
+    begins, ends = t[edges[::2]], t[np.minimum(edges[1::2], len(t) - 1)]
+    longest = int(np.argmax(ends - begins))
+    return float(begins[longest]), float(ends[longest])
+
+
+def _moves(gyro: Channel, begin: float, end: float) -> bool:
+    inside = (gyro.t >= begin) & (gyro.t <= end)
+    return bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > 0.1)
+
+
+def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
+    """Mean roll and pitch moment of the rotors: half a second without balance turns a vehicle over.
+
+    Yaw is left free, for a vehicle may turn for long.  One rotor is named: that whose square, set to what balance
+    needs, agrees best with the others.
+    """
+    lever = np.column_stack([-vehicle.rotor_positions[:, 1], vehicle.rotor_positions[:, 0]]) / vehicle.arm
+    share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-9)
+    odd = np.linalg.norm(share @ lever, axis=1) > _IMBALANCE / (len(lever) - 0.25)
+    if odd.mean() < _UNBALANCED:
+        return None
+    typical = np.median(share[odd], axis=0)
+    fits = []
+    for rotor, arm in enumerate(lever):
+        needed = typical.copy()
+        needed[rotor] -= float(typical @ lever @ arm / (arm @ arm))
+        if needed[rotor] > 0.0:
+            fits.append(
+                (float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(typical[rotor] / needed[rotor])))
+            )
+    if not fits:
+        return "the rotor speeds are far from balance", {"share": float(odd.mean())}
+    _, rotor, ratio = min(fits)
+    return (
+        f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of the flight",
+        {"rotor": rotor + 1.0, "speed_ratio": ratio, "share": float(odd.mean())},
+    )
+
+
+def _against_thrust(
+    recording: Recording, squares: FloatArray, known: NDArray[np.bool_], edges: FloatArray, spans: Spans
+) -> Problem | None:
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return None
+    force, felt = _means(accel.t, -accel.values[:, 2:], edges, spans)
+    total = squares.sum(axis=1)
+    used = known & felt & (total > 0.0)
+    if np.count_nonzero(used) < 10:
+        return None
+    low, high = np.quantile(force[used, 0] / total[used], [0.1, 0.9])
+    if low > 0.0 and high < _THRUST_RANGE * low:
+        return None
+    ratio = float(high / low) if low > 0.0 else float("inf")
+    return (
+        f"thrust felt per rotor speed squared changes by a factor of {ratio:.2g} within the flight: "
+        "the rotor speeds disagree with the accelerometer",
+        {"thrust_range": ratio},
+    )

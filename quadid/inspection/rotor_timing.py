@@ -1,0 +1,129 @@
+"""Whether the rotor signal stands in one place in time before the motion that it causes.
+
+A motor answers its command late by its lag, always the same; measured speeds come a few milliseconds late.  A lag that
+wanders over the flight is a clock's, not a motor's, and a torque that follows its own effect is a wrong stamp.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import QuadidError
+from quadid.inspection.airborne import Spans
+from quadid.inspection.findings import Check, Verdict
+from quadid.resample import moving_mean, sample_period
+from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+_STEP = 0.01
+"""Lags are compared at multiples of this [s]; the peak is found between them."""
+_FARTHEST = 25
+_BLOCK = 15.0
+_SLOW = 0.4
+"""Motion slower than this [s] is left out, as in `motor_checks`."""
+_SLOWEST_RATE = 30.0
+_CLEAR = 0.3
+"""Correlation above which the peak of a block counts."""
+_WANDER, _LATE, _EARLY = 0.012, 0.015, 0.2
+"""Limits [s]: spread of the lag over the flight, torque after its effect, and before it."""
+
+
+class _Peak(NamedTuple):
+    """Axis, lag [s] of its angular acceleration behind the torque in one block, and their correlation there."""
+
+    axis: int
+    lag: float
+    correlation: float
+
+
+def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Lag between roll and pitch torque and angular acceleration, block by block, and how far it wanders."""
+    name = "rotor_timing"
+    gyro = recording.channels.get("gyro")
+    if gyro is None or not spans:
+        return Check(name, Verdict.UNKNOWN, "needs gyro and rotor signal in flight")
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check(name, Verdict.UNKNOWN, error.found)
+    if 1.0 / sample_period(signal.t) < _SLOWEST_RATE or 1.0 / sample_period(gyro.t) < _SLOWEST_RATE:
+        return Check(name, Verdict.UNKNOWN, "rotor signal or gyro too slow to place them in time")
+    peaks = [peak for times in _blocks(spans) for peak in _peaks(signal, gyro, vehicle, times)]
+    return _judge(name, peaks)
+
+
+def _judge(name: str, peaks: list[_Peak]) -> Check:
+    if not peaks:
+        return Check(name, Verdict.UNKNOWN, "too little flight to place the rotor signal in time")
+    correlation = float(np.median([p.correlation for p in peaks]))
+    clear = np.array([p.lag for p in peaks if p.correlation > _CLEAR])
+    about = [_about_median([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
+    numbers = {"correlation": correlation}
+    if len(clear) < max(2, len(peaks) // 2):
+        message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
+        return Check(name, Verdict.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
+    low, high = np.quantile(np.concatenate(about), [0.1, 0.9])
+    lag = float(np.median(clear))
+    numbers |= {"lag_s": lag, "wander_s": float(high - low)}
+    message = (
+        f"torque and angular acceleration correlate by {correlation:.2f} at a lag of {1e3 * lag:.0f} ms, "
+        f"which wanders by {1e3 * (high - low):.0f} ms"
+    )
+    fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
+    if high - low > _WANDER:
+        return Check(name, Verdict.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
+    if lag < -_LATE:
+        return Check(name, Verdict.ERROR, f"{message}: the rotor signal comes after its effect", fix, numbers)
+    if lag > _EARLY:
+        return Check(name, Verdict.ERROR, f"{message}: no motor answers that late", fix, numbers)
+    return Check(name, Verdict.OK, message, numbers=numbers)
+
+
+def _about_median(lags: list[float]) -> FloatArray:
+    """Lags of one axis about their own median: axes may differ, for other motion excites them."""
+    return np.array(lags) - np.median(lags) if lags else np.empty(0)
+
+
+def _blocks(spans: Spans) -> list[FloatArray]:
+    """Times on a uniform grid, in blocks of about `_BLOCK` seconds of uninterrupted flight."""
+    out = []
+    for a, b in spans:
+        parts = max(1, int((b - a) // _BLOCK))
+        bounds = np.linspace(a, b, parts + 1)
+        out += [np.arange(c, d, _STEP) for c, d in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [times for times in out if len(times) > 8 * _FARTHEST]
+
+
+def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray) -> list[_Peak]:
+    place = vehicle.rotor_positions
+    rates = np.column_stack([np.interp(at, gyro.t, c) for c in gyro.values[:, :2].T])
+    squares = np.column_stack([np.interp(at, signal.t, c) for c in (signal.values**2).T])
+    width = max(3, round(2.5 * max(sample_period(signal.t), sample_period(gyro.t)) / _STEP) | 1)
+    motion = _quick(np.gradient(rates, _STEP, axis=0), width)
+    torque = _quick(squares @ np.column_stack([-place[:, 1], place[:, 0]]), width)
+    return [_peak(axis, torque[:, axis], motion[:, axis]) for axis in range(2)]
+
+
+def _quick(values: FloatArray, width: int) -> FloatArray:
+    """Band of frequencies that both signals hold: smoothed over `width` rows, slow motion left out."""
+    smooth = moving_mean(values, width)
+    return np.asarray(smooth - moving_mean(smooth, round(_SLOW / _STEP) | 1, mirrored=True))
+
+
+def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
+    n, far = len(torque), _FARTHEST
+    later = motion[far : n - far]
+    rows = [torque[far - k : n - far - k] for k in range(-far, far + 1)]
+    scores = np.array([row @ later / np.sqrt(row @ row * (later @ later) + 1e-300) for row in rows])
+    best = int(np.argmax(scores))
+    shift = 0.0
+    if 0 < best < 2 * far:
+        before, here, after = scores[best - 1 : best + 2]
+        shift = 0.5 * float((before - after) / (before - 2.0 * here + after))
+    return _Peak(axis, (best - far + shift) * _STEP, float(scores[best]))

@@ -1,0 +1,128 @@
+"""Rotor signals that cannot be true are refused by name: dead, stuck, halved, against the thrust, out of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from quadid_replay import open_log
+
+from quadid.inspection import Check, Verdict, inspect
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def flight(data_dir: Path) -> tuple[Recording, Vehicle]:
+    """Four minutes by an independent simulator."""
+    folder = data_dir / "cases" / "case_000"
+    vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
+    return open_log(folder / "train.csv"), vehicle
+
+
+def judged(flight: tuple[Recording, Vehicle], change: Callable[[Channel], Channel], name: str) -> Check:
+    recording, vehicle = flight
+    channel = change(recording.channels["rotor_speed"])
+    found = inspect(replace(recording, channels={**recording.channels, "rotor_speed": channel}), vehicle)
+    assert not found.usable
+    assert not any(c.name in ("geometry", "mass") for c in found.checks), "no advice from a broken signal"
+    return next(c for c in found.checks if c.name == name)
+
+
+def column(channel: Channel, rotor: int, change: Callable[[FloatArray], FloatArray]) -> Channel:
+    values = channel.values.copy()
+    values[:, rotor - 1] = change(values[:, rotor - 1])
+    return replace(channel, values=values)
+
+
+def part(of: float, change: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
+    """Changes the last share of a column."""
+    return lambda x: np.concatenate([x[: round(len(x) * (1 - of))], change(x[round(len(x) * (1 - of)) :])])
+
+
+@pytest.mark.parametrize("rotor", [1, 2, 3, 4])
+def test_a_dead_rotor_signal_is_named(flight: tuple[Recording, Vehicle], rotor: int) -> None:
+    check = judged(flight, lambda c: column(c, rotor, part(0.3, np.zeros_like)), "rotor_speed")
+    assert check.verdict is Verdict.ERROR
+    assert f"rotor {rotor} reads nothing for 30%" in check.message
+
+
+def test_a_stuck_rotor_signal_is_named(flight: tuple[Recording, Vehicle]) -> None:
+    check = judged(flight, lambda c: column(c, 3, part(0.02, lambda x: np.full_like(x, x[0]))), "rotor_speed")
+    assert check.verdict is Verdict.ERROR
+    assert "rotor 3 holds" in check.message
+
+
+@pytest.mark.parametrize(("factor", "share"), [(0.5, 1.0), (0.5, 0.3), (2.0, 1.0)])
+def test_a_halved_or_doubled_rotor_signal_is_named(
+    flight: tuple[Recording, Vehicle], factor: float, share: float
+) -> None:
+    check = judged(flight, lambda c: column(c, 2, part(share, lambda x: factor * x)), "rotor_speed")
+    assert check.verdict is Verdict.ERROR
+    assert "rotor 2 reads" in check.message
+    assert check.numbers["speed_ratio"] == pytest.approx(factor, rel=0.05)
+    assert check.numbers["share"] == pytest.approx(share, abs=0.05)
+
+
+def test_speeds_that_disagree_with_the_thrust_felt_are_refused(flight: tuple[Recording, Vehicle]) -> None:
+    def raise_all(channel: Channel) -> Channel:
+        values = channel.values.copy()
+        values[len(values) // 2 :] *= 1.45
+        return replace(channel, values=values)
+
+    check = judged(flight, raise_all, "rotor_speed")
+    assert check.verdict is Verdict.ERROR
+    assert check.numbers["thrust_range"] == pytest.approx(1.45**2, rel=0.1)
+
+
+def test_a_rotor_that_lost_a_third_of_its_thrust_is_no_broken_signal(flight: tuple[Recording, Vehicle]) -> None:
+    recording, vehicle = flight
+    speeds = column(recording.channels["rotor_speed"], 1, lambda x: x / np.sqrt(0.67))
+    found = inspect(replace(recording, channels={**recording.channels, "rotor_speed": speeds}), vehicle)
+    assert next(c for c in found.checks if c.name == "rotor_speed").verdict is Verdict.OK
+
+
+def test_a_signal_that_drifts_out_of_time_is_refused(flight: tuple[Recording, Vehicle]) -> None:
+    check = judged(flight, lambda c: replace(c, t=c.t * (1.0 + 0.05 / 120.0)), "rotor_timing")
+    assert check.verdict is Verdict.ERROR
+    assert "not in time" in check.message
+    assert 0.02 < check.numbers["wander_s"] < 0.05
+
+
+def test_a_signal_that_comes_after_its_effect_is_refused(flight: tuple[Recording, Vehicle]) -> None:
+    check = judged(flight, lambda c: replace(c, t=c.t + 0.06), "rotor_timing")
+    assert check.verdict is Verdict.ERROR
+    assert "after its effect" in check.message
+
+
+def test_correlation_and_lag_are_reported(flight: tuple[Recording, Vehicle]) -> None:
+    recording, vehicle = flight
+    check = next(c for c in inspect(recording, vehicle).checks if c.name == "rotor_timing")
+    assert check.verdict is Verdict.OK
+    assert check.numbers["correlation"] > 0.9
+    assert abs(check.numbers["lag_s"] - 0.01) < 0.005  # half of a held sample
+
+
+@pytest.mark.parametrize(
+    ("log", "vehicle", "usable"),
+    [
+        ("jana00.csv", "vehicle.yaml", True),
+        ("jana24.csv", "vehicle.yaml", False),
+        ("jana02_pwm.csv", "vehicle_pwm.yaml", True),
+    ],
+)
+def test_the_recorded_dead_sensor_is_refused_and_its_sisters_are_not(
+    data_dir: Path, log: str, vehicle: str, usable: bool
+) -> None:
+    described = Vehicle.from_yaml((data_dir / "brushed" / vehicle).read_text(encoding="utf-8"))
+    found = inspect(open_log(data_dir / "brushed" / log), described)
+    assert found.usable is usable
+    if not usable:
+        check = next(c for c in found.checks if c.name == "rotor_speed")
+        assert "rotor 1 reads nothing" in check.message
