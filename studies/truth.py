@@ -24,7 +24,7 @@ from quadid.diagnose.validation import settle
 from quadid.flight import draw_truth, fly
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import FitOptions, fit
-from quadid.identify.noise_model import NoiseModel
+from quadid.identify.noise_model import estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -60,23 +60,15 @@ def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
 
     That of one cut into segments with an initial state each; the fit weighs two.
     """
-    shooting = Shooting([window], vehicle, SEGMENT)
+    shooting = Shooting.cut([window], vehicle, SEGMENT)
     theta = shooting.layout.neutral()
     theta[: len(truth)] = truth
-    settle(shooting, theta, [])
-    free = shooting.free([])
-    shooting.noise = _white(shooting, theta)
-    settle(shooting, theta, [])
-    shooting.noise = shaped_noise(shooting, theta, free)
-    settle(shooting, theta, [])
-    return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES)).gram.sum(axis=0))
-
-
-def _white(shooting: Shooting, theta: FloatArray) -> NoiseModel:
-    from quadid.identify.noise_model import estimate_noise
-
-    lin = shooting.linearise(theta, shooting.free([]))
-    return estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0)
+    lin = settle(shooting, theta, [])
+    shooting = shooting.with_noise(estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0))
+    lin = settle(shooting, theta, [])
+    shooting = shooting.with_noise(shaped_noise(shooting, theta, shooting.free([]), lin.states))
+    lin = settle(shooting, theta, [])
+    return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES), lin.states).gram.sum(axis=0))
 
 
 def run(job: tuple[int, str, float, float]) -> Outcome:

@@ -15,6 +15,7 @@ from benchmarks.speed.flights import flight
 from benchmarks.speed.timing import interleaved
 from quadid.baselines.optimisers import minimise
 from quadid.identify.fit import SWARM_SECONDS, SWARM_SEGMENTS
+from quadid.identify.global_search import projected_cost
 from quadid.identify.particle_swarm import Swarm, SwarmOptions
 from quadid.identify.shooting import Shooting
 from quadid.identify.shooting_objective import BoxProblem
@@ -38,13 +39,13 @@ class NumpyObjective:
     def __init__(self, seconds: float, most: int | None = None) -> None:
         """Prepares a set of this length; all its segments, or at most about `most` spread evenly."""
         vehicle, window = Vehicle.shipped("pelican"), flight(seconds)
-        whole = Shooting([window], vehicle, SWARM_SECONDS)
+        whole = Shooting.cut([window], vehicle, SWARM_SECONDS)
         self.vehicle, self.shooting = vehicle, whole.thinned(1 if most is None else -(-whole.count // most))
         s = self.shooting
         self.theta, self.free = s.layout.initial(vehicle), s.free(NOMINAL_NAMES)
-        self.ours = s.swarm_cost(self.theta, self.free, s.count)
+        self.ours = projected_cost(s, self.theta, self.free, s.count)
         self.lower, self.upper = np.log(vehicle.bounds).T
-        self.segments, self.x0 = s.segments[0], s.states(1)[0]
+        self.segments, self.x0 = s.segments[0], s.starts(1).x0[0].copy()
         rollout = s.rollouts[0]
         self.measured, self.moments = rollout.measured, numpy_moments(vehicle, window.rotor_speed)
         sigma = np.sqrt(s.noise.variance)

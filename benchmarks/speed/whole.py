@@ -174,12 +174,12 @@ def particles_and_parameters(rounds: int) -> dict[str, Any]:
     from quadid.parameters import NOMINAL_NAMES
 
     vehicle, window = Vehicle.shipped("pelican"), flight(120.0)
-    shooting = Shooting([window], vehicle, SWARM_SECONDS)
+    shooting = Shooting.cut([window], vehicle, SWARM_SECONDS)
     theta, free = shooting.layout.initial(vehicle), shooting.free(NOMINAL_NAMES)
     cost = shooting.swarm_cost(theta, free, shooting.count)
     names = list(dict.fromkeys([*NOMINAL_NAMES, *flexible_names(shooting.layout, shooting)]))
     pieces = {n: [window.slice(i * len(window) // n, (i + 1) * len(window) // n) for i in range(n)] for n in (1, 4, 16)}
-    split = {n: Shooting(parts, vehicle, SWARM_SECONDS) for n, parts in pieces.items()}
+    split = {n: Shooting.cut(parts, vehicle, SWARM_SECONDS) for n, parts in pieces.items()}
     cases: dict[str, Any] = {}
     for m in (16, 64, 256, 1024):
         cases[f"cost, {m} particles"] = lambda m=m: cost(np.repeat(theta[None], m, axis=0))

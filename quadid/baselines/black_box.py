@@ -73,10 +73,10 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
     """
-    shooting = Shooting(windows, vehicle, SCORE_SECONDS)
+    shooting = Shooting.cut(windows, vehicle, SCORE_SECONDS)
     if not shooting.rollouts:
         raise NotIdentifiableError("no stretch is long enough to be scored", f"{SCORE_SECONDS + 0.4:g} s without gaps")
-    shooting.noise = covering(noise, shooting.channels, vehicle)
+    shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
     expected = expected_squares(shooting, Layout(vehicle).initial(vehicle)).sum(axis=0)[:_CHANNELS]
     squares, samples = np.zeros(_CHANNELS), np.zeros(_CHANNELS)
     for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):

@@ -37,7 +37,6 @@ def eliminate(shooting: Shooting, theta: FloatArray, listed: Sequence[Candidate]
     """
     allowed = set(flexible_names(shooting.layout, shooting))
     causes = tuple(c for c in listed if c.timed is None and not c.split and set(c.names) <= allowed)
-    shooting.restore({})
     model = fit_model(shooting, _only(shooting, theta, causes), causes, iterations=8)
     for _ in range(PASSES):
         kept = _missed(model)

@@ -61,9 +61,8 @@ def without_in_clutter(
     always = {*NOMINAL_NAMES, *untidy_names([c for c in listed if c.requires])}
     takes_up = [abs(z) > TAKES_UP or e.name in always for z, e in zip(step, free.entries, strict=True)]
     used = Free(tuple(e for e, keep in zip(free.entries, takes_up, strict=True) if keep))
-    shooting.restore(model.states)
     start = used.move(theta, step[np.array(takes_up)])
-    result = polish(shooting, start, used, iterations=_ITERATIONS, tolerance=0.1, settled=True)
+    result = polish(shooting, start, used, states=model.states, iterations=_ITERATIONS, tolerance=0.1, settled=True)
     return replace(as_model(shooting, result, used, causes), worth=model.worth)
 
 

@@ -20,11 +20,11 @@ from quadid.identify.gauss_newton import (
     prior_terms,
     scaled_difference,
 )
+from quadid.identify.initial_states import InitialStates
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]
-States = dict[int, list[FloatArray]]
 
 FAR_STEPS = 4
 
@@ -50,7 +50,7 @@ class Model:
     theta: FloatArray
     lin: Linearised
     cost: float
-    states: States
+    states: InitialStates
     held_out: FloatArray
     worth: dict[str, float] = field(default_factory=dict)
 
@@ -107,15 +107,13 @@ def free_names(causes: tuple[Candidate, ...]) -> list[str]:
 
 
 def fit_model(
-    shooting: Shooting, theta: FloatArray, causes: tuple[Candidate, ...], states: States | None = None,
+    shooting: Shooting, theta: FloatArray, causes: tuple[Candidate, ...], states: InitialStates | None = None,
     iterations: int = 6, tolerance: float = 0.05,
 ) -> Model:  # fmt: skip
     """Fits the model with `causes` from `theta` and `states`; `iterations` and `tolerance` as in `polish`."""
-    if states is not None:
-        shooting.restore(states)
     free = shooting.free(free_names(causes))
     settled = bool(states)
-    result = polish(shooting, theta, free, iterations=iterations, tolerance=tolerance, settled=settled)
+    result = polish(shooting, theta, free, states=states, iterations=iterations, tolerance=tolerance, settled=settled)
     return as_model(shooting, result, free, causes)
 
 
@@ -125,11 +123,11 @@ def as_model(
     """Wraps a polish result with its held-out deviance; `prior` as in the polish, weak by default."""
     prior = prior or default_prior(shooting, free)
     held_out = held_out_deviance(result.lin, 1.0 / prior.sigma**2, block_labels(result.lin))
-    return Model(causes, free, prior, result.theta, result.lin, result.cost, shooting.snapshot(), held_out)
+    return Model(causes, free, prior, result.theta, result.lin, result.cost, result.states, held_out)
 
 
-def restore_settled(shooting: Shooting, model: Model, rounds: int = 2) -> None:
-    """Puts back the states of `model`, and fits those that a linearisation of the whole catalogue begins at to it.
+def settled_states(shooting: Shooting, model: Model, rounds: int = 2) -> InitialStates:
+    """States of `model`, those that a linearisation of the whole catalogue begins at fitted to it.
 
     Filters and delays begin before a segment, where no fit without them has been; from states as measured there, the
     linear problem can promise more than there is to gain.
@@ -139,11 +137,11 @@ def restore_settled(shooting: Shooting, model: Model, rounds: int = 2) -> None:
         model: whose parameters stay as they are.
         rounds: Gauss-Newton steps on the initial states.
     """
-    shooting.restore(model.states)
     anything = shooting.free(["imu_lag.period", "rotor_drag.k_x"])  # what begins early, what needs velocity
+    states = model.states
     for _ in range(rounds):
-        lin = shooting.linearise(model.theta, anything)
-        shooting.adopt(model.theta, anything, shooting.step_states(model.theta, anything, lin, np.zeros(2)))
+        states = shooting.linearise(model.theta, anything, states).stepped()
+    return states
 
 
 @dataclass(frozen=True)
@@ -158,7 +156,7 @@ class Sketch:
 
     theta: FloatArray
     drop: float
-    states: States
+    states: InitialStates
 
 
 def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Sequence[FloatArray] = ()) -> Sketch:
@@ -181,7 +179,6 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Se
             theta = base.copy()
             if start:
                 theta[shooting.free(list(candidate.names)).index] = start
-            shooting.restore(model.states)
             trial = _walk(shooting, model, free, theta) if elsewhere else _step(shooting, model, free, prior, theta)
             if best is None or trial.drop > best.drop:
                 best = trial
@@ -191,30 +188,28 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Se
 
 def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: FloatArray) -> Sketch:
     """What the linearised problem promises."""
-    lin = shooting.linearise(theta, free)
+    lin = shooting.linearise(theta, free, model.states)
     precision, pull, cost = prior_terms(free, prior, theta)
     h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
     z = bounded_step(free, theta, h, g)
     deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
     moved = free.move(theta, z)
-    states = shooting.step_states(theta, free, lin, scaled_difference(free, theta, moved))
-    shooting.adopt(moved, free, states)
-    return Sketch(moved, model.deviance - deviance, shooting.snapshot())
+    return Sketch(moved, model.deviance - deviance, lin.stepped(scaled_difference(free, theta, moved)))
 
 
 def _walk(shooting: Shooting, model: Model, free: Free, theta: FloatArray) -> Sketch:
     """What a few steps bring: far from the optimum a linear promise is worth nothing."""
-    result = polish(shooting, theta, free, iterations=FAR_STEPS)
+    result = polish(shooting, theta, free, states=model.states, iterations=FAR_STEPS)
     drop = model.deviance - result.cost - float(result.lin.occam.sum())
-    return Sketch(result.theta, drop, shooting.snapshot())
+    return Sketch(result.theta, drop, result.states)
 
 
 def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Model, int]:
     """Every n-th segment of the problem, so that at most about `most` stay, the model refitted there, and n."""
     every = max(shooting.count // most, 1)
-    shooting.restore(model.states)
-    thin = shooting.thinned(every)
-    return thin, fit_model(thin, model.theta, model.causes, iterations=FAR_STEPS), every
+    places = shooting.places(every)
+    thin, states = shooting.taking(places), model.states.taking(places)
+    return thin, fit_model(thin, model.theta, model.causes, states, iterations=FAR_STEPS), every
 
 
 def extend(

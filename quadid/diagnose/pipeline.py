@@ -25,8 +25,9 @@ from quadid.diagnose.validation import validate
 from quadid.diagnose.vehicle_file import Fitted, extended_vehicle
 from quadid.diagnose.whole_rest import with_look_alike
 from quadid.errors import NotIdentifiableError
-from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows, swarm_search
+from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
+from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
@@ -99,7 +100,7 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    search = _select(windows, begun, report)
+    begun, search = _select(windows, begun, report)
     decisive = search.shooting
     nominal = _usual_nominal(begun, search)
     search, left = _with_rest(search, nominal, begun, seed)
@@ -151,24 +152,25 @@ class _Begun:
 
 def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
     """Fits the nominal model, estimates the noise, cuts the data into the segments of the ladder."""
-    short = Shooting(windows, vehicle, SWARM_SECONDS)
+    short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
     free = short.free(NOMINAL_NAMES)
     start = short.layout.initial(vehicle)
     if swarm is not None:
-        start, _ = swarm_search(short, start, free, swarm, report)
+        settings = replace(swarm.swarm, iterations=swarm.iterations)
+        start, _ = swarm_search(short, start, free, settings, swarm.particles, swarm.seed, report)
     report("fit", 0.0)
     first = polish(short, start, free, iterations=8)
     far = first.cost > FAR * float(first.lin.rows.sum())
-    typical, short.noise = short.noise, residual_noise(short, first)
-    first = polish(short, first.theta, free, iterations=8)
+    typical, short = short.noise, short.with_noise(residual_noise(short, first))
+    first = polish(short, first.theta, free, states=first.states, iterations=8)
     report("noise floor", 0.0)
     if far:
         # What the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
         flexible = flexible_fit(windows, short, [first.theta, start], free, typical, FAR_ITERATIONS)
     else:
         flexible = flexible_fit(windows, short, [first.theta], free, short.noise)
-    short.noise = flexible.noise
-    ladder = [Shooting(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
+    short = short.with_noise(flexible.noise)
+    ladder = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     ladder = [*(s for s in ladder if s.count >= FEWEST_SEGMENTS), short]
     elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15)
@@ -176,49 +178,49 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     return _Begun(short, ladder, first.theta, flexible.theta, elsewhere, listed)
 
 
-def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> Search:
+def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
     """Selects causes forwards, where that leads nowhere backwards, and again when they show the noise to be less."""
-    ladder, short = begun.ladder, begun.short
-    search = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere)
+    search = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere)
     if search.model.reduced_chi_square > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
-        general = eliminate(short, begun.flexible, begun.listed)
-        other = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, general)
+        general = eliminate(begun.short, begun.flexible, begun.listed)
+        other = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere, general)
         search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
             break
         report("noise floor", 0.5)
         before = search.shooting.noise.variance
-        noise = _noise_around(windows, short, search.model)
+        noise = _noise_around(windows, begun.short, search.model)
         growth = noise.variance / before
         if np.any(growth > NOISE_LOST) or (np.any(growth > NOISE_ROSE) and np.mean(np.log(growth)) > 0.0):
             break
-        search = _with_noise(noise, ladder, search)
+        begun, search = _with_noise(noise, begun, search)
         if np.all(noise.variance > NOISE_FELL * before):
             break
-        again = select(ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
+        again = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
     # Refitted on longer segments or under less noise, a cause may be nothing any more.
     suspects = doubtful(search.model, search.tests)
-    return replace(search, model=prune(search.shooting, search.model, suspects, search.nominal, search.tests))
+    model = prune(search.shooting, search.model, suspects, search.nominal, search.tests)
+    return begun, replace(search, model=model)
 
 
 def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:
     """Re-estimates the noise around the selected model, where the flexible fit is nearly linear."""
-    short.restore({})
     wide = short.free(free_names(model.causes))
     return noise_floor(windows, short, model.theta, wide, iterations=2)[0]
 
 
-def _with_noise(noise: NoiseModel, ladder: Sequence[Shooting], search: Search) -> Search:
-    """Refits nominal and selected model under another noise model."""
-    for shooting in ladder:
-        shooting.noise = noise
-    decisive = search.shooting
+def _with_noise(noise: NoiseModel, begun: _Begun, search: Search) -> tuple[_Begun, Search]:
+    """Problems under another noise model, nominal and selected model refitted there."""
+    ladder = [s.with_noise(noise) for s in begun.ladder]
+    begun = replace(begun, ladder=ladder, short=ladder[-1])
+    decisive = search.shooting.with_noise(noise)
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
-    return replace(search, model=replace(model, worth=search.model.worth), nominal=nominal)
+    model = replace(model, worth=search.model.worth)
+    return begun, replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
 def _usual_nominal(begun: _Begun, search: Search) -> Model:

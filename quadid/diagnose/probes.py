@@ -97,8 +97,7 @@ def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tupl
     Returns:
         All signals together, at the best site of each group, strongest first; and every signal alone at every site.
     """
-    shooting.restore(model.states)
-    parts = list(shooting.columns(model.theta, model.free))
+    parts = list(shooting.columns(model.theta, model.free, model.states))
     named = [signals(part) for part in parts]
     names = tuple(named[0])
     # Scaled over all windows alike, so that one coefficient means the same in each.

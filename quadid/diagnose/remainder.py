@@ -99,8 +99,7 @@ class Remainder:
 
 def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
     """Judges what `model` leaves; attitude channels are left out, their slow noise being modelled, not known."""
-    shooting.restore(model.states)
-    found, null, segments = mode_power(shooting, model.theta, model.free, np.random.default_rng(seed))
+    found, null, segments = mode_power(shooting, model.theta, model.free, np.random.default_rng(seed), model.states)
     rate = 1.0 / shooting.dt
     out = []
     for c in range(found.shape[0]):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.candidates import Candidate, all_names, unset_times
-from quadid.diagnose.models import Model, restore_settled
+from quadid.diagnose.models import Model, settled_states
 from quadid.identify.gauss_newton import default_prior
 from quadid.identify.shooting import Linearised, Shooting
 
@@ -41,9 +41,9 @@ class Score:
 def linearise_all(shooting: Shooting, model: Model, listed: list[Candidate]) -> tuple[Linearised, list[str]]:
     """Linearises the current model with every candidate's entries free; returns it and the entry names."""
     names = list(dict.fromkeys([*model.free.names, *all_names(listed)]))
-    restore_settled(shooting, model)
+    states = settled_states(shooting, model)
     theta = unset_times(model.theta, model.effects)
-    return shooting.linearise(theta, shooting.free(names)), names
+    return shooting.linearise(theta, shooting.free(names), states), names
 
 
 def screen(shooting: Shooting, model: Model, listed: list[Candidate]) -> list[Score]:

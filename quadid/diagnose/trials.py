@@ -16,7 +16,7 @@ from quadid.diagnose.climb import LINEAR_MISFIT
 from quadid.diagnose.exchange import LEAST_GAIN, NEAR, Trial
 from quadid.diagnose.models import Model, Sketch, extend, fit_model, sketch, thinned
 from quadid.diagnose.screen import Score
-from quadid.identify.shooting import Shooting
+from quadid.identify.shooting import MEASURED, Shooting
 
 FloatArray = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def drafts_of(
             drawn = sketch(thin, base, score.candidate, elsewhere if far else ())
             drop = max(every * drawn.drop, score.drop) if far else drawn.drop
             # Far from the optimum the model's initial states are as wrong as its parameters: begin at measured ones.
-            drafts.append(Draft(score, drop, replace(drawn, states={}) if far else drawn))
+            drafts.append(Draft(score, drop, replace(drawn, states=MEASURED) if far else drawn))
         else:
             drafts.append(Draft(score, score.drop, model.theta))
     drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)
@@ -87,12 +87,11 @@ def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Mode
     assert candidate.timed is not None
     none = shooting.free([])
     best_theta = model.theta
-    shooting.restore(model.states)
     for step in (0.2, 0.05):
         costs = []
         for offset in (-2.0, -1.0, 0.0, 1.0, 2.0):
             theta = best_theta.copy()
             theta[candidate.timed] += offset * step
-            costs.append((float(shooting.linearise(theta, none).cost.sum()), offset, theta))
+            costs.append((float(shooting.linearise(theta, none, model.states).cost.sum()), offset, theta))
         best_theta = min(costs, key=lambda c: c[0])[2]
     return replace(fit_model(shooting, best_theta, model.causes, model.states, iterations=4), worth=model.worth)

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from quadid.diagnose.blocks import block_labels, paired_gain
 from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.clutter import clutter_names, ordinary, without_in_clutter
-from quadid.diagnose.models import Model, restore_settled
+from quadid.diagnose.models import Model, settled_states
 from quadid.diagnose.result import Benefit, Validation
 from quadid.diagnose.search import Search
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import polish
-from quadid.identify.shooting import Shooting
+from quadid.identify.initial_states import InitialStates
+from quadid.identify.shooting import Linearised, Shooting
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -69,9 +70,8 @@ def validate(
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
     if not model.causes:
         return {}
-    restore_settled(decisive, model)
-    model = replace(model, states=decisive.snapshot())
-    everything = decisive.linearise(model.theta, decisive.free(clutter_names(model, listed)))
+    model = replace(model, states=settled_states(decisive, model))
+    everything = decisive.linearise(model.theta, decisive.free(clutter_names(model, listed)), model.states)
     out = {c.label: without_in_clutter(decisive, model, c, listed, everything) for c in model.causes}
     return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}
 
@@ -136,7 +136,6 @@ def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = No
     """Deviance of each block of unseen data with parameters as fitted, and the independent rows."""
     point = model.theta if theta is None else theta
     names = [n for c in model.causes for n in c.names]
-    scorer.restore({})
     lin = settle(scorer, point, names)
     labels = block_labels(lin)
     total = np.zeros(int(labels.max()) + 1)
@@ -144,7 +143,7 @@ def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = No
     return total, float(lin.rows.sum())
 
 
-def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: int = 3):  # type: ignore[no-untyped-def]
+def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: int = 3) -> Linearised:
     """Fits the initial states of all segments at fixed parameters and returns the last linearisation.
 
     Args:
@@ -154,11 +153,10 @@ def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: in
         rounds: Gauss-Newton steps on the initial states.
     """
     free = scorer.free(list(names))
-    still = np.zeros(len(free.entries))
+    states: InitialStates | None = None
     for _ in range(rounds):
-        lin = scorer.linearise(theta, free)
-        scorer.adopt(theta, free, scorer.step_states(theta, free, lin, still))
-    return scorer.linearise(theta, free)
+        states = scorer.linearise(theta, free, states).stepped()
+    return scorer.linearise(theta, free, states)
 
 
 class _Halves(NamedTuple):

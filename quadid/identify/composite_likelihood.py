@@ -18,6 +18,7 @@ from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, s
 from quadid.identify.shooting import Free, Shooting
 
 FloatArray = NDArray[np.float64]
+Places = list[NDArray[np.intp]]
 
 FEWEST_SEGMENTS = 10
 """Segments of the second cut below which it is not made."""
@@ -65,7 +66,7 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
     enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
     if second.count < enough or shooting.local or not np.isfinite(found.cost):
         return None
-    other = polish(second, found.theta, free, prior, ITERATIONS, robust)
+    other = polish(second, found.theta, free, prior, iterations=ITERATIONS, robust=robust)
     if not other.cost / other.lin.rows.sum() < WORSE * found.cost / found.lin.rows.sum():
         return None
     precision = np.diag(prior_terms(free, prior, found.theta)[0])
@@ -73,11 +74,13 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
     away = scaled_difference(free, found.theta, other.theta)
     step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
     h = 0.5 * (h_one + h_other)
-    information = _information(h, *_shared(shooting, second, other, free))
+    information = _information(h, *_shared(shooting, second, found, other, free))
     return BothCuts(free.move(found.theta, step), information, other.iterations)
 
 
-def _shared(first: Shooting, second: Shooting, other: Polished, free: Free) -> tuple[FloatArray, FloatArray]:
+def _shared(
+    first: Shooting, second: Shooting, found: Polished, other: Polished, free: Free
+) -> tuple[FloatArray, FloatArray]:
     """Covariance of the score of the second cut, and of that with the score of the first, both (P, P).
 
     From the segments that tell most; exact for white noise, and nearly for the slow noise of an attitude, whose
@@ -86,7 +89,10 @@ def _shared(first: Shooting, second: Shooting, other: Polished, free: Free) -> t
     p = len(free.entries)
     own, cross = np.zeros((p, p)), np.zeros((p, p))
     for one, later in _pairs(first, second, other):
-        (before,), (after,) = one.columns(other.theta, free), later.columns(other.theta, free)
+        (before,), (after,) = (
+            cut.taking(places).columns(other.theta, free, states.taking(places))
+            for (cut, states), places in zip(((first, found.states), (second, other.states)), (one, later), strict=True)
+        )
         a, b = before.projected, after.projected
         place = {int(start): i for i, start in enumerate(before.rows[:, 0])}
         half, length = a.shape[1] // 2, a.shape[1]
@@ -99,8 +105,8 @@ def _shared(first: Shooting, second: Shooting, other: Polished, free: Free) -> t
     return own, 0.5 * (cross + cross.T)
 
 
-def _pairs(first: Shooting, second: Shooting, other: Polished) -> Iterator[tuple[Shooting, Shooting]]:
-    """Window by window the segments of the second cut that tell most, and those of the first that they overlap."""
+def _pairs(first: Shooting, second: Shooting, other: Polished) -> Iterator[tuple[Places, Places]]:
+    """Window by window places in the first cut, and those of the second that tell most and overlap them."""
     told = np.diagonal(other.lin.gram, axis1=1, axis2=2)
     total = told.sum(axis=0)
     weight = np.sum(told / np.where(total > 0.0, total, 1.0), axis=1)
@@ -114,8 +120,8 @@ def _pairs(first: Shooting, second: Shooting, other: Polished) -> Iterator[tuple
         both = np.union1d(places, places + 1)
         none = np.zeros(0, dtype=np.intp)
         yield (
-            first.taking([both[both < len(s.starts)] if i == v else none for i, s in enumerate(first.segments)]),
-            second.taking([places if i == w else none for i in range(len(second.rollouts))]),
+            [both[both < len(s.starts)] if i == v else none for i, s in enumerate(first.segments)],
+            [places if i == w else none for i in range(len(second.rollouts))],
         )
 
 

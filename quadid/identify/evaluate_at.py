@@ -33,10 +33,9 @@ def fit_at(
         evaluations: parameter vectors that the search simulated.
         how: sentence on how it ended.
     """
-    shooting = Shooting(windows, vehicle, FIT_SECONDS, noise)
-    settle_states(shooting, theta)
+    shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)
     free = shooting.free(NOMINAL_NAMES)
-    lin = shooting.linearise(theta, free)
+    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
     prior = default_prior(shooting, free)
     unc = uncertainty(lin, free, prior, theta)
     parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)

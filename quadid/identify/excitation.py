@@ -59,7 +59,7 @@ def excitation(
         names: parameters of interest.
         seconds: segment length.
     """
-    shooting = Shooting(windows, vehicle, seconds, noise)
+    shooting = Shooting.cut(windows, vehicle, seconds, noise)
     free = shooting.free(list(names))
     point = shooting.layout.initial(vehicle) if theta is None else theta
     information = shooting.linearise(point, free).gram.sum(axis=0)

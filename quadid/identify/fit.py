@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,11 +12,13 @@ from quadid.errors import WindowError
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, Prior, default_prior, polish
+from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.noise_estimation import flexible_names as flexible_names
 from quadid.identify.noise_estimation import noise_floor as noise_floor
 from quadid.identify.noise_estimation import residual_noise as residual_noise
+from quadid.identify.noise_estimation import reweighted_fit
 from quadid.identify.noise_model import NoiseModel
-from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
@@ -26,14 +28,9 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
-RESOLUTION = 0.5
-"""Differences of the swarm's cost, a sum of squares over the noise, below which particles are equally good."""
-SWARM_SEGMENTS = 100
-"""Most segments the swarm simulates, spread evenly: it has to find the valley, whose bottom the polish finds."""
 SHORT_SEGMENTS = 1000
 """Most short segments of the first polish, whose result only starts the last one."""
 MOST_SEGMENTS = 10_000
@@ -142,29 +139,29 @@ def fit(
     layout = Layout(vehicle)
     free_names = list(names or NOMINAL_NAMES)
     theta = layout.initial(vehicle)
-    short = Shooting(windows, vehicle, SWARM_SECONDS, layout=layout)
+    short = Shooting.cut(windows, vehicle, SWARM_SECONDS, layout=layout)
     evaluations = 0
     if options.iterations > 0:
-        theta, evaluations = swarm_search(short, theta, short.free(free_names), options, report)
+        settings = replace(options.swarm, iterations=options.iterations)
+        theta, evaluations = swarm_search(
+            short, theta, short.free(free_names), settings, options.particles, options.seed, report
+        )
     if not options.polish:
         return _finish(short, theta, free_names, Convergence.BUDGET, evaluations)
     report("polish", 0.0)
     short = short.at_most(SHORT_SEGMENTS)
     free = short.free(free_names)
-    first = polish(short, theta, free, iterations=8)
-    short.noise = residual_noise(short, first)
-    first = polish(short, first.theta, free, iterations=10, robust=options.robust)
-    short.robust = [None] * len(short.rollouts)
+    short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
     moments = _slow_moments(short, theta, first, free)
     aside: tuple[str, ...] = ()
     if moments is not None:
         # Longer segments would only let the missing moments in again.
-        result = moments
-        final, spent, aside = short, 0, (_SET_ASIDE,)
+        final, result = moments
+        spent, aside = 0, (_SET_ASIDE,)
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
-        whole = Shooting(windows, vehicle, options.seconds, noise, layout)
+        whole = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
         final = whole.at_most(MOST_SEGMENTS)
         aside = _thinned(whole, final)
         result = polish(final, first.theta, final.free(free_names), robust=options.robust)
@@ -187,27 +184,21 @@ def _thinned(whole: Shooting, used: Shooting) -> tuple[str, ...]:
     )
 
 
-def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> Polished | None:
-    """Refits with a slow roll and pitch moment of its own in each segment; None unless the data ask for it.
+def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> tuple[Shooting, Polished] | None:
+    """Problem and fit with a slow roll and pitch moment of its own in each segment; None unless the data ask for it.
 
     Aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model that lacks them otherwise takes them
-    for a large inertia.  On return `short` keeps the moments free when they are used.
+    for a large inertia.
     """
     if plain.lin.cost.sum() < MOMENT_MISFIT * plain.lin.rows.sum() and _at_rest(free, plain.theta):
         return None
-    kept, noise = short.snapshot(), short.noise
-    short.restore({})
-    short.local = SLOW_MOMENTS
-    best = polish(short, start, free, iterations=10)
+    apart = short.with_local(SLOW_MOMENTS)
+    best = polish(apart, start, free, iterations=10)
     for _ in range(2):
-        short.noise = residual_noise(short, best)
-        best = polish(short, best.theta, free, iterations=8)
-    free_variance, variance = residual_noise(short, best).variance[:2], noise.variance[:2]
-    if np.any(free_variance < MOMENT_GAIN * variance):
-        return best
-    short.local, short.noise = (), noise
-    short.restore(kept)
-    return None
+        apart = apart.with_noise(residual_noise(apart, best))
+        best = polish(apart, best.theta, free, states=best.states, iterations=8)
+    free_variance, variance = residual_noise(apart, best).variance[:2], short.noise.variance[:2]
+    return (apart, best) if np.any(free_variance < MOMENT_GAIN * variance) else None
 
 
 def _at_rest(free: Free, theta: FloatArray) -> bool:
@@ -248,54 +239,6 @@ def _warnings(free: Free, theta: FloatArray, unc: Uncertainty, prior: Prior) -> 
             + "; quadid diagnose names the cause"
         )  # fmt: skip
     return tuple(out)
-
-
-def swarm_search(
-    shooting: Shooting, theta: FloatArray, free: Free, options: FitOptions, report: Progress
-) -> tuple[FloatArray, int]:
-    """Global search by the particle swarm on a thinned set of segments.
-
-    Returns:
-        Full vector of the best particle, and the number of parameter vectors simulated.
-    """
-    lower, upper = _box(free)
-    start = _to_box(free, theta[free.index])
-    cost = shooting.swarm_cost(theta, free, SWARM_SEGMENTS)
-    guess = np.clip(start, lower, upper)[None]
-    settings = replace(options.swarm, iterations=options.iterations, initial_points=guess)
-    swarm = Swarm(lower, upper, options.particles, options.seed, settings)
-    done = 0
-    while swarm.stop is Stop.RUNNING and not _resolved(swarm, settings):
-        points = swarm.ask()
-        thetas = np.repeat(theta[None], len(points), axis=0)
-        thetas[:, free.index] = _from_box(free, points)
-        swarm.tell(cost(thetas))
-        done += 1
-        report("swarm", min(done / (options.iterations + 1), 1.0))
-    best = theta.copy()
-    best[free.index] = _from_box(free, swarm.best[None])[0]
-    return best, done * options.particles
-
-
-def _resolved(swarm: Swarm, settings: SwarmOptions) -> bool:
-    """True when no particle's best is worse than the best of all by more than the data can tell."""
-    worst = float(np.max(swarm.personal_bests[1]))
-    return settings.tolerance > 0.0 and np.isfinite(worst) and worst - swarm.best_cost < RESOLUTION
-
-
-def _box(free: Free) -> tuple[FloatArray, FloatArray]:
-    low = _to_box(free, np.array([e.lower for e in free.entries]))
-    high = _to_box(free, np.array([e.upper for e in free.entries]))
-    return low, high
-
-
-def _to_box(free: Free, values: FloatArray) -> FloatArray:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(free.is_log, np.log(values), values / free.scale)
-
-
-def _from_box(free: Free, points: FloatArray) -> FloatArray:
-    return np.where(free.is_log, np.exp(points), points * free.scale)
 
 
 def channel_names(channels: int) -> tuple[str, ...]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.box_qp import least_within
-from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.initial_states import InitialStates
+from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
 
 FloatArray = NDArray[np.float64]
 
@@ -63,6 +64,11 @@ class Polished:
     iterations: int
     outcome: Convergence
 
+    @property
+    def states(self) -> InitialStates:
+        """Initial states of the optimum."""
+        return self.lin.states
+
 
 def default_prior(shooting: Shooting, free: Free) -> Prior:
     """Prior of each free parameter: thrust stand, else the file's sigma, else half of its bounds on the log scale."""
@@ -86,12 +92,7 @@ def default_prior(shooting: Shooting, free: Free) -> Prior:
 
 def prior_terms(free: Free, prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Precision (P,), gradient (P,) and cost of the prior at `theta`, in scaled parameters."""
-    value = theta[free.index]
-    z = np.where(
-        free.is_log,
-        np.log(np.maximum(value, 1e-300) / np.maximum(prior.mean, 1e-300)),
-        (value - prior.mean) / free.scale,
-    )
+    z = free.difference(theta[free.index], prior.mean)
     precision = 1.0 / prior.sigma**2
     return precision, precision * z, float(np.sum(precision * z * z))
 
@@ -108,16 +109,17 @@ def robust_weights(shooting: Shooting, lin: Linearised) -> list[FloatArray]:
 
 
 def polish(
-    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, iterations: int = 12,
-    robust: bool = False, tolerance: float = 0.02, settled: bool = False,
+    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, states: InitialStates | None = None,
+    iterations: int = 12, robust: bool = False, tolerance: float = 0.02, settled: bool = False,
 ) -> Polished:  # fmt: skip
     """Refines `theta` to the local optimum, once more from measured initial states where those at hand went astray.
 
     Args:
-        shooting: the problem; its initial states are advanced.
+        shooting: the problem.
         theta: start, full vector.
         free: parameters to move.
         prior: weak by default.
+        states: initial states to start from; as measured by default.
         iterations: most linearisations to spend.
         robust: down-weight outliers (weights are renewed after accepted steps until they stay).
         tolerance: stop when every step is below this fraction of the parameter's standard deviation.
@@ -127,31 +129,27 @@ def polish(
         NotIdentifiableError: the data lead to equations with infinite or missing entries.
     """
     prior = prior or default_prior(shooting, free)
-    settled = settled and shooting.has_states(theta, free)
-    first = _descend(shooting, theta, free, prior, iterations, robust, tolerance, settled)
+    states = states or MEASURED
+    settled = settled and shooting.start_of(theta, free)[0] in states.starts
+    first = _descend(shooting, theta, free, prior, states, iterations, robust, tolerance, settled)
     if first.outcome is not Convergence.ASTRAY:
         return first
-    kept = shooting.snapshot()
-    shooting.restore({})
-    again = _descend(shooting, first.theta, free, prior, iterations, robust, tolerance, False)
+    again = _descend(shooting, first.theta, free, prior, MEASURED, iterations, robust, tolerance, False)
     best = min(again, first, key=lambda p: p.cost)
-    if best is first:
-        shooting.restore(kept)
     return replace(best, iterations=first.iterations + again.iterations)
 
 
 def _descend(
-    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior, iterations: int, robust: bool, tolerance: float,
-    settled: bool,
+    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior, states: InitialStates, iterations: int,
+    robust: bool, tolerance: float, settled: bool,
 ) -> Polished:  # fmt: skip
     """`polish` from the states as they are; gives up where these have gone astray."""
-    lin = shooting.linearise(theta, free)
+    lin = shooting.linearise(theta, free, states)
     if robust:
         # Initial states as measured would let every sample of a segment look like an outlier.
-        still = np.zeros(len(free.entries))
-        shooting.adopt(theta, free, shooting.step_states(theta, free, lin, still))
-        shooting.robust = list(robust_weights(shooting, shooting.linearise(theta, free)))
-        lin = shooting.linearise(theta, free)
+        lin = shooting.linearise(theta, free, lin.stepped())
+        shooting = shooting.with_robust(robust_weights(shooting, lin))
+        lin = shooting.linearise(theta, free, lin.states)
     damping, refused, spent, outcome = 0.0, 0, 3 if robust else 1, Convergence.BUDGET
     cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     while spent < iterations:
@@ -162,15 +160,12 @@ def _descend(
         z *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(z), initial=0.0)), 1e-12))
         moved = free.move(theta, z)
         actual = scaled_difference(free, theta, moved)
-        kept = shooting.snapshot()
-        shooting.adopt(moved, free, shooting.step_states(theta, free, lin, actual))
-        trial = shooting.linearise(moved, free)
+        trial = shooting.linearise(moved, free, lin.stepped(actual))
         spent += 1
         trial_cost = float(trial.cost.sum()) + prior_terms(free, prior, moved)[2]
         # The first step also moves the initial states away from single noisy samples; it may cost a little.
         least = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
         if not (trial_cost <= least and _leads_on(trial)):
-            shooting.restore(kept)
             damping, refused = max(4.0 * damping, 1e-2), refused + 1
             if refused == _REFUSALS and _astray(shooting, theta, free, lin):
                 outcome = Convergence.ASTRAY
@@ -187,9 +182,10 @@ def _descend(
             outcome = Convergence.CONVERGED
             break
         settled = True
-        if robust and _renewed(shooting, lin):
+        if robust and (weights := _renewed(shooting, lin)) is not None:
             # A cost under old weights says nothing about one under new weights.
-            lin = shooting.linearise(theta, free)
+            shooting = shooting.with_robust(weights)
+            lin = shooting.linearise(theta, free, lin.states)
             spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
 
@@ -202,23 +198,18 @@ def _leads_on(lin: Linearised) -> bool:
 
 def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:
     """Whether initial states, moved alone, miss the cost that their linearisation counts on."""
-    kept = shooting.snapshot()
-    shooting.adopt(theta, free, shooting.step_states(theta, free, lin, np.zeros(len(free.entries))))
-    reached = float(shooting.linearise(theta, free).cost.sum())
-    shooting.restore(kept)
+    reached = float(shooting.linearise(theta, free, lin.stepped()).cost.sum())
     return not reached <= (1.0 + _SETTLED) * float(lin.cost.sum())
 
 
-def _renewed(shooting: Shooting, lin: Linearised) -> bool:
-    """Renews the robust weights; False, and the old ones stay, when they would hardly change."""
+def _renewed(shooting: Shooting, lin: Linearised) -> list[FloatArray] | None:
+    """New robust weights; None when they would hardly differ from those in use."""
     weights = robust_weights(shooting, lin)
-    steady = all(
-        old is not None and np.max(np.abs(new - old), initial=0.0) <= _STEADY_WEIGHT
+    steady = shooting.robust is not None and all(
+        np.max(np.abs(new - old), initial=0.0) <= _STEADY_WEIGHT
         for new, old in zip(weights, shooting.robust, strict=True)
     )
-    if not steady:
-        shooting.robust = list(weights)
-    return not steady
+    return None if steady else weights
 
 
 def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
@@ -250,17 +241,10 @@ def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) ->
 
 def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Smallest and largest scaled step of each parameter within its bounds, shapes (P,)."""
-    value = theta[free.index]
-    lower = np.array([e.lower for e in free.entries])
-    upper = np.array([e.upper for e in free.entries])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low = np.where(free.is_log, np.log(lower / value), (lower - value) / free.scale)
-        high = np.where(free.is_log, np.log(upper / value), (upper - value) / free.scale)
+    low, high = (free.difference(bound, theta[free.index]) for bound in free.bounds)
     return np.minimum(low, 0.0), np.maximum(high, 0.0)
 
 
 def scaled_difference(free: Free, theta: FloatArray, moved: FloatArray) -> FloatArray:
     """The scaled step that leads from `theta` to `moved`, shape (P,)."""
-    old, new = theta[free.index], moved[free.index]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(free.is_log, np.log(new / old), (new - old) / free.scale)
+    return free.difference(moved[free.index], theta[free.index])

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +20,85 @@ LEAK_SECONDS = 8.0
 SPIKE = 20.0
 """Usual steps from one sample to the next by which a rate must be off its neighbours to be taken for a spike."""
 _BLOCK = 256
+_ADJACENT = 1
+"""Rows before a segment at which simulation starts when no filter has to settle."""
+_VELOCITY = slice(7, 10)
+
+
+class Starts(NamedTuple):
+    """Where the simulations of all segments start.
+
+    Attributes:
+        x0: states, one array (segments, 13) a window.
+        reckoned: velocity there as measured or by dead reckoning [m/s], one array (segments, 3) a window.
+    """
+
+    x0: tuple[FloatArray, ...]
+    reckoned: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """Initial states of the segments of a problem, found by a fit; what is missing is taken from measurements.
+
+    Attributes:
+        starts: by the rows between the start of the simulation and the segment (filters and delays need some).
+    """
+
+    starts: Mapping[int, Starts] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        """Whether any are known."""
+        return bool(self.starts)
+
+    def at(self, n_pre: int, rollouts: Sequence[Rollout], segments: Sequence[Segments]) -> Starts:
+        """Starts `n_pre` rows before the segments; measured ones, with velocities found so far, if not known."""
+        if n_pre in self.starts:
+            return self.starts[n_pre]
+        measured = [first_states(r, s, n_pre) for r, s in zip(rollouts, segments, strict=True)]
+        reckoned = tuple(_frozen(x[:, _VELOCITY].copy()) for x in measured)
+        if _ADJACENT in self.starts:
+            near = self.starts[_ADJACENT]
+            for x, found, began in zip(measured, near.x0, near.reckoned, strict=True):
+                x[:, _VELOCITY] += found[:, _VELOCITY] - began
+        return Starts(tuple(_frozen(x) for x in measured), reckoned)
+
+    def replaced(self, n_pre: int, starts: Starts) -> InitialStates:
+        """The same with other starts `n_pre` rows before the segments."""
+        return InitialStates({**self.starts, n_pre: starts})
+
+    def stepped(self, n_pre: int, da: FloatArray) -> InitialStates:
+        """The same after the steps `da` along the tangents, shape (segments of all windows, k)."""
+        old = self.starts[n_pre]
+        moved = (retract(x, d) for x, d in zip(old.x0, _split(da, old.x0), strict=True))
+        return self.replaced(n_pre, old._replace(x0=tuple(_frozen(x) for x in moved)))
+
+    def chosen(self, n_pre: int, better: NDArray[np.bool_], other: InitialStates) -> InitialStates:
+        """These states for segments where `better`, those of `other` elsewhere."""
+        mine, its = self.starts[n_pre], other.starts[n_pre]
+        parts = _split(better, mine.x0)
+        x0 = tuple(
+            _frozen(np.where(take[:, None], new, old)) for take, new, old in zip(parts, mine.x0, its.x0, strict=True)
+        )
+        return self.replaced(n_pre, mine._replace(x0=x0))
+
+    def taking(self, places: Sequence[NDArray[np.intp]]) -> InitialStates:
+        """States of some segments of each window, as `Shooting.taking`; windows of which none is kept are left out."""
+
+        def some(arrays: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
+            return tuple(_frozen(a[kept]) for a, kept in zip(arrays, places, strict=True) if len(kept))
+
+        return InitialStates({n: Starts(some(s.x0), some(s.reckoned)) for n, s in self.starts.items()})
+
+
+def _frozen(array: FloatArray) -> FloatArray:
+    array.setflags(write=False)
+    return array
+
+
+def _split(rows: NDArray[Any], like: Sequence[FloatArray]) -> list[NDArray[Any]]:
+    """Rows of all windows, one after the other, as one array a window."""
+    return np.split(rows, np.cumsum([len(x) for x in like])[:-1])
 
 
 def first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import FloatArray, Polished, polish
+from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
@@ -53,6 +54,23 @@ def residual_noise(shooting: Shooting, polished: Polished, parameters: int | Non
     return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
 
 
+def reweighted_fit(
+    shooting: Shooting, theta: FloatArray, free: Free, iterations: int, robust: bool = False
+) -> tuple[Shooting, Polished]:
+    """Fits, measures the noise in what the fit leaves, and fits again: the problem with that noise, and the last fit.
+
+    Args:
+        shooting: the problem.
+        theta: start, full vector.
+        free: parameters to move.
+        iterations: most linearisations of the second fit.
+        robust: down-weight outliers in the second fit.
+    """
+    first = polish(shooting, theta, free, iterations=8)
+    shooting = shooting.with_noise(residual_noise(shooting, first))
+    return shooting, polish(shooting, first.theta, free, states=first.states, iterations=iterations, robust=robust)
+
+
 def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     """Everything the catalogue can free at once on these data: the model that leaves only noise."""
     kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
@@ -94,7 +112,7 @@ def flexible_fit(
 
     Args:
         windows: data.
-        short: short segments; its initial states are left as they were.
+        short: short segments.
         starts: full vectors; the best outcome counts.
         free: nominal free parameters (kept free).
         noise: weights of the first fit.
@@ -111,25 +129,23 @@ def flexible_fit(
     first, few = min(tried, key=lambda t: t[0].cost)
     wide = few.free(names)
     brief = residual_noise(few, first)
-    longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
-    longer.local = ()
+    longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS).with_local(())
     simulated = sum(t.iterations for t, _ in tried) * (len(names) + 10)
     # In calm flight short segments may lead flexible parameters far astray; then longer ones begin where they did.
     for theta, iterations in [(first.theta, 3), *((start, FROM_START) for start in starts)]:
-        longer.noise = brief
         second, more = _on_longer(longer, theta, names, iterations)
-        longer.noise = residual_noise(longer, second, len(names))
+        noise = residual_noise(longer, second, len(names))
         simulated += more
         # Noise does not grow with the length of a segment; what does is the model losing its way.
-        if not np.any(longer.noise.variance > GROWS * brief.variance):
-            longest, more = _longest(windows, longer, second.theta, names)
-            return Flexible(shaped_noise(longest, second.theta, wide), second.theta, simulated + more)
+        if not np.any(noise.variance > GROWS * brief.variance):
+            longest, states, more = _longest(windows, longer.with_noise(noise), second, names)
+            shaped = shaped_noise(longest, second.theta, wide, states)
+            return Flexible(shaped, second.theta, simulated + more)
     return Flexible(brief, first.theta, simulated)
 
 
 def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterations: int) -> tuple[Polished, int]:
     """Fits the flexible model to some of the longer segments, evenly spread, and settles all; and vectors simulated."""
-    longer.restore({})
     second = polish(longer.at_most(LONG_SEGMENTS), theta, longer.free(names), iterations=iterations)
     simulated = second.iterations * (len(names) + 10)
     # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial states,
@@ -140,21 +156,21 @@ def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterat
 
 
 def _longest(
-    windows: Sequence[Window], longer: Shooting, theta: FloatArray, names: Sequence[str]
-) -> tuple[Shooting, int]:
-    """The longest segments that the flexible model at `theta` follows as well as `longer`; and vectors simulated."""
+    windows: Sequence[Window], longer: Shooting, second: Polished, names: Sequence[str]
+) -> tuple[Shooting, InitialStates, int]:
+    """The longest segments that the model of `second` follows as well as `longer`, states there, vectors simulated."""
     out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
     if out.count < LINE_SEGMENTS:
-        return longer, 0
+        return longer, second.states, 0
     settled = out.free([n for n in _SETTLING if n in names])
-    fitted = polish(out, theta, settled, iterations=3)
-    out.noise = residual_noise(out, fitted, len(names))
-    grew = bool(np.any(out.noise.variance > STAYS * longer.noise.variance))
-    return longer if grew else out, fitted.iterations * (len(settled.entries) + 10)
+    fitted = polish(out, second.theta, settled, iterations=3)
+    noise = residual_noise(out, fitted, len(names))
+    simulated = fitted.iterations * (len(settled.entries) + 10)
+    if np.any(noise.variance > STAYS * longer.noise.variance):
+        return longer, second.states, simulated
+    return out.with_noise(noise), fitted.states, simulated
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
     """Segments of `seconds`, at most about `most` of them spread evenly; vehicle and local parameters as in `like`."""
-    out = Shooting(windows, like.vehicle, seconds, noise, like.layout)
-    out.local = like.local
-    return out.at_most(most)
+    return Shooting.cut(windows, like.vehicle, seconds, noise, like.layout).with_local(like.local).at_most(most)

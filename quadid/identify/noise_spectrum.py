@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
 
@@ -28,21 +29,22 @@ LEAST_SEGMENTS = 20
 
 
 def mode_power(
-    shooting: Shooting, theta: FloatArray, free: Free, rng: np.random.Generator
+    shooting: Shooting, theta: FloatArray, free: Free, rng: np.random.Generator, states: InitialStates
 ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
     """Mean power of each mode (channels, length) of the residual, and of noise through the same elimination.
 
     Args:
-        shooting: problem, with initial states at their optimum.
+        shooting: problem.
         theta: full parameter vector.
         free: free parameters of the model (decide what is eliminated).
         rng: for the drawn noise.
+        states: initial states at their optimum.
 
     Returns:
         Power found, power of unit white noise, and the number of segments, per channel; NaN where none is complete.
     """
     parts: list[tuple[FloatArray, FloatArray, NDArray[np.bool_]]] = []
-    for c in shooting.columns(theta, free, parameters=False):
+    for c in shooting.columns(theta, free, states, parameters=False):
         powers = [_powers(c.residual, c.basis)]
         powers += [_powers(rng.standard_normal(c.residual.shape), c.basis) for _ in range(DRAWS)]
         parts.append((powers[0], np.mean(powers[1:], axis=0), c.complete))
@@ -74,14 +76,14 @@ def _cosines(length: int) -> FloatArray:
     return np.asarray(modes)
 
 
-def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, seed: int = 0) -> NoiseModel:
-    """Noise model of `shooting` with the spectrum of its inertial channels, from the residual at `theta`.
+def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: InitialStates, seed: int = 0) -> NoiseModel:
+    """Noise model of `shooting` with the spectrum of its inertial channels, from the residual at `theta` and `states`.
 
     `shooting.noise` must be white in those channels.  Attitude keeps its slow part; channels with few segments stay
     white.
     """
     noise = shooting.noise
-    found, null, counts = mode_power(shooting, theta, free, np.random.default_rng(seed))
+    found, null, counts = mode_power(shooting, theta, free, np.random.default_rng(seed), states)
     channels, length = found.shape
     frequency = 0.5 * np.arange(length) / (length * shooting.dt)
     grid = np.linspace(0.0, 0.5 / shooting.dt, SHAPE_POINTS)

@@ -46,6 +46,32 @@ class Free:
         """Size of one unit of a linear parameter."""
         return np.array([e.typical for e in self.entries])
 
+    @cached_property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the values, shapes (parameters,)."""
+        return np.array([e.lower for e in self.entries]), np.array([e.upper for e in self.entries])
+
+    def scaled(self, values: FloatArray) -> FloatArray:
+        """Scaled parameters of values, last axis of both (parameters,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.is_log, np.log(values), values / self.scale)
+
+    def unscaled(self, z: FloatArray) -> FloatArray:
+        """Values of scaled parameters, last axis of both (parameters,)."""
+        with np.errstate(over="ignore"):
+            return np.where(self.is_log, np.exp(z), z * self.scale)
+
+    def placed(self, theta: FloatArray, z: FloatArray) -> FloatArray:
+        """Full vector `theta` with the free entries replaced by scaled parameters `z`."""
+        out = theta.copy()
+        out[self.index] = self.unscaled(z)
+        return out
+
+    def difference(self, values: FloatArray, start: FloatArray) -> FloatArray:
+        """The scaled step that leads from values `start` to `values`, shape (parameters,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.is_log, np.log(values / start), (values - start) / self.scale)
+
     def from_neutral(self, theta: FloatArray) -> FloatArray:
         """How far effects are from neutral at `theta`, in typical sizes, shape (parameters,)."""
         return np.asarray((theta[self.index] - np.array([e.neutral for e in self.entries])) / self.scale)
@@ -53,9 +79,10 @@ class Free:
     def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
         """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
         out = theta.copy()
-        for e, step in zip(self.entries, z, strict=True):
-            value = out[e.index] * np.exp(step) if e.name in NOMINAL_NAMES else out[e.index] + step * e.typical
-            out[e.index] = min(max(value, e.lower), e.upper)
+        old = out[self.index]
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.where(self.is_log, old * np.exp(z), old + z * self.scale)
+        out[self.index] = np.minimum(np.maximum(moved, self.bounds[0]), self.bounds[1])
         return out
 
     def jacobian(self, theta: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
+from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
@@ -96,15 +97,15 @@ def mse_score(
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
     """
-    shooting = Shooting(windows, vehicle, SCORE_SECONDS)
+    shooting = Shooting.cut(windows, vehicle, SCORE_SECONDS)
     if not shooting.rollouts:
         raise NotIdentifiableError(
             f"{windows[0].name or 'window'}: no stretch is long enough to be scored",
             f"{SCORE_SECONDS + 0.4:g} s without gaps", "record longer stretches at a steady rate",
         )  # fmt: skip
-    shooting.noise = covering(noise, shooting.channels, vehicle)
+    shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
     lin = settle_states(shooting, theta)
-    expected = expected_squares(shooting, theta)
+    expected = expected_squares(shooting, theta, lin.states)
     series = _series(shooting, lin)
     known = shooting.channels if noise is None else len(noise.white)
     return SetScore(*_compare(lin, expected, series, known), series)
@@ -129,21 +130,16 @@ def settle_states(shooting: Shooting, theta: FloatArray) -> Linearised:
     """Fits the initial state of every segment at fixed `theta`; a step that makes a segment worse is not taken.
 
     Returns:
-        The linearisation at the fitted states, which `shooting` holds afterwards.
+        The linearisation at the fitted states.
     """
     none = shooting.free([])
     lin = shooting.linearise(theta, none)
     power = _power(shooting, lin)
     for _ in range(STATE_STEPS):
-        kept = shooting.snapshot()
-        (before,) = kept.values()  # one vector, so one way to start segments
-        after = shooting.step_states(theta, none, lin, np.empty(0))
-        shooting.adopt(theta, none, after)
-        trial = shooting.linearise(theta, none)
+        trial = shooting.linearise(theta, none, lin.stepped())
         better = _power(shooting, trial) < power
         if not better.all():
-            shooting.adopt(theta, none, _choose(better, after, before))
-            trial = shooting.linearise(theta, none)
+            trial = shooting.linearise(theta, none, trial.states.chosen(lin.n_pre, better, lin.states))
         lin, last, power = trial, power, _power(shooting, trial)
         if np.sum(last - power) <= 1e-6 * np.sum(power):
             break
@@ -156,15 +152,7 @@ def _power(shooting: Shooting, lin: Linearised) -> FloatArray:
     return np.asarray(np.nan_to_num(np.sum(white**2, axis=(1, 2, 3)), nan=np.inf))
 
 
-def _choose(better: NDArray[np.bool_], after: list[FloatArray], before: list[FloatArray]) -> list[FloatArray]:
-    out, place = [], 0
-    for new, old in zip(after, before, strict=True):
-        out.append(np.where(better[place : place + len(new), None], new, old))
-        place += len(new)
-    return out
-
-
-def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
+def expected_squares(shooting: Shooting, theta: FloatArray, states: InitialStates | None = None) -> FloatArray:
     """Sum of squares that pure noise leaves in each segment and channel, shape (segments, channels), unit squared.
 
     With C = L L' the noise covariance of a channel and Q the whitened initial-state directions, fitting the initial
@@ -175,7 +163,7 @@ def expected_squares(shooting: Shooting, theta: FloatArray) -> FloatArray:
     white = [np.count_nonzero(w - np.diag(np.diag(w))) == 0 for w in whitener]
     variance = shooting.noise.variance
     parts = []
-    for i, part in enumerate(shooting.columns(theta, shooting.free([]))):
+    for i, part in enumerate(shooting.columns(theta, shooting.free([]), states)):
         q = part.basis.reshape(len(part.basis), shooting.length, shooting.channels, -1)
         rows = shooting.segments[i].starts[:, None] + np.arange(shooting.length)
         measured = np.count_nonzero(shooting.rollouts[i].valid[rows][..., : shooting.channels], axis=1)

@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.identify.initial_states import InitialStates
+
 FloatArray = NDArray[np.float64]
+
+_LONGEST_STEP = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)
+"""Longest step of an initial state: rad, rad/s, m/s, m."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,8 @@ class Linearised:
         weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
         back: what gives the initial-state steps back: (offset (segments, k), slope (segments, k, P)).
         window: index of the window of each segment; time: its first scored time [s].
+        states: initial states it was linearised at.
+        n_pre: rows between the start of the simulation and the segment.
     """
 
     gram: FloatArray
@@ -37,6 +44,15 @@ class Linearised:
     back: tuple[FloatArray, FloatArray]
     window: NDArray[np.intp]
     time: FloatArray
+    states: InitialStates
+    n_pre: int
+
+    def stepped(self, z: FloatArray | None = None) -> InitialStates:
+        """Initial states after the scaled parameter step `z`, or with parameters held."""
+        offset, slope = self.back
+        da = -(offset if z is None else offset + slope @ z)
+        limit = _LONGEST_STEP[: da.shape[1]]
+        return self.states.stepped(self.n_pre, np.clip(da, -limit, limit))
 
 
 def join(parts: list[Linearised]) -> Linearised:

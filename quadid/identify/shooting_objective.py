@@ -40,7 +40,7 @@ class BoxProblem:
         Raises:
             NotIdentifiableError: no stretch is long enough.
         """
-        shooting = Shooting(windows, vehicle, SWARM_SECONDS)
+        shooting = Shooting.cut(windows, vehicle, SWARM_SECONDS)
         if not shooting.rollouts:
             raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
         self._shooting = shooting = shooting.at_most(SEGMENTS)
@@ -48,8 +48,8 @@ class BoxProblem:
         none = shooting.free([])
         self._index = shooting.free(NOMINAL_NAMES).index
         self._bases = [np.ascontiguousarray(c.basis) for c in shooting.columns(self._theta, none)]
-        (self._states,) = shooting.snapshot().values()
-        (self._n_pre,) = shooting.snapshot()
+        self._n_pre = shooting.start_of(self._theta, none)[0]
+        self._x0 = [x.copy() for x in shooting.starts(self._n_pre).x0]
         self.lower, self.upper = np.log(vehicle.bounds).T
         self.start = np.clip(np.log(vehicle.initial), self.lower, self.upper)
 
@@ -65,7 +65,7 @@ class BoxProblem:
         s = self._shooting
         sigma = np.sqrt(s.noise.variance)
         parts = []
-        for rollout, segments, x0, basis in zip(s.rollouts, s.segments, self._states, self._bases, strict=True):
+        for rollout, segments, x0, basis in zip(s.rollouts, s.segments, self._x0, self._bases, strict=True):
             rows = segments.starts[:, None] + np.arange(segments.length)
             weights = rollout.valid[rows][..., : s.channels] / sigma
             out, _ = rollout.roll(segments, thetas, x0, None, self._n_pre)

@@ -17,7 +17,7 @@ from quadid.online.fusion import Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
-from quadid.online.window_fit import FitReply, FitRequest, prior_of, scaled, unscaled
+from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -130,7 +130,7 @@ class Estimator:
         self._search = False
         fused = self.fusion.estimate()
         assert fused is not None
-        self.theta, self.learned = unscaled(self._free, self._initial, fused.z), True
+        self.theta, self.learned = self._free.placed(self._initial, fused.z), True
 
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
@@ -153,7 +153,7 @@ class Estimator:
         fused = self.fusion.estimate()
         if fused is None:
             return None
-        theta = unscaled(self._free, self._initial, fused.z)
+        theta = self._free.placed(self._initial, fused.z)
         unc = Uncertainty(fused.covariance, np.ones(len(fused.z)), self._prior_sigma)
         return parameter_set(self._free, theta, self._initial, unc)
 
@@ -166,7 +166,7 @@ class Estimator:
         for p in known.parameters if known is not None else ():
             if p.name in NOMINAL_NAMES:
                 theta[self._layout.entry(p.name).index] = p.value
-        return scaled(self._free, theta)
+        return self._free.scaled(theta[self._free.index])
 
     def case(
         self, parameters: ParameterSet, quality: Quality, reply: FitReply, in_force: OnlineSet | None,

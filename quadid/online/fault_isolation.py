@@ -11,6 +11,7 @@ from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
 from quadid.errors import QuadidError
 from quadid.identify.gauss_newton import Prior, polish
+from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
@@ -95,6 +96,7 @@ class _Outcome:
     sigma: FloatArray
     deviance: float
     mse: float
+    states: InitialStates
 
 
 def isolate_fault(request: ChangeRequest) -> ChangeReply:
@@ -107,15 +109,13 @@ def isolate_fault(request: ChangeRequest) -> ChangeReply:
 
 def _explain(request: ChangeRequest) -> ChangeReply:
     layout = Layout(request.vehicle)
-    shooting = Shooting(request.windows, request.vehicle, SEGMENT, request.noise, layout)
+    shooting = Shooting.cut(request.windows, request.vehicle, SEGMENT, request.noise, layout)
     if shooting.count < 3:
         return request.failed("too little data after the change")
     nothing = _fit(shooting, request, _Cause("", (), ()))
-    kept = shooting.snapshot()
     outcomes = []
     for cause in _causes(request):
-        shooting.restore(kept)
-        outcome = _fit(shooting, request, cause)
+        outcome = _fit(shooting, request, cause, nothing.states)
         if np.isfinite(outcome.deviance):
             outcomes.append(outcome)
     outcomes = _without_idle(outcomes)
@@ -150,7 +150,7 @@ def _without_idle(outcomes: list[_Outcome]) -> list[_Outcome]:
     return sorted((o for o in outcomes if not idle(o)), key=lambda o: o.deviance + PENALTY * len(o.cause.names))
 
 
-def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause) -> _Outcome:
+def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: InitialStates | None = None) -> _Outcome:
     free = shooting.free([*NOMINAL_NAMES, *cause.names])
     theta = request.theta.copy()
     theta[[ix.MASS_TIME, ix.DROP_TIME]] = -NEVER
@@ -167,11 +167,11 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause) -> _Outcome:
     prior = Prior(
         np.concatenate([request.theta[: len(NOMINAL_NAMES)], np.zeros(len(place))]), np.concatenate([known, width])
     )
-    result = polish(shooting, theta, free, prior, iterations=8)
+    result = polish(shooting, theta, free, prior, states, iterations=8)
     covariance = np.linalg.inv(result.lin.gram.sum(axis=0) + np.diag(1.0 / prior.sigma**2))
     sigma = np.sqrt(np.diag(covariance))[len(NOMINAL_NAMES) :] * free.scale[len(NOMINAL_NAMES) :]
     rows = max(float(result.lin.rows.sum()), 1.0)
-    return _Outcome(cause, result.theta, sigma, result.cost, float(result.lin.cost.sum()) / rows)
+    return _Outcome(cause, result.theta, sigma, result.cost, float(result.lin.cost.sum()) / rows, result.states)
 
 
 def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]) -> OnlineFinding:

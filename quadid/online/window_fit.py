@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
-from quadid.identify.fit import SWARM_SECONDS, FitOptions, residual_noise, swarm_search
+from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import Polished, Prior, polish, robust_weights
+from quadid.identify.global_search import swarm_search
+from quadid.identify.noise_estimation import residual_noise, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.fusion import WindowEstimate
@@ -28,7 +31,8 @@ FIT_SECONDS = 1.66
 What happens across their borders is lost with the free states there.  The time between refits is no multiple of it, so
 windows that overlap have their borders at different places, and fused they see nearly all.
 """
-SEARCH = FitOptions(particles=48, iterations=40)
+SEARCH = SwarmOptions(iterations=40)
+PARTICLES = 48
 """Swarm of the first fit: six parameters, a factor of 4 each way."""
 EXCITED = 0.02
 """A window is excited when roll and pitch inertia can be had from it alone to this relative standard deviation."""
@@ -95,20 +99,6 @@ class FitReply(JobReply):
     measured: NoiseModel | None = None
 
 
-def scaled(free: Free, theta: FloatArray) -> FloatArray:
-    """Scaled parameters of a full vector: logarithms of nominal ones, typical sizes for effects; shape (P,)."""
-    values = theta[free.index]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(free.is_log, np.log(values), values / free.scale)
-
-
-def unscaled(free: Free, theta: FloatArray, z: FloatArray) -> FloatArray:
-    """Full vector `theta` with the free entries replaced by scaled parameters `z`."""
-    out = theta.copy()
-    out[free.index] = np.where(free.is_log, np.exp(z), z * free.scale)
-    return out
-
-
 def prior_of(vehicle: Vehicle) -> Prior:
     """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
     sigma = []
@@ -131,7 +121,7 @@ def fit_window(request: FitRequest) -> FitReply:
 def _fit(request: FitRequest) -> FitReply:
     layout = Layout(request.vehicle)
     theta, noise = request.theta, request.noise
-    shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+    shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
     if shooting.count == 0:
         return request.failed("no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
@@ -141,7 +131,7 @@ def _fit(request: FitRequest) -> FitReply:
         return FitReply(request.number, excitation=bounds)
     if request.search or noise is None or drowned:
         theta, noise = _search(replace(request, noise=None) if drowned else request, layout)
-        shooting = Shooting(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+        shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
         if drowned and not is_excited(bounds := _bounds(shooting, theta, free)):
             return FitReply(request.number, excitation=bounds)
     result = _polish(shooting, theta, free)
@@ -150,7 +140,7 @@ def _fit(request: FitRequest) -> FitReply:
     lin = result.lin
     information = lin.gram.sum(axis=0)
     estimate = WindowEstimate(
-        request.start, request.stop, scaled(free, result.theta), information, lin.grad.sum(axis=0),
+        request.start, request.stop, free.scaled(result.theta[free.index]), information, lin.grad.sum(axis=0),
         float(lin.cost.sum()), float(lin.rows.sum()),
     )  # fmt: skip
     measured = _measure_noise(request, layout, result.theta, noise) if request.measure else None
@@ -175,28 +165,21 @@ def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
     usual = NoiseModel.guess(shooting.channels, shooting.vehicle.noise)
     if not np.any(shooting.noise.variance > INFLATED * usual.variance):
         return False
-    found, shooting.noise = shooting.noise, usual
-    try:
-        return is_excited(_bounds(shooting, theta, free))
-    finally:
-        shooting.noise = found
+    return is_excited(_bounds(shooting.with_noise(usual), theta, free))
 
 
 def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel]:
     """Global search and sensor noise from short segments, all structure counted as noise."""
-    short = Shooting(request.windows, request.vehicle, SWARM_SECONDS, request.noise, layout)
+    short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, request.noise, layout)
     free = short.free(list(NOMINAL_NAMES))
-    options = FitOptions(SEARCH.particles, SEARCH.iterations, seed=request.seed)
-    theta, _ = swarm_search(short, request.theta, free, options, lambda stage, share: None)
-    result = polish(short, theta, free, iterations=8)
-    short.noise = residual_noise(short, result)
-    result = polish(short, result.theta, free, iterations=8)
+    theta, _ = swarm_search(short, request.theta, free, SEARCH, PARTICLES, request.seed, lambda stage, share: None)
+    short, result = reweighted_fit(short, theta, free, iterations=8)
     return result.theta, residual_noise(short, result)
 
 
 def _measure_noise(request: FitRequest, layout: Layout, theta: FloatArray, noise: NoiseModel) -> NoiseModel:
     """Sensor noise of this window, from short segments around the optimum."""
-    short = Shooting(request.windows, request.vehicle, SWARM_SECONDS, noise, layout)
+    short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, noise, layout)
     return residual_noise(short, polish(short, theta, short.free(list(NOMINAL_NAMES)), iterations=3))
 
 
@@ -206,8 +189,8 @@ def _polish(shooting: Shooting, theta: FloatArray, free: Free) -> Polished:
     result = polish(shooting, theta, free, prior, iterations=8)
     if not np.isfinite(result.cost):
         return result
-    shooting.robust = list(robust_weights(shooting, result.lin))
-    return polish(shooting, result.theta, free, prior, iterations=4)
+    shooting = shooting.with_robust(robust_weights(shooting, result.lin))
+    return polish(shooting, result.theta, free, prior, result.states, iterations=4)
 
 
 def warm_up(vehicle: Vehicle) -> None:
@@ -224,5 +207,5 @@ def warm_up(vehicle: Vehicle) -> None:
         layout = Layout(vehicle)
         request = FitRequest(0, vehicle, (window,), 0.0, 3.0, layout.initial(vehicle), None, True, 0)
         theta, noise = _search(request, layout)
-        shooting = Shooting((window,), vehicle, FIT_SECONDS, noise, layout)
+        shooting = Shooting.cut((window,), vehicle, FIT_SECONDS, noise, layout)
         _polish(shooting, theta, shooting.free(list(NOMINAL_NAMES)))

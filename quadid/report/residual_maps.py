@@ -95,13 +95,12 @@ def residual_map(
     Returns:
         The map, or None where the flight lacks the channels.
     """
-    shooting = Shooting(_first(windows), vehicle, SCORE_SECONDS)
+    shooting = Shooting.cut(_first(windows), vehicle, SCORE_SECONDS)
     if not shooting.rollouts or effect not in PAIRS:
         return None
-    shooting.noise = covering(noise, shooting.channels, vehicle)
+    shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
     after = _residuals(shooting, theta)
     signals = _signals(shooting, after)
-    shooting.restore({})
     before = _residuals(shooting, switched_off(shooting.layout, theta, effect, names))
     drawn = [
         _binned(shooting, before, after, mode, channel, quantity, signals[quantity])

@@ -14,7 +14,7 @@ from quadid.diagnose.models import Model, fit_model
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import polish
-from quadid.identify.noise_estimation import noise_floor, residual_noise
+from quadid.identify.noise_estimation import noise_floor, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -51,14 +51,15 @@ def window_with(effects: dict[str, dict[str, float]] | None = None, **planted: F
 def fitted(window: Window, noise: NoiseModel | None = None) -> Problem:
     """Fits the nominal model; the noise is that of a flexible fit to the window where none is given."""
     vehicle = guessed(draw_truth(PELICAN, SEED), SEED)
-    short = Shooting([window], vehicle, SWARM_SECONDS, noise)
+    short = Shooting.cut([window], vehicle, SWARM_SECONDS, noise)
     free = short.free(NOMINAL_NAMES)
-    first = polish(short, short.layout.initial(vehicle), free, iterations=8)
+    start = short.layout.initial(vehicle)
     if noise is None:
-        short.noise = residual_noise(short, first)
-        first = polish(short, first.theta, free, iterations=8)
-        short.noise, _ = noise_floor([window], short, first.theta, free)
-    decisive = Shooting([window], vehicle, 1.0, short.noise, short.layout)
+        short, first = reweighted_fit(short, start, free, iterations=8)
+        short = short.with_noise(noise_floor([window], short, first.theta, free)[0])
+    else:
+        first = polish(short, start, free, iterations=8)
+    decisive = Shooting.cut([window], vehicle, 1.0, short.noise, short.layout)
     return Problem(window, decisive, fit_model(decisive, first.theta, (), iterations=10, tolerance=0.01))
 
 

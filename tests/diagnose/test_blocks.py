@@ -15,7 +15,7 @@ from quadid.diagnose.models import extend
 from quadid.diagnose.validation import settle
 from quadid.identify.gauss_newton import polish
 from quadid.identify.segment_cost import Linearised
-from quadid.identify.shooting import Shooting
+from quadid.identify.shooting import MEASURED, Shooting
 from quadid.model.rollout import Segments
 from tests.diagnose.problems import cause, fitted, window_with
 
@@ -31,7 +31,7 @@ def linear(rng: np.random.Generator, segments: int) -> tuple[Linearised, FloatAr
         gram=np.einsum("srp,srq->spq", b, b), grad=np.einsum("srp,sr->sp", b, r), cost=np.sum(r * r, axis=1),
         occam=np.zeros(segments), rows=np.full(segments, float(ROWS)), residuals=nothing, weights=nothing,
         back=(nothing, nothing), window=np.zeros(segments, dtype=np.intp),
-        time=3.0 + np.arange(segments, dtype=np.float64),
+        time=3.0 + np.arange(segments, dtype=np.float64), states=MEASURED, n_pre=1,
     )  # fmt: skip
     return lin, b, r
 
@@ -97,7 +97,6 @@ def test_the_leave_out_step_is_that_of_full_refits_of_a_nonlinear_model() -> Non
     for block in (0, 4, 9):
         rest = without_block(problem.shooting, labels != block)
         theta = polish(rest, model.theta, model.free, iterations=8, tolerance=0.01).theta
-        problem.shooting.restore(model.states)
         lin = settle(problem.shooting, theta, list(model.free.names))
         refitted = float(np.sum((lin.cost + lin.occam)[labels == block]))
         charge = refitted - inside[block]
@@ -108,10 +107,9 @@ def test_the_leave_out_step_is_that_of_full_refits_of_a_nonlinear_model() -> Non
 def without_block(shooting: Shooting, keep: NDArray[np.bool_]) -> Shooting:
     """The problem on some of its segments."""
     (window,) = [r.window for r in shooting.rollouts]
-    out = Shooting([window], shooting.vehicle, shooting.length * shooting.dt, shooting.noise, shooting.layout)
+    out = Shooting.cut([window], shooting.vehicle, shooting.length * shooting.dt, shooting.noise, shooting.layout)
     (whole,) = out.segments
-    out.segments = [Segments(whole.length, whole.lead, np.ascontiguousarray(whole.starts[keep]))]
-    return out
+    return replace(out, segments=(Segments(whole.length, whole.lead, np.ascontiguousarray(whole.starts[keep])),))
 
 
 def test_the_error_of_a_gain_holds_under_autocorrelation_where_that_of_single_segments_does_not() -> None:

@@ -24,9 +24,8 @@ def untidy() -> tuple[Problem, Model, Linearised]:
     }  # fmt: skip
     problem = fitted(window_with(effects), clean().shooting.noise)
     model = extend(problem.shooting, problem.nominal, cause(problem, "weak_rotor 2"), iterations=12)
-    problem.shooting.restore(model.states)
     free = problem.shooting.free(clutter_names(model, problem.listed))
-    return problem, model, problem.shooting.linearise(model.theta, free)
+    return problem, model, problem.shooting.linearise(model.theta, free, model.states)
 
 
 def refitted(label: str | None) -> Model:

@@ -99,7 +99,7 @@ def refitted(
         window = replace(window, velocity=None, position=None)
     effects = {"motor_lag": {"tau": 0.01}, "rotor_drag": {"k_x": 0.4, "k_y": 0.4}}
     vehicle = vehicle.model_copy(update={"effects": effects})
-    shooting = Shooting([window], vehicle, 0.5)
+    shooting = Shooting.cut([window], vehicle, 0.5)
     found = fit_model(shooting, shooting.layout.initial(vehicle), ())
     listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
     listed = [c for c in listed if c.effect not in vehicle.effects]

@@ -24,9 +24,8 @@ ROWS = 40_000.0
 
 def test_noise_leaves_every_mode_the_power_that_elimination_leaves_it() -> None:
     problem = clean()
-    problem.shooting.restore(problem.nominal.states)
     found, null, counts = mode_power(
-        problem.shooting, problem.nominal.theta, problem.nominal.free, np.random.default_rng(1)
+        problem.shooting, problem.nominal.theta, problem.nominal.free, np.random.default_rng(1), problem.nominal.states
     )
     assert np.all(counts[:9] > 50)
     ratio = found.sum(axis=1) / null.sum(axis=1)

@@ -18,8 +18,7 @@ FloatArray = NDArray[np.float64]
 
 def columns(problem: Problem) -> Columns:
     """The one window's columns at the nominal optimum."""
-    problem.shooting.restore(problem.nominal.states)
-    (part,) = problem.shooting.columns(problem.nominal.theta, problem.nominal.free)
+    (part,) = problem.shooting.columns(problem.nominal.theta, problem.nominal.free, problem.nominal.states)
     return part
 
 
@@ -113,8 +112,7 @@ def test_no_motion_signal_holds_the_noise_of_the_sample_it_is_held_against() -> 
     n = len(problem.window)
     noise = {"gyro": 0.05 * rng.standard_normal((n, 3)), "accel": 0.5 * rng.standard_normal((n, 3))}
     other = fitted(window_with(None, **noise), problem.shooting.noise)
-    other.shooting.restore(problem.nominal.states)
-    (part,) = other.shooting.columns(problem.nominal.theta, problem.nominal.free)
+    (part,) = other.shooting.columns(problem.nominal.theta, problem.nominal.free, problem.nominal.states)
     for name, values in signals(part).items():
         np.testing.assert_allclose(values, before[name], atol=1e-9, err_msg=name)
 

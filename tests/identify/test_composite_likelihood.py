@@ -28,7 +28,7 @@ DRAWS = 60
 def both(window: Window, start: FloatArray | None = None) -> tuple[BothCuts | None, FloatArray, FloatArray]:
     """What both cuts tell of a window with the noise `WHITE`, and value and information of one, nominal parameters."""
     noise = NoiseModel(WHITE, np.zeros(9))
-    shooting = Shooting([window], PELICAN, 1.0, noise)
+    shooting = Shooting.cut([window], PELICAN, 1.0, noise)
     free = shooting.free(NOMINAL_NAMES)
     prior = default_prior(shooting, free)
     one = polish(shooting, shooting.layout.initial(PELICAN) if start is None else start, free)
@@ -37,7 +37,7 @@ def both(window: Window, start: FloatArray | None = None) -> tuple[BothCuts | No
 
 def test_two_cuts_are_nearer_to_the_truth_by_what_their_information_says() -> None:
     flight = flown(3, noise_scale=0.0)
-    start = at_truth(Shooting([flight.window], PELICAN, 1.0), flight.truth.parameters)
+    start = at_truth(Shooting.cut([flight.window], PELICAN, 1.0), flight.truth.parameters)
     errors, single, promised = [], [], []
     for seed in range(DRAWS):
         found, one, _ = both(with_noise(flight.window, seed), start)
@@ -63,7 +63,7 @@ def test_the_gain_is_between_nothing_and_that_of_twice_the_data() -> None:
 
 
 def test_the_segments_of_the_second_cut_begin_in_the_middle_of_those_of_the_first() -> None:
-    shooting = Shooting([flown(3).window, flown(3).window.slice(0, 62)], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window, flown(3).window.slice(0, 62)], PELICAN, 1.0)
     second = shooting.between()
     assert second.segments[0].starts[0] == shooting.segments[0].starts[0] + 25
     assert np.all(second.segments[0].starts + 50 < len(flown(3).window))
@@ -80,13 +80,11 @@ def test_the_segments_of_the_second_cut_begin_in_the_middle_of_those_of_the_firs
 
 def test_too_few_segments_or_moments_set_aside_leave_the_result_as_it_is() -> None:
     assert both(with_noise(flown(3, noise_scale=0.0).window.slice(0, 500), 1))[0] is None
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     free = shooting.free(NOMINAL_NAMES)
     prior = default_prior(shooting, free)
     found = polish(shooting, shooting.layout.initial(PELICAN), free)
-    shooting.local = ("cg_offset.x",)
-    assert with_second_cut(shooting, found, free, prior, robust=True) is None
-    shooting.local = ()
+    assert with_second_cut(shooting.with_local(["cg_offset.x"]), found, free, prior, robust=True) is None
     assert with_second_cut(shooting, replace(found, cost=np.inf), free, prior, robust=True) is None
 
 
@@ -104,7 +102,7 @@ def test_a_fit_narrows_what_crosses_borders_and_leaves_the_rest(monkeypatch: pyt
 def test_a_spike_where_a_segment_begins_does_no_harm(cut: str, spike: float) -> None:
     """The initial state of that segment is the spoilt sample."""
     window = flown(3).window
-    shooting = Shooting([window], PELICAN, 1.0)
+    shooting = Shooting.cut([window], PELICAN, 1.0)
     start = (shooting if cut == "first" else shooting.between()).segments[0].starts[30]
     clean, spoilt = (fit([w], PELICAN, FitOptions(iterations=0)) for w in (window, spiked(window, [start - 1], spike)))
     moved = np.log(spoilt.theta[:6] / clean.theta[:6]) / clean.uncertainty.sigma
@@ -136,7 +134,7 @@ def test_a_second_cut_that_goes_astray_is_left_out(monkeypatch: pytest.MonkeyPat
 def test_many_short_windows_are_cut_once() -> None:
     window = flown(3).window
     pieces = [window.slice(i, i + 113) for i in range(0, 2600, 113)]
-    shooting = Shooting(pieces, PELICAN, 1.0)
+    shooting = Shooting.cut(pieces, PELICAN, 1.0)
     free = shooting.free(NOMINAL_NAMES)
     found = polish(shooting, shooting.layout.initial(PELICAN), free)
     assert (shooting.count, shooting.between().count) == (48, 24)
@@ -146,7 +144,7 @@ def test_many_short_windows_are_cut_once() -> None:
 def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
     """Nine tenths hover: segments spread evenly would hardly meet the manoeuvres that all the information is in."""
     calm, lively = flown(3, "hover", 240.0).window, flown(3, seconds=20.0).window
-    shooting = Shooting([calm, lively], PELICAN, 1.0, NoiseModel(WHITE, np.zeros(9)))
+    shooting = Shooting.cut([calm, lively], PELICAN, 1.0, NoiseModel(WHITE, np.zeros(9)))
     free = shooting.free(NOMINAL_NAMES)
     prior = default_prior(shooting, free)
     one = polish(shooting, shooting.layout.initial(PELICAN), free)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -25,7 +25,8 @@ from quadid.identify.gauss_newton import (
     robust_weights,
     scaled_difference,
 )
-from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.initial_states import InitialStates
+from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior
@@ -39,7 +40,7 @@ MIXED = ("b", "d", "J_xx", "motor_lag.tau", "parasitic_drag.c", "rotor_drag.k_x"
 @pytest.fixture(scope="module")
 def optimum() -> Polished:
     """Optimum on one-second segments, started from the truth."""
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     return polish(shooting, at_truth(shooting, flown(3).truth.parameters), shooting.free(NOMINAL_NAMES), iterations=30)
 
 
@@ -51,7 +52,7 @@ def distance(optimum: Polished, theta: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_every_perturbed_start_leads_to_the_same_optimum(optimum: Polished, seed: int) -> None:
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     free = shooting.free(NOMINAL_NAMES)
     start = free.move(optimum.theta, np.random.default_rng(seed).uniform(-0.35, 0.35, 6))
     result = polish(shooting, start, free, iterations=30)
@@ -62,7 +63,7 @@ def test_every_perturbed_start_leads_to_the_same_optimum(optimum: Polished, seed
 
 
 def test_at_the_optimum_no_direction_lowers_the_cost(optimum: Polished) -> None:
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     free = shooting.free(NOMINAL_NAMES)
     _, pull, _ = prior_terms(free, default_prior(shooting, free), optimum.theta)
     left = optimum.lin.grad.sum(axis=0) + pull
@@ -102,7 +103,7 @@ def test_outliers_lose_their_pull() -> None:
 
 
 def test_weights_of_good_samples_are_one_and_of_outliers_fall_with_their_size() -> None:
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     theta = at_truth(shooting, flown(3).truth.parameters)
     lin = shooting.linearise(theta, shooting.free([]))
     white = np.abs(lin.residuals) / np.sqrt(shooting.noise.variance)
@@ -167,14 +168,15 @@ def test_a_step_is_the_best_within_the_bounds(tilt: float, near: bool) -> None:
         assert found == pytest.approx(least, rel=1e-6, abs=1e-6), (seed, tilt, near)
 
 
+@dataclass(frozen=True)
 class Cliff(Shooting):
     """A problem whose simulation runs away where J_xx is above `edge`."""
 
-    edge = np.inf
-    sign = "cost"
+    edge: float = np.inf
+    sign: str = "cost"
 
-    def linearise(self, theta: FloatArray, free: Free) -> Linearised:
-        lin = super().linearise(theta, free)
+    def linearise(self, theta: FloatArray, free: Free, states: InitialStates | None = None) -> Linearised:
+        lin = super().linearise(theta, free, states)
         if theta[LAYOUT.entry("J_xx").index] > self.edge:
             if self.sign == "cost":
                 lin.cost[:] = np.inf
@@ -188,20 +190,20 @@ class Cliff(Shooting):
 @pytest.mark.parametrize("sign", ["cost", "slopes", "digits"])
 def test_a_simulation_that_runs_away_is_stepped_back_from(optimum: Polished, sign: str) -> None:
     index = LAYOUT.entry("J_xx").index
-    shooting = Cliff([flown(3).window], PELICAN, 1.0)
-    shooting.edge, shooting.sign = 0.97 * optimum.theta[index], sign
+    plain = Shooting.cut([flown(3).window], PELICAN, 1.0)
+    shooting = Cliff(**vars(plain), edge=0.97 * optimum.theta[index], sign=sign)
     free = shooting.free(NOMINAL_NAMES)
     start = optimum.theta.copy()
     start[index] *= 0.7
     result = polish(shooting, start, free, iterations=40)
     assert np.isfinite(result.cost)
     assert start[index] < result.theta[index] <= shooting.edge
-    before = Shooting([flown(3).window], PELICAN, 1.0).linearise(start, free).cost.sum()
+    before = Shooting.cut([flown(3).window], PELICAN, 1.0).linearise(start, free).cost.sum()
     assert result.cost < 0.5 * before
 
 
 def test_no_step_is_longer_than_the_longest(monkeypatch: pytest.MonkeyPatch, optimum: Polished) -> None:
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     free = shooting.free((*NOMINAL_NAMES, "cg_offset.x", "gyro_bias.x"))
     start = optimum.theta.copy()
     start[shooting.layout.entry("cg_offset.x").index] = 0.08
@@ -225,7 +227,7 @@ def test_a_known_sigma_of_the_vehicle_file_pulls_like_a_measurement() -> None:
     parameters = {n: ParameterPrior(initial=v) for n, v in truth.items()}
     parameters["J_xx"] = ParameterPrior(initial=1.1 * truth["J_xx"], sigma=1.1e-4 * truth["J_xx"])
     vehicle = PELICAN.model_copy(update={"parameters": parameters})
-    shooting = Shooting([flight.window], vehicle, 1.0)
+    shooting = Shooting.cut([flight.window], vehicle, 1.0)
     free = shooting.free(NOMINAL_NAMES)
     prior = default_prior(shooting, free)
     assert prior.sigma[2] == pytest.approx(1e-4)
@@ -239,7 +241,7 @@ def test_a_known_sigma_of_the_vehicle_file_pulls_like_a_measurement() -> None:
 
 
 def test_the_prior_of_an_effect_is_ten_typical_sizes_about_neutral() -> None:
-    shooting = Shooting([flown(3).window.slice(0, 200)], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window.slice(0, 200)], PELICAN, 1.0)
     free = shooting.free(["cg_offset.x", "motor_lag.tau"])
     prior = default_prior(shooting, free)
     np.testing.assert_array_equal(prior.mean, 0.0)
@@ -286,13 +288,13 @@ def test_hopeless_data_end_in_an_answer_or_an_error_of_ours(hopeless: str) -> No
 
 def test_initial_states_gone_astray_are_left_for_measured_ones() -> None:
     """Ten radians a second off, no linear step keeps its promise, and each would be refused for ever."""
-    shooting = Shooting([flown(3).window], PELICAN, 1.0)
+    shooting = Shooting.cut([flown(3).window], PELICAN, 1.0)
     free = shooting.free([*NOMINAL_NAMES, "rotor_drag.k_x", "rotor_drag.k_y"])
     start = free.move(at_truth(shooting, flown(3).truth.parameters), np.full(len(free.entries), 0.2))
     wanted = polish(shooting, start, free, iterations=30)
-    shooting.restore({})
-    (states,) = [x.copy() for x in shooting.states(1)]
-    states[:, 4:7] += 10.0 * np.random.default_rng(1).standard_normal((len(states), 3))
-    shooting.set_states(1, [states])
-    found = polish(shooting, start, free, iterations=30, settled=True)
+    measured = shooting.starts(1)
+    x0 = measured.x0[0].copy()
+    x0[:, 4:7] += 10.0 * np.random.default_rng(1).standard_normal((len(x0), 3))
+    states = MEASURED.replaced(1, measured._replace(x0=(x0,)))
+    found = polish(shooting, start, free, states=states, iterations=30, settled=True)
     assert found.cost == pytest.approx(wanted.cost, rel=5e-3)

@@ -164,12 +164,12 @@ def test_the_spectrum_of_a_flight_is_found_above_3_hz_and_flat_below() -> None:
         accel=window.accel + 0.2 * rng.standard_normal((n, 3)),
         attitude=turned(window.attitude, 0.0015 * rng.standard_normal((n, 3))),
     )
-    shooting = Shooting([window], PELICAN, 0.5)
+    shooting = Shooting.cut([window], PELICAN, 0.5)
     theta = at_truth(shooting, flight.truth.parameters)
     lin = settle_states(shooting, theta)
-    shooting.noise = estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0)
-    settle_states(shooting, theta)
-    found = shaped_noise(shooting, theta, shooting.free([]))
+    shooting = shooting.with_noise(estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0))
+    states = settle_states(shooting, theta).states
+    found = shaped_noise(shooting, theta, shooting.free([]), states)
     assert found.shape is not None
     frequency = np.linspace(0.0, 25.0, SHAPE_POINTS)
     above = frequency > LOWEST + 1.0

@@ -12,9 +12,10 @@ from scipy.optimize import least_squares
 
 from quadid.errors import WindowError
 from quadid.flight import draw_truth, fly
+from quadid.identify.global_search import projected_cost
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
-from quadid.identify.shooting import VELOCITY_PRIOR, Free, Linearised, Shooting
+from quadid.identify.shooting import MEASURED, VELOCITY_PRIOR, Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
 from tests.identify.dense import DenseProblem, perturbed
@@ -46,23 +47,22 @@ class Case:
 
 def case(window: Window, names: Sequence[str], **values: float) -> Case:
     """Linearises 0.4 s segments of `window` at the truth with `values` set, and the same by plain differences."""
-    shooting = Shooting([window], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([window], PELICAN, 0.4, NOISE)
     free = shooting.free(list(names))
     theta = at_truth(shooting, flown(3).truth.parameters)
     for name, value in values.items():
         theta[shooting.layout.entry(name.replace("__", ".")).index] = value
-    settle_states(shooting, theta)
-    lin = shooting.linearise(theta, free)
+    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
     moving = any("drag" in n for n in names)
-    (n_pre,) = shooting.snapshot()
-    (x0,) = shooting.states(n_pre)
+    n_pre = lin.n_pre
+    (x0,) = shooting.starts(n_pre, lin.states).x0
     dense = DenseProblem(shooting.rollouts[0], shooting.segments[0], shooting.noise, 9, n_pre)
     k = 9 if moving else 6
     precision = RIDGE[:k] ** -2.0
     away = np.zeros((len(x0), k))
     if moving:
         precision = precision + np.array([0.0] * 6 + [VELOCITY_PRIOR**-2.0] * 3)
-        fresh = Shooting([window], PELICAN, 0.4, NOISE).states(n_pre)[0]
+        fresh = Shooting.cut([window], PELICAN, 0.4, NOISE).starts(n_pre).x0[0]
         away[:, 6:] = x0[:, 7:10] - fresh[:, 7:10]
     return Case(
         shooting, free, theta, lin, dense.state_columns(theta, x0, k), dense.parameter_columns(theta, x0, free),
@@ -133,10 +133,10 @@ def test_gram_and_gradient_are_those_of_the_projected_columns(which: str, reques
 
 def test_the_cost_of_a_segment_is_the_least_over_its_initial_states(short: Window) -> None:
     """Against an optimiser that knows nothing of the elimination, the full nonlinear simulation in its loop."""
-    shooting = Shooting([short], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([short], PELICAN, 0.4, NOISE)
     theta = at_truth(shooting, flown(3).truth.parameters)
     lin = settle_states(shooting, theta)
-    (x0,) = shooting.states(1)
+    (x0,) = shooting.starts(1, lin.states).x0
     rollout, cut = shooting.rollouts[0], shooting.segments[0]
     for s in range(len(x0)):
         one = DenseProblem(rollout, replace(cut, starts=cut.starts[s : s + 1]), NOISE, 9, 1)
@@ -162,7 +162,7 @@ def test_the_gradient_is_the_slope_of_the_profiled_cost(
     names: tuple[str, ...], values: dict[str, float], short: Window
 ) -> None:
     """Envelope theorem: with the initial states at their optimum, twice the gradient is the slope of the least cost."""
-    shooting = Shooting([short], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([short], PELICAN, 0.4, NOISE)
     theta = at_truth(shooting, flown(3).truth.parameters)
     for name, value in values.items():
         theta[shooting.layout.entry(name).index] = value
@@ -175,7 +175,7 @@ def test_the_gradient_is_the_slope_of_the_profiled_cost(
         step[j] = h
         costs = []
         for sign in (1.0, -1.0):
-            other = Shooting([short], PELICAN, 0.4, NOISE)
+            other = Shooting.cut([short], PELICAN, 0.4, NOISE)
             costs.append(settle_states(other, free.move(theta, sign * step)).cost.sum())
         slope = (costs[0] - costs[1]) / (2.0 * h)
         size = np.sqrt(lin.gram[:, j, j].sum() * lin.cost.sum())
@@ -183,7 +183,7 @@ def test_the_gradient_is_the_slope_of_the_profiled_cost(
 
 
 def test_at_an_upper_bound_the_difference_steps_inwards(short: Window) -> None:
-    shooting = Shooting([short], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([short], PELICAN, 0.4, NOISE)
     theta = at_truth(shooting, flown(3).truth.parameters)
     entry = shooting.layout.entry("motor_lag.tau")
     theta[entry.index] = entry.upper
@@ -213,7 +213,8 @@ def test_a_missing_sample_carries_no_weight(short: Window) -> None:
 
 def test_a_channel_that_is_absent_and_one_that_is_all_nan_are_the_same(short: Window) -> None:
     shooting = [
-        Shooting([w], PELICAN, 0.4, NOISE) for w in (replace(short, accel=None), without_rows(short, accel=slice(None)))
+        Shooting.cut([w], PELICAN, 0.4, NOISE)
+        for w in (replace(short, accel=None), without_rows(short, accel=slice(None)))
     ]
     theta = at_truth(shooting[0], flown(3).truth.parameters)
     one, other = (s.linearise(theta, s.free(NOMINAL_NAMES)) for s in shooting)
@@ -234,11 +235,11 @@ def test_rows_count_samples_less_fitted_directions(late: Case, dragged: Case) ->
 def test_segments_never_cross_a_gap() -> None:
     window = flown(3).window
     parts = [window.slice(0, 400), window.slice(520, 900)]
-    together = Shooting(parts, PELICAN, 0.4, NOISE)
+    together = Shooting.cut(parts, PELICAN, 0.4, NOISE)
     theta = at_truth(together, flown(3).truth.parameters)
     free = together.free(NOMINAL_NAMES)
     lin = together.linearise(theta, free)
-    alone = [Shooting([p], PELICAN, 0.4, NOISE).linearise(theta, free) for p in parts]
+    alone = [Shooting.cut([p], PELICAN, 0.4, NOISE).linearise(theta, free) for p in parts]
     np.testing.assert_array_equal(lin.cost, np.concatenate([a.cost for a in alone]))
     np.testing.assert_array_equal(lin.gram, np.concatenate([a.gram for a in alone]))
     np.testing.assert_array_equal(lin.window, [0] * len(alone[0].cost) + [1] * len(alone[1].cost))
@@ -251,14 +252,14 @@ def test_segments_never_cross_a_gap() -> None:
 
 
 def test_windows_too_short_for_a_segment_are_left_out(short: Window) -> None:
-    shooting = Shooting([short.slice(0, 20), short], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([short.slice(0, 20), short], PELICAN, 0.4, NOISE)
     assert len(shooting.rollouts) == 1
-    assert shooting.count == Shooting([short], PELICAN, 0.4, NOISE).count
+    assert shooting.count == Shooting.cut([short], PELICAN, 0.4, NOISE).count
 
 
 def test_a_window_of_another_vehicle_is_refused(short: Window) -> None:
     with pytest.raises(WindowError, match="rotor columns"):
-        Shooting([replace(short, rotor_speed=short.rotor_speed[:, :3])], PELICAN, 0.4)
+        Shooting.cut([replace(short, rotor_speed=short.rotor_speed[:, :3])], PELICAN, 0.4)
 
 
 def test_occam_turns_the_least_deviance_into_the_marginal_one(dragged: Case, late: Case) -> None:
@@ -277,24 +278,24 @@ def test_the_velocity_prior_pulls_towards_dead_reckoning_but_gives_way_to_drag()
     """Where drag is strong the data find the velocity; the prior alone holds it elsewhere."""
     truth = draw_truth(PELICAN, 3)
     flight = fly(PELICAN, truth, 20.0, 3, effects={"rotor_drag": {"k_x": 0.6, "k_y": 0.6}}, noise_scale=0.2)
-    shooting = Shooting([flight.window], PELICAN, 1.0)
+    shooting = Shooting.cut([flight.window], PELICAN, 1.0)
     theta = at_truth(shooting, truth)
     free = shooting.free(["rotor_drag.k_x", "rotor_drag.k_y"])
-    (reckoned,) = (x.copy() for x in shooting.states(1))
+    (reckoned,) = shooting.starts(1).x0
+    theta[free.index] = 0.6
+    states = MEASURED
     for _ in range(4):
-        theta[free.index] = 0.6
-        lin = shooting.linearise(theta, free)
-        shooting.adopt(theta, free, shooting.step_states(theta, free, lin, np.zeros(2)))
+        states = shooting.linearise(theta, free, states).stepped()
     rows = shooting.segments[0].starts - 1
     true = flight.truth.velocity[rows]
     before = np.sqrt(np.mean((reckoned[:, 7:9] - true[:, :2]) ** 2))
-    after = np.sqrt(np.mean((shooting.states(1)[0][:, 7:9] - true[:, :2]) ** 2))
+    after = np.sqrt(np.mean((shooting.starts(1, states).x0[0][:, 7:9] - true[:, :2]) ** 2))
     assert after < 0.5 * before
 
 
 def test_measured_velocity_leaves_no_room_for_the_prior() -> None:
     flight = fly(PELICAN, draw_truth(PELICAN, 3), 10.0, 3, extras=("velocity",))
-    shooting = Shooting([flight.window], PELICAN, 1.0)
+    shooting = Shooting.cut([flight.window], PELICAN, 1.0)
     assert shooting.has_velocity
     theta = at_truth(shooting, flight.truth.parameters)
     lin = shooting.linearise(theta, shooting.free(["rotor_drag.k_x"]))
@@ -303,7 +304,7 @@ def test_measured_velocity_leaves_no_room_for_the_prior() -> None:
 
 
 def test_a_simulation_that_runs_away_costs_infinity(short: Window) -> None:
-    shooting = Shooting([short], PELICAN, 0.4, NOISE)
+    shooting = Shooting.cut([short], PELICAN, 0.4, NOISE)
     theta = at_truth(shooting, flown(3).truth.parameters)
     theta[:1] = 1e300
     lin = shooting.linearise(theta, shooting.free(NOMINAL_NAMES))
@@ -314,18 +315,18 @@ def test_a_simulation_that_runs_away_costs_infinity(short: Window) -> None:
 def test_the_swarm_sees_the_same_valley_as_the_eliminated_cost() -> None:
     """White noise: near the point where the directions were taken, both costs differ by a constant."""
     window = flown(3).window.slice(0, 1500)
-    shooting = Shooting([window], PELICAN, 0.2)
+    shooting = Shooting.cut([window], PELICAN, 0.2)
     truth = at_truth(shooting, flown(3).truth.parameters)
     free = shooting.free(NOMINAL_NAMES)
-    cost = shooting.swarm_cost(truth, free, 10_000)
+    cost = projected_cost(shooting, truth, free, 10_000)
     rng = np.random.default_rng(0)
     thetas = np.array([free.move(truth, 0.05 * rng.standard_normal(6)) for _ in range(10)])
     swarm = cost(thetas)
     plain = []
     for theta in thetas:
-        other = Shooting([window], PELICAN, 0.2)
+        other = Shooting.cut([window], PELICAN, 0.2)
         plain.append(settle_states(other, theta).cost.sum())
     difference = swarm - np.array(plain)
     assert np.ptp(difference) < 0.02 * np.ptp(swarm)
     assert np.argmin(swarm) == np.argmin(plain)
-    assert len(shooting.swarm_cost(truth, free, 5)(thetas[:3])) == 3
+    assert len(projected_cost(shooting, truth, free, 5)(thetas[:3])) == 3

@@ -20,7 +20,7 @@ STEP = 1.0 / SETTINGS.rate
 
 def cut(seconds: float) -> Shooting:
     rows = round(seconds / STEP)
-    return Shooting([flight(24.0).window.slice(0, rows)], PELICAN, FIT_SECONDS)
+    return Shooting.cut([flight(24.0).window.slice(0, rows)], PELICAN, FIT_SECONDS)
 
 
 @pytest.mark.parametrize(("seconds", "count"), [(SHORTEST, 1), (SETTINGS.window + LEAD + STEP, 6)])

@@ -1,0 +1,91 @@
+"""Global search: the particle swarm on short segments, whose valley Gauss-Newton then follows to the bottom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identify.shooting import RIDGE, Free, Shooting
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+RESOLUTION = 0.5
+"""Differences of the swarm's cost, a sum of squares over the noise, below which particles are equally good."""
+SWARM_SEGMENTS = 100
+"""Most segments the swarm simulates, spread evenly: it has to find the valley, whose bottom the polish finds."""
+
+
+def swarm_search(
+    shooting: Shooting, theta: FloatArray, free: Free, options: SwarmOptions, particles: int, seed: int,
+    report: Progress,
+) -> tuple[FloatArray, int]:  # fmt: skip
+    """Global search by the particle swarm on a thinned set of segments.
+
+    Args:
+        shooting: the problem, short segments.
+        theta: full vector; what is not free stays.
+        free: parameters to search within their bounds.
+        options: variant of the swarm and most iterations.
+        particles: their number.
+        seed: of the swarm.
+        report: called with a stage and a fraction done.
+
+    Returns:
+        Full vector of the best particle, and the number of parameter vectors simulated.
+    """
+    lower, upper = (free.scaled(bound) for bound in free.bounds)
+    cost = projected_cost(shooting, theta, free, SWARM_SEGMENTS)
+    guess = np.clip(free.scaled(theta[free.index]), lower, upper)[None]
+    settings = replace(options, initial_points=guess)
+    swarm = Swarm(lower, upper, particles, seed, settings)
+    done = 0
+    while swarm.stop is Stop.RUNNING and not _resolved(swarm, settings):
+        points = swarm.ask()
+        thetas = np.repeat(theta[None], len(points), axis=0)
+        thetas[:, free.index] = free.unscaled(points)
+        swarm.tell(cost(thetas))
+        done += 1
+        report("swarm", min(done / (options.iterations + 1), 1.0))
+    best = theta.copy()
+    best[free.index] = free.unscaled(swarm.best)
+    return best, done * particles
+
+
+def _resolved(swarm: Swarm, settings: SwarmOptions) -> bool:
+    """True when no particle's best is worse than the best of all by more than the data can tell."""
+    worst = float(np.max(swarm.personal_bests[1]))
+    return settings.tolerance > 0.0 and np.isfinite(worst) and worst - swarm.best_cost < RESOLUTION
+
+
+def projected_cost(shooting: Shooting, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
+    """Cost of many parameter vectors at once on at most `most` segments, spread evenly.
+
+    The directions of the initial states are taken at `theta` and projected out (variable projection): within a short
+    segment they hardly depend on the parameters.
+
+    Returns:
+        A function of parameter vectors (m, size) giving costs (m,).
+    """
+    n_pre, k = shooting.start_of(theta, free)
+    few = shooting.thinned(-(-shooting.count // most))
+    sigma = np.sqrt(few.noise.variance)
+    jobs = []
+    for i, (rollout, segments, start) in enumerate(zip(few.rollouts, few.segments, few.starts(n_pre).x0, strict=True)):
+        x0 = start.copy()
+        rolled, steps = few.roll_directions(i, theta, few.free([]), x0, n_pre, k)
+        columns = rolled[0, ..., : few.channels, 1 : k + 1] - rolled[0, ..., : few.channels, :1]
+        flat = (columns / steps * (few.measured_weights(i) / sigma)[..., None]).reshape(len(x0), -1, k)
+        flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / RIDGE[:k])[None], len(flat), axis=0)], axis=1)
+        basis = np.ascontiguousarray(np.linalg.qr(flat)[0][:, :-k])  # once, not at every call
+        jobs.append((rollout, segments, x0, rollout.valid[:, : few.channels] / sigma, basis))
+
+    def cost(thetas: FloatArray) -> FloatArray:
+        parts = [r.costs(cut, thetas, x0, weights, basis, n_pre) for r, cut, x0, weights, basis in jobs]
+        return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
+
+    return cost
