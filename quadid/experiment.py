@@ -20,7 +20,7 @@ from quadid.identify.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 
 if TYPE_CHECKING:
-    from quadid.identify.fit import Progress as Advance
+    from quadid.identify.global_search import Progress as Advance
     from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
 
