@@ -123,6 +123,7 @@ class Recording:
         warnings: what was wrong with the log and what was done about it.
         sha256: hash of the bytes read.
         grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
+        autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
     """
 
     name: str
@@ -132,6 +133,7 @@ class Recording:
     warnings: tuple[str, ...] = ()
     sha256: str = ""
     grid: float | None = None
+    autopilot: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

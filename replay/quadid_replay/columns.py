@@ -121,7 +121,14 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
 
 
-def assemble(name: str, kind: str, raw: Sequence[RawChannel], clock: LogClock, notes: Sequence[str]) -> Recording:
+def assemble(
+    name: str,
+    kind: str,
+    raw: Sequence[RawChannel],
+    clock: LogClock,
+    notes: Sequence[str],
+    autopilot: Mapping[str, float] | None = None,
+) -> Recording:
     """Cleans the channels and makes the recording; of several sources of one channel the first usable one is kept.
 
     Raises:
@@ -141,7 +148,7 @@ def assemble(name: str, kind: str, raw: Sequence[RawChannel], clock: LogClock, n
             "see docs/logs.md for the messages that are read",
         )  # fmt: skip
     warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
-    return Recording(name, kind, channels, tuple(clock.breaks), warnings)
+    return Recording(name, kind, channels, tuple(clock.breaks), warnings, autopilot=dict(autopilot or {}))
 
 
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:

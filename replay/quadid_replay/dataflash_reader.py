@@ -23,8 +23,16 @@ FloatArray = NDArray[np.float64]
 
 _ATTITUDE = ("Roll", "Pitch", "Yaw")
 _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
+_RATES = ("R", "P", "Y")
+_QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
 _QUATERNION = ("Q1", "Q2", "Q3", "Q4")
 _VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
+
+
+_STAMPED = (
+    "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", "RCOU", "ESC", "CTUN",
+    *_QUATERNIONS,
+)  # fmt: skip
 
 
 class _Source(NamedTuple):
@@ -47,7 +55,7 @@ def read_dataflash(path: Path) -> Recording:
     times = _recording_times(index, clock)
     parameters = _parameters(index)
     raw = [
-        *fastest_first(_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR"))),
+        *fastest_first([*_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR")), *_rates(index, times)]),
         *fastest_first(_vectors(index, times, "accel", _ACCEL, ("IMU", "ACC"))),
         *_attitude(index, times),
         *_reference(index, times),
@@ -56,7 +64,12 @@ def read_dataflash(path: Path) -> Recording:
         *_outputs(index, times, parameters),
         *_esc(index, times, parameters),
     ]
-    return assemble(path.name, "dataflash", raw, clock, _damage(index))
+    return assemble(_name(path), "dataflash", raw, clock, _damage(index), parameters)
+
+
+def _name(path: Path) -> str:
+    """ArduPilot numbers its logs from 1 on every vehicle: such a name only tells something with its folder's."""
+    return f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
 
 
 def _damage(index: DataflashIndex) -> list[str]:
@@ -73,22 +86,7 @@ def _damage(index: DataflashIndex) -> list[str]:
 def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatArray]:
     """Runs the stamps of all records that are used through one clock, in file order."""
     stamps: dict[str, FloatArray] = {}
-    for name in (
-        "IMU",
-        "GYR",
-        "ACC",
-        "ATT",
-        "XKF1",
-        "NKF1",
-        "EKF1",
-        "BAT",
-        "CURR",
-        "RCOU",
-        "ESC",
-        "CTUN",
-        "XKQ1",
-        "NKQ1",
-    ):
+    for name in _STAMPED:
         for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)):
             if index.has(name, column):
                 stamps[name] = index.column(name, column) * unit
@@ -142,13 +140,23 @@ def _vectors(
     return out
 
 
+def _rates(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    """The rate controller's input: filtered on board, but at the loop's rate where the IMU is logged slowly."""
+    source = _source(index, times, "RATE", _RATES)
+    if source is None:
+        return []
+    rates = np.radians(_stack(index, source, _RATES))
+    return [RawChannel("gyro", source.t, rates, "RATE (degrees/s, filtered on board)", source.refused)]
+
+
 def _attitude(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
     out = []
-    source = _source(index, times, "ATT", _ATTITUDE)
-    if source is not None:
-        angles = np.radians(_stack(index, source, _ATTITUDE))
-        out.append(RawChannel("attitude", source.t, from_euler(angles), "ATT (degrees)", source.refused))
-    for name in ("XKQ1", "NKQ1"):
+    for name in ("ATT", "ANG"):
+        source = _source(index, times, name, _ATTITUDE)
+        if source is not None:
+            angles = np.radians(_stack(index, source, _ATTITUDE))
+            out.append(RawChannel("attitude", source.t, from_euler(angles), f"{name} (degrees)", source.refused))
+    for name in _QUATERNIONS:
         source = _source(index, times, name, _QUATERNION)
         if source is not None:
             out.append(RawChannel("attitude", source.t, _stack(index, source, _QUATERNION), name, source.refused))
@@ -156,9 +164,9 @@ def _attitude(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawCh
 
 
 def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
-    """Desired angles of ATT with the last throttle output of CTUN."""
+    """Desired angles of ANG or ATT with the last throttle output of CTUN."""
     columns = ("DesRoll", "DesPitch", "DesYaw")
-    desired, throttle = _source(index, times, "ATT", columns), None
+    desired, throttle = _source(index, times, "ANG", columns) or _source(index, times, "ATT", columns), None
     column, unit = ("ThO", 1.0) if index.has("CTUN", "ThO") else ("ThrOut", 1e-3)
     if index.has("CTUN", column):
         throttle = _source(index, times, "CTUN", (column,))
@@ -170,7 +178,11 @@ def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawC
     angles = np.radians(_stack(index, desired, columns)[known])
     angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     values = np.column_stack([angles, level[latest[known]]])
-    return [RawChannel("attitude_reference", desired.t[known], values, f"ATT Des*, CTUN {column}", desired.refused)]
+    return [
+        RawChannel(
+            "attitude_reference", desired.t[known], values, f"{desired.name} Des*, CTUN {column}", desired.refused
+        )
+    ]
 
 
 def _states(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:

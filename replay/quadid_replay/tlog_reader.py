@@ -134,7 +134,7 @@ def read_tlog(path: Path) -> Recording:
     if others:
         notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")
     raw = _channels(vehicles[who], notes)
-    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes)
+    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
 
 
 def _notes(count: FrameCount, bad: int, size: int) -> list[str]:

@@ -7,6 +7,7 @@ expands nested message formats without limit.
 from __future__ import annotations
 
 import mmap
+import re
 import struct
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -91,7 +92,7 @@ def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozens
     if kind == ord("F"):
         _note_format(body, found.formats)
     elif kind == ord("A"):
-        if body[3:].decode("utf-8", "replace") not in topics or len(body) < 4:
+        if unversioned(body[3:].decode("utf-8", "replace")) not in topics or len(body) < 4:
             return
         found.wanted.add(body[1] | body[2] << 8)
     elif kind == ord("D") and len(body) > 2:
@@ -102,6 +103,11 @@ def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozens
     elif kind not in _DEFINITIONS:
         return
     found.clean.write(struct.pack("<HB", len(body), kind) + body)
+
+
+def unversioned(topic: str) -> str:
+    """Name of a topic without the version that newer PX4 appends (`vehicle_status_v1`)."""
+    return re.sub(r"_v\d{1,3}$", "", topic)
 
 
 def _next_record(data: mmap.mmap, offset: int, found: UlogRecords) -> int:

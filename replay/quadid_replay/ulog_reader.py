@@ -23,7 +23,7 @@ from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
-from quadid_replay.ulog_check import UlogRecords, collect_records
+from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
 
 FloatArray = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def read_ulog(path: Path) -> Recording:
         *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
         *_esc(log),
     ]
-    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size))
+    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), log.parameters)
 
 
 def _notes(records: UlogRecords, size: int) -> list[str]:
@@ -83,7 +83,7 @@ def _load(path: Path, records: UlogRecords) -> _Log:
             f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
             "a PX4 ULog", "copy the file again from the vehicle",
         ) from error  # fmt: skip
-    topics = {(d.name, d.multi_id): d.data for d in reversed(ulog.data_list)}
+    topics = {(unversioned(d.name), d.multi_id): d.data for d in reversed(ulog.data_list)}
     parameters = {
         str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)
     }  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from pyulog import ULog
 from quadid_replay import open_log
 from quadid_replay.motors import RPM
-from quadid_replay.ulog_check import collect_records
+from quadid_replay.ulog_check import collect_records, unversioned
 
 from quadid.errors import LogError
 from tests.faults.evidence import Happened
@@ -185,3 +185,9 @@ def test_data_appended_after_a_crash_is_read(tmp_path: Path) -> None:
     future[19 + 9] = 1
     with pytest.raises(LogError, match="does not know"):
         open_log(opened(tmp_path, bytes(future)))
+
+
+@pytest.mark.parametrize("name", ["vehicle_attitude_v1", "vehicle_attitude_v12"])
+def test_versions_behind_a_topic_make_no_difference(name: str) -> None:
+    assert unversioned(name) == "vehicle_attitude"
+    assert unversioned("actuator_motors") == "actuator_motors"
