@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 from quadid.effects import EFFECTS, known_keys, rotor_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
+from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
 
 FloatArray = NDArray[np.float64]
@@ -161,6 +162,7 @@ class Vehicle(_Strict):
         noise: known sensor noise, or None.
         stabiliser: known stabiliser gains, or None.
         mixer: from logged mixer inputs to rotors, a name of `MIXERS` or a matrix with a row a rotor; or None.
+        residual: forces and moments beyond the catalogue, of a file that predicts.
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
         arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
         thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
@@ -178,6 +180,7 @@ class Vehicle(_Strict):
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
+    residual: tuple[ResidualTerm, ...] = Field(default=(), max_length=MOST_TERMS)
     _remark: str = PrivateAttr("")
 
     @field_validator("parameters", mode="before")
@@ -330,7 +333,7 @@ class Vehicle(_Strict):
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
         data = self.model_dump(mode="json", exclude_none=True)
-        for name in ("mass_sigma", "arm_sigma", "thrust_stand"):
+        for name in ("mass_sigma", "arm_sigma", "thrust_stand", "residual"):
             if not data[name]:
                 del data[name]
         head = "".join(f"# {line}\n" for line in self._remark.splitlines())

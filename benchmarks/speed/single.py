@@ -142,12 +142,13 @@ def _single_cost(
     f, kernel = np.float32, kernels["rollout_kernel"]
     rollout, segments = objective.shooting.rollouts[0], objective.shooting.segments[0]
     (lanes,) = rollout._prepared(segments, 1, thetas[:LANES], None, 9)
-    need = kernels["needs_kernel"].Needs(*needs_of(thetas, 9))
+    need = kernels["needs_kernel"].Needs(*needs_of(thetas, 4, 9))
     window, length = rollout.window, segments.length
     room, ends = _aligned(9 * 2 * LANES).reshape(1, 1, -1), np.empty((0, 0, 0), f)
     arguments = (
         window.rotor_speed.astype(f), rollout._slope.astype(f), window.sampling == "held", rollout.geometry.astype(f),
-        kernel.Flight(*(f(x) for x in rollout._flight)), lanes.table.astype(f), rollout.measured.astype(f),
+        rollout._terms, kernel.Flight(*(f(x) for x in rollout._flight)), lanes.table.astype(f),
+        rollout.measured.astype(f),
         np.ascontiguousarray(objective.weights).astype(f), lanes.memory, segments.starts, 1, objective.x0.astype(f),
         thetas, np.zeros((12, 2 * LANES), f), need, 9, length, True, np.ascontiguousarray(objective.basis).astype(f),
         room, ends,

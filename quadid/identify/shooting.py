@@ -230,7 +230,7 @@ class Shooting:
         if self.robust is not None:
             weights = weights * self.robust[i]
         thetas, dx, steps = self._directions(theta, free, k)
-        lane = packing(thetas, self.channels)
+        lane = packing(thetas, self.layout.rotors, self.channels)
         thetas, dx = packed(thetas, lane), packed(dx, lane)
         whitening = self.noise.whitening(self.length, self.dt)
         into = Reduced.room(len(x0), k + local, len(steps) - k - local, self.length, self.channels)

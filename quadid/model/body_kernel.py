@@ -19,8 +19,9 @@ from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
 from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_GROUND, C_HOVER, C_HX, C_HY,
     C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX,
-    C_KY, C_KZ, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY, C_RZ, C_WE, C_WN, HALF, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q,
-    S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    C_KY, C_KZ, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY, C_RZ, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY,
+    L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY,
+    X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -60,7 +61,11 @@ def _body_of(air: bool, solid: bool, rare: bool) -> Any:
         sz = -thrust * s[C_INVM + lane]
         if rare:
             speed = s[C_CPAR + lane] * math.sqrt(u * u + v * v + w * w)
-            sx, sy, sz = sx - speed * u, sy - speed * v, sz - speed * w
+            sx, sy, sz = (
+                sx - speed * u + s[L_FX + lane],
+                sy - speed * v + s[L_FY + lane],
+                sz - speed * w + s[L_FZ + lane],
+            )
         if solid:
             sx, sy, sz = sx * im, sy * im, sz * im
         if air:
@@ -77,6 +82,8 @@ def _body_of(air: bool, solid: bool, rare: bool) -> Any:
         tx = -b * y2 + s[C_CGY + lane] * thrust + m * s[C_HY + lane] * hy + jr * q
         ty = b * x2 - s[C_CGX + lane] * thrust - m * s[C_HX + lane] * hx - jr * p
         tz = d * g * z2 + s[C_JSPIN + lane] * do
+        if rare:
+            tx, ty, tz = tx + s[L_MX + lane], ty + s[L_MY + lane], tz + s[L_MZ + lane]
         jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
         lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
         tx -= q * lz - r * ly

@@ -12,6 +12,7 @@ from quadid.attitude_controller import mixer_matrix, pack_gains
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
 from quadid.model.closed_loop_kernel import OUTPUTS, fly_closed_loop
+from quadid.model.layout import residual_terms
 from quadid.model.needs_kernel import needs_of
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
@@ -63,7 +64,7 @@ class ClosedLoop:
             raise ParameterError(f"stabiliser rate {rate} Hz", f"a whole multiple of {1.0 / window.dt:g} Hz")
         rollout = Rollout(window, vehicle)
         self.window, self.channels = window, rollout.channels
-        self._geometry, self._gains = rollout.geometry, pack_gains(gains)
+        self._geometry, self._terms, self._gains = rollout.geometry, residual_terms(vehicle), pack_gains(gains)
         self._mixer = mixer_matrix(vehicle, gains)
         self._references = np.ascontiguousarray(window.attitude_reference)
         self._flight = Flight(rollout.mass, rollout.reach, window.t0, window.dt, *window.log_span)
@@ -85,8 +86,8 @@ class ClosedLoop:
         full = np.concatenate([theta, np.repeat(theta[-1:], LANES - lanes, axis=0)])
         out = aligned((len(self.window), OUTPUTS, LANES))
         fly_closed_loop(
-            self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._flight, full,
-            needs_of(full, 9), self._x0, out,
+            self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._terms, self._flight, full,
+            needs_of(full, len(self._geometry), 9), self._x0, out,
         )  # fmt: skip
         return np.ascontiguousarray(np.moveaxis(out[..., :lanes], 2, 0))
 

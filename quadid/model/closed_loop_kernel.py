@@ -16,6 +16,7 @@ from quadid.model.body_kernel import step_full
 from quadid.model.kernel import body_constants, flight_factors, step_core
 from quadid.model.needs_kernel import Needs
 from quadid.model.rollout_kernel import Flight
+from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
 from quadid.model.rotor_kernel import rotor_constants, turn_delayed
 
 # isort: off
@@ -81,7 +82,8 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
 @nb.njit(**allocating)
 def _fly(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-    flight: Flight, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray,
+    flight: Flight, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray, terms: NDArray[np.int64],
+    coefficients: FloatArray, signals: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over rows and steps of `fly_closed_loop`, with its work space."""
     rotors, dt = len(geometry), flight.dt / substeps
@@ -109,6 +111,9 @@ def _fly(
             _rotors(step, geometry, dt, sent, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
+            if need.learned:
+                residual_signals(s, signals)
+                residual_forces(terms, coefficients, signals, step == 0, s)
             if need.full:
                 step_full(dt, s)
             else:
@@ -138,7 +143,7 @@ def _fly(
 @nb.njit(**allocating)
 def _fly_closed_loop(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-    flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
+    terms: NDArray[np.int64], flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Flies one block of lanes through a window.
 
@@ -149,6 +154,7 @@ def _fly_closed_loop(
         substeps: runs of the stabiliser a row.
         lanes: how many of the block's lanes are wanted.
         geometry: (rotors, 3): x, y [m], spin.
+        terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
         flight: numbers of the window.
         theta: parameter vectors (LANES, size).
         need: which parts of the model any lane needs.
@@ -169,7 +175,12 @@ def _fly_closed_loop(
     for i in range(N_STATE):
         s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
     s[E_QW : E_QW + LANES] = 1.0
-    _fly(references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot)
+    coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
+    signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
+    residual_coefficients(theta, rotors, coefficients)
+    _fly(
+        references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot, terms, coefficients, signals
+    )
 
 
 def _on_disk(sources: int) -> Any:

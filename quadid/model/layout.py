@@ -17,7 +17,8 @@ from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, rotor_losses
 from quadid.effects.kinds import Scale
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
-from quadid.vehicle import Vehicle
+from quadid.residual import MOST_FACTORS, SIGNALS, TARGETS
+from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]
 
@@ -86,7 +87,7 @@ class Layout:
     def __init__(self, vehicle: Vehicle) -> None:
         """Lays out the vector for `vehicle`; its scale (arm, weight, inertia) sets bounds and typical sizes."""
         self.rotors = len(vehicle.rotors)
-        self.size = LOSS + self.rotors
+        self.size = LOSS + self.rotors + len(vehicle.residual)
         scale = _scales(vehicle)
         entries: list[Entry] = []
         for index, name in enumerate(NOMINAL_NAMES):
@@ -100,6 +101,18 @@ class Layout:
         entries.extend(
             Entry(f"weak_rotor.loss_{i + 1}", LOSS + i, "", 0.0, loss.lower, loss.upper, loss.typical)
             for i in range(self.rotors)
+        )
+        entries.extend(
+            Entry(
+                f"residual.{i + 1}",
+                LOSS + self.rotors + i,
+                term.unit,
+                0.0,
+                -math.inf,
+                math.inf,
+                term.typical(vehicle.mass * GRAVITY, vehicle.arm),
+            )
+            for i, term in enumerate(vehicle.residual)
         )
         self.entries = {e.name: e for e in entries}
 
@@ -125,6 +138,7 @@ class Layout:
         theta = self.neutral()
         theta[: len(NOMINAL_NAMES)] = vehicle.initial
         self.write_effects(theta, vehicle.effects)
+        theta[LOSS + self.rotors :] = [term.value for term in vehicle.residual]
         return theta
 
     def write_effects(self, theta: FloatArray, effects: Mapping[str, Mapping[str, float]]) -> None:
@@ -153,6 +167,16 @@ class Layout:
             period = float(theta[IMU_PERIOD])
             return {"cutoff": 1.0 / period if period > 0.0 else math.inf}
         return {p.name: float(theta[_INDEX[f"{name}.{p.name}"]]) for p in EFFECTS[name].parameters}
+
+
+def residual_terms(vehicle: Vehicle) -> NDArray[np.int64]:
+    """Terms beyond the catalogue as numbers for the kernel, shape (terms, 4): target, three signals, 0 for none."""
+    signals, targets = ["", *SIGNALS], list(TARGETS)
+    rows = [
+        [targets.index(t.acts_on), *(signals.index(x) for x in t.product), *[0] * (MOST_FACTORS - len(t.product))]
+        for t in vehicle.residual
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 1 + MOST_FACTORS)
 
 
 def _scales(vehicle: Vehicle) -> dict[Scale, float]:

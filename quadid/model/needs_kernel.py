@@ -38,6 +38,7 @@ class Needs(NamedTuple):
     att_delay: bool
     imu_static: bool
     ahrs: bool
+    learned: bool
 
 
 AIR_ENTRIES = places("rotor_drag", "axial_inflow")
@@ -51,10 +52,10 @@ ROTOR_ENTRIES = places("motor_lag", "command_delay", "thrust_curve")
 
 
 @nb.njit(**jit)
-def _needs_of(theta: FloatArray, channels: int) -> Needs:
+def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
     """Returns what a block of parameter vectors (LANES, size) needs of the model."""
     air, solid, rare, factors, varied, imu_static = channels > 9, False, False, False, False, False
-    delayed, imu_lag, att_delay, ahrs = False, False, False, False
+    delayed, imu_lag, att_delay, ahrs, learned = False, False, False, False, False
     for lane in range(len(theta)):
         for i in AIR_ENTRIES:
             air |= theta[lane, i] != 0.0
@@ -66,16 +67,21 @@ def _needs_of(theta: FloatArray, channels: int) -> Needs:
             factors |= theta[lane, i] != 0.0
         for i in ROTOR_ENTRIES:
             varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS, theta.shape[1]):
+        for i in range(ix.LOSS, ix.LOSS + rotors):
             varied |= theta[lane, i] != theta[0, i]
+        for i in range(ix.LOSS + rotors, theta.shape[1]):
+            learned |= theta[lane, i] != 0.0
         for i in IMU_ENTRIES:
             imu_static |= theta[lane, i] != 0.0
         delayed |= theta[lane, ix.DELAY] > 0.0
         imu_lag |= theta[lane, ix.IMU_PERIOD] > 0.0
         att_delay |= theta[lane, ix.ATT_DELAY] > 0.0
         ahrs |= theta[lane, ix.AHRS_K] != 0.0
-    air, solid = air or rare, solid or factors
-    return Needs(air or solid, air, solid, rare, not varied, delayed, factors, imu_lag, att_delay, imu_static, ahrs)
+    rare, solid = rare or learned, solid or factors or learned
+    air = air or rare
+    return Needs(
+        air or solid, air, solid, rare, not varied, delayed, factors, imu_lag, att_delay, imu_static, ahrs, learned
+    )
 
 
 def _on_disk(sources: int) -> Any:

@@ -22,7 +22,7 @@ _ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7
 """Nanoseconds a particle and step, beside the plain ones; `python -m benchmarks.speed --parts pieces` measures them."""
 
 
-def packing(thetas: FloatArray, channels: int) -> NDArray[np.intp]:
+def packing(thetas: FloatArray, rotors: int, channels: int) -> NDArray[np.intp]:
     """Lane of each of these parameter vectors (m, size), the first one in lane 0, shape (m,).
 
     Of a few orders by what a vector needs beyond the first one, the one that should take least time.  Lanes beyond the
@@ -35,7 +35,7 @@ def packing(thetas: FloatArray, channels: int) -> NDArray[np.intp]:
     for feature, entries in groups:
         features[:, feature] = (thetas[:, list(entries)] != 0.0).any(axis=1)
     features[:, _AIR] |= channels > 9
-    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS :]], axis=1)
+    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS : ix.LOSS + rotors]], axis=1)
     features[:, _ROTORS] = (own != own[0]).any(axis=1)
     for feature, entry in ((_DELAYED, ix.DELAY), (_FILTER, ix.IMU_PERIOD), (_LATE, ix.ATT_DELAY), (_AHRS, ix.AHRS_K)):
         features[:, feature] = thetas[:, entry] != 0.0

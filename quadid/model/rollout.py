@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
+from quadid.model.layout import residual_terms
 from quadid.model.needs_kernel import Needs, needs_of
 from quadid.model.rollout_kernel import N_TANGENT, Flight, roll_segments
 from quadid.model.rotor_kernel import rotor_table
@@ -130,6 +131,7 @@ class Rollout:
             self.channels = 15 if window.position is not None else 12
         self.measured, self.valid = _measured(window, self.channels)
         self._slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
+        self._terms = residual_terms(vehicle)
         self._mask = self.valid.astype(np.float64)
         self._flight = Flight(self.mass, self.reach, window.t0, window.dt, *window.log_span)
         self._tables: OrderedDict[tuple[float, float, float, bytes], FloatArray] = OrderedDict()
@@ -277,7 +279,7 @@ class Rollout:
         return [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]
 
     def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
-        need = needs_of(theta, channels)
+        need = needs_of(theta, len(self.geometry), channels)
         table = self._table(theta, need) if need.shared else _NO_TABLE
         lag, late = float(theta[:, ix.TAU].max()), float(theta[:, ix.DELAY].max())
         memory = math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
@@ -285,7 +287,12 @@ class Rollout:
 
     def _table(self, theta: FloatArray, need: Needs) -> FloatArray:
         """Rotor moments of every step for lanes with the same rotors; kept for the next calls."""
-        key = (theta[0, ix.TAU], theta[0, ix.DELAY], theta[0, ix.DEAD_SPEED], theta[0, ix.LOSS :].tobytes())
+        key = (
+            theta[0, ix.TAU],
+            theta[0, ix.DELAY],
+            theta[0, ix.DEAD_SPEED],
+            theta[0, ix.LOSS : ix.LOSS + len(self.geometry)].tobytes(),
+        )
         table = self._tables.get(key)
         if table is None:
             w = self.window
@@ -304,9 +311,9 @@ class Rollout:
     ) -> None:  # fmt: skip
         w = self.window
         roll_segments(
-            w.rotor_speed, self._slope, w.sampling == "held", self.geometry, self._flight, lanes.table, self.measured,
-            scale, lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1],
-            segments.length, basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
+            w.rotor_speed, self._slope, w.sampling == "held", self.geometry, self._terms, self._flight, lanes.table,
+            self.measured, scale, lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need,
+            scale.shape[1], segments.length, basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from quadid.model.body_kernel import step_air, step_air_rare, step_air_solid, step_full, step_solid
 from quadid.model.kernel import body_constants, flight_factors, step_core, step_core_shared
 from quadid.model.needs_kernel import Needs
+from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
 from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step, spread_moments
 
 # isort: off
@@ -150,7 +151,7 @@ def _march(
     measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
     dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
     ends: FloatArray, cost: FloatArray, s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray,
-    total: FloatArray, inside: FloatArray,
+    total: FloatArray, inside: FloatArray, terms: NDArray[np.int64], coefficients: FloatArray, signals: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
@@ -187,6 +188,9 @@ def _march(
             at, row = (0, 0) if sums else (seg, i - n_pre)
             if scored and channels > 9:
                 compare_motion(at, row, k, measured, scale, s, out)
+            if need.learned:
+                residual_signals(s, signals)
+                residual_forces(terms, coefficients, signals, i == 0, s)
             # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
             if need.rare and need.solid:
                 step_full(dt, s)
@@ -232,10 +236,10 @@ def _march(
 
 @nb.njit(**allocating)
 def _roll_segments(
-    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray,
-    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
-    theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray,
-    out: FloatArray, ends: FloatArray, cost: FloatArray,
+    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, terms: NDArray[np.int64], flight: Flight,
+    table: FloatArray, measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int,
+    x0: FloatArray, theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool,
+    basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
 
@@ -248,6 +252,7 @@ def _roll_segments(
         slope: of a held input within its samples, see `rotors_step`.
         held: the input acts held, else linear between samples.
         geometry: (rotors, 3): x, y [m], spin.
+        terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
         flight: numbers of the window.
         table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
         measured: (n, 16), see `compare`.
@@ -283,9 +288,12 @@ def _roll_segments(
     body_constants(theta, flight.mass, rotors, flight.reach, s)
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
+    coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
+    signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
+    residual_coefficients(theta, rotors, coefficients)
     _march(
         u, slope, held, geometry, flight, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg,
-        sums, basis, out, ends, cost, s, rot, ahead, past, total, inside,
+        sums, basis, out, ends, cost, s, rot, ahead, past, total, inside, terms, coefficients, signals,
     )  # fmt: skip
 
 

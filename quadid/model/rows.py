@@ -53,7 +53,10 @@ HALF = 9 * LANES
 (E_QW, E_QX, E_QY, E_QZ, N_QW, N_QX, N_QY, N_QZ) = _rows(G_BEND + 3 * LANES, 8)
 # Delayed attitude: state looked up in the past, its rate, the rate before that, and how far back from there.
 (D_QW, D_QX, D_QY, D_QZ, D_P, D_Q, D_R, D_P0, D_Q0, D_R0, D_H) = _rows(N_QZ + LANES, 11)
-N_ROWS = D_H // LANES + 1
+# What acts beyond the catalogue: specific force [m/s^2] and moment [N m]; mean over a step, at its start, at the last.
+(L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, L_NOW) = _rows(D_H + LANES, 7)
+L_PAST = L_NOW + 6 * LANES
+N_ROWS = L_PAST // LANES + 6
 
 # Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gain; the
 # input's slope one sample back, now, one ahead.

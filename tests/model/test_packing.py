@@ -32,7 +32,7 @@ def one_each() -> FloatArray:
 
 def test_every_vector_has_a_lane_of_its_own_and_the_first_has_the_first() -> None:
     thetas = one_each()
-    lane = packing(thetas, 9)
+    lane = packing(thetas, 4, 9)
     assert lane[0] == 0
     assert len(set(lane.tolist())) == len(thetas)
     assert lane.max() < -(-len(thetas) // LANES) * LANES
@@ -41,15 +41,15 @@ def test_every_vector_has_a_lane_of_its_own_and_the_first_has_the_first() -> Non
 
 def test_vectors_that_need_little_are_not_beside_those_that_need_much() -> None:
     thetas = one_each()
-    spread = packed(thetas, packing(thetas, 9))
-    blocks = [needs_of(spread[i : i + LANES], 9) for i in range(0, len(spread), LANES)]
+    spread = packed(thetas, packing(thetas, 4, 9))
+    blocks = [needs_of(spread[i : i + LANES], 4, 9) for i in range(0, len(spread), LANES)]
     assert sum(b.shared for b in blocks) >= len(blocks) - 1
     assert sum(b.air for b in blocks) <= 2
     assert sum(b.imu_lag or b.att_delay or b.ahrs for b in blocks) <= 2
 
 
 def test_few_vectors_stay_where_they_are() -> None:
-    np.testing.assert_array_equal(packing(one_each()[:LANES], 9), np.arange(LANES))
+    np.testing.assert_array_equal(packing(one_each()[:LANES], 4, 9), np.arange(LANES))
 
 
 @pytest.mark.parametrize("channels", [9, 15])
@@ -63,7 +63,7 @@ def test_the_lane_does_not_change_the_result(channels: int) -> None:
         out, _ = rollout.roll(segments, vectors, x0, n_pre=8)
         return np.moveaxis(out, -1, 1).reshape(-1, *out.shape[1:4])
 
-    lane = packing(thetas, channels)
+    lane = packing(thetas, 4, channels)
     difference = rolled(packed(thetas, lane))[lane] - rolled(thetas)[: len(thetas)]
     assert np.abs(difference).max() < 1e-11
 

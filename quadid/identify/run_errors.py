@@ -1,0 +1,100 @@
+"""Errors of runs from measured states, as a share of what predicting no change would miss by in the same flight.
+
+The error that a prediction is judged by: Euclidean, a tenth to half a second after a measured state.  Its normal
+equations serve whoever makes it small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import NotIdentifiableError
+from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+STAGES = ((0.1,), (0.1, 0.2, 0.3), (0.1, 0.2, 0.3, 0.4, 0.5))
+"""Times after the start [s] at which errors count, near ones first: there even a poor start is nearly linear."""
+_NEAR = 0.05
+"""Errors below this share of no change weigh as if they were as large; keeps the weights finite."""
+_CALM = 0.1
+"""A flight counts as if no change missed by at least this share of what it misses by in all flights."""
+_STEP = 1e-3
+"""Share of a direction by which slopes are differenced."""
+
+
+class RunErrors:
+    """Errors at some times after the start, over all flights."""
+
+    def __init__(self, windows: Sequence[Window], vehicle: Vehicle, seconds: Sequence[float], most: int) -> None:
+        """Prepares runs.
+
+        Args:
+            windows: flights, on one grid.
+            vehicle: geometry and mass.
+            seconds: times after the start at which errors count.
+            most: runs at most; of longer logs every n-th.
+
+        Raises:
+            NotIdentifiableError: no run fits into any window.
+        """
+        dt = windows[0].dt
+        self.at = np.unique(np.maximum(np.round(np.array(seconds) / dt).astype(int), 1))
+        longest = int(self.at[-1])
+        every = max(-(-sum(len(w) for w in windows) // most), 1)
+        self._loops = [loop for w in windows if len((loop := OpenLoop(w, vehicle, longest, every)).rows)]
+        if not self._loops:
+            raise NotIdentifiableError(
+                f"no run of {longest * dt:g} s fits: measured rate, and no gap after it",
+                f"stretches longer than {longest * dt:g} s with gyro", "log without gaps",
+            )  # fmt: skip
+        self._scales = _scales(self._loops, self.at)
+        self._counts = np.sum([loop.counted(loop.rows, self.at).sum(axis=0) for loop in self._loops], axis=0)
+
+    def share(self, theta: FloatArray) -> float:
+        """Mean error of the full vector `theta` (size,) as a share of no change; infinite where a run went away."""
+        shares = [
+            lengths(loop.misses(theta[None], self.at)[0]) / scale
+            for loop, scale in zip(self._loops, self._scales, strict=True)
+        ]
+        return float(np.mean(mean_of_known(np.concatenate(shares))[self._counts > 0]))
+
+    def equations(self, theta: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Curvature (P, P) and half the slope (P,) of the summed errors along `directions` (P, size).
+
+        An error weighs by its own inverse, so that squares stand for lengths (Weiszfeld); runs that went away are left
+        out.
+        """
+        p = len(directions)
+        ends = np.concatenate([theta[None], theta + _STEP * directions, theta - _STEP * directions])
+        h, g = np.zeros((p, p)), np.zeros(p)
+        for loop, scale in zip(self._loops, self._scales, strict=True):
+            misses = loop.misses(ends, self.at)
+            usable = np.asarray(np.isfinite(misses).all(axis=(0, 4)))
+            share = lengths(misses[0]) / scale
+            weight = np.where(usable, 1.0 / np.maximum(share, _NEAR), 0.0) / np.maximum(self._counts, 1)
+            root = (np.sqrt(weight) / scale)[..., None]
+            residual = np.where(usable[..., None], misses[0], 0.0) * root
+            with np.errstate(invalid="ignore"):
+                slope = (misses[1 : 1 + p] - misses[1 + p :]) / (2.0 * _STEP)
+            j = (np.where(usable[..., None], slope, 0.0) * root).reshape(p, -1)
+            h, g = h + j @ j.T, g + j @ residual.ravel()
+        return h, g
+
+
+def _scales(loops: Sequence[OpenLoop], at: NDArray[np.intp]) -> list[FloatArray]:
+    """What no change misses by in the flight of each loop, shape (at, 4)."""
+    flights = [(loop.window.name, loop.window.log_span) for loop in loops]
+    still = [loop.no_change(at) for loop in loops]
+    everywhere = mean_of_known(np.concatenate(still))
+    floor = np.where(everywhere > 0.0, everywhere, 1.0) * _CALM
+    means = {
+        flight: mean_of_known(np.concatenate([e for e, own in zip(still, flights, strict=True) if own == flight]))
+        for flight in set(flights)
+    }
+    return [np.fmax(means[flight], floor) for flight in flights]
