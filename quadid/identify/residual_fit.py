@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.errors import NotIdentifiableError
 from quadid.identify.run_errors import STAGES, RunErrors
 from quadid.model.layout import Layout
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
@@ -27,7 +26,7 @@ FloatArray = NDArray[np.float64]
 SIZES = (6, 15, 30, 60)
 """Numbers of terms that are tried."""
 RIDGE = 1e-3
-"""Curvature that holds a coefficient of typical size back, relative to a mean error of one; its gain below it is noise."""
+"""Curvature that holds coefficients of typical size back, relative to a mean error of one."""
 SIMPLER = 0.02
 """A smaller model is preferred when its error on data not fitted is larger by no more than this share."""
 WORTH = 0.97

@@ -86,8 +86,8 @@ class ClosedLoop:
         full = np.concatenate([theta, np.repeat(theta[-1:], LANES - lanes, axis=0)])
         out = aligned((len(self.window), OUTPUTS, LANES))
         fly_closed_loop(
-            self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._terms, self._flight, full,
-            needs_of(full, len(self._geometry), 9), self._x0, out,
+            self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._terms, self._flight,
+            full, needs_of(full, len(self._geometry), 9), self._x0, out,
         )  # fmt: skip
         return np.ascontiguousarray(np.moveaxis(out[..., :lanes], 2, 0))
 

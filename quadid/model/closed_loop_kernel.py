@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from quadid.model.body_kernel import step_full
 from quadid.model.kernel import body_constants, flight_factors, step_core
 from quadid.model.needs_kernel import Needs
-from quadid.model.rollout_kernel import Flight
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
+from quadid.model.rollout_kernel import Flight
 from quadid.model.rotor_kernel import rotor_constants, turn_delayed
 
 # isort: off
@@ -178,9 +178,7 @@ def _fly_closed_loop(
     coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
     signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
     residual_coefficients(theta, rotors, coefficients)
-    _fly(
-        references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot, terms, coefficients, signals
-    )
+    _fly(references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot, terms, coefficients, signals)
 
 
 def _on_disk(sources: int) -> Any:
