@@ -1,6 +1,6 @@
 """How often a diagnosis cries wolf, and whether its intervals hold: many flights without effects and with one.
 
-    python -m studies.calibration --nulls 100 --singles 75 --records calibration.jsonl --page docs/diagnosis-method.md
+    python -m studies.calibration --nulls 80 --singles 75 --records FILE --page docs/results/calibration.md
 
 Every flight is decided by its number alone; numbers begin where the blinded campaign never goes.  A run that is
 stopped goes on from its records.
@@ -23,14 +23,14 @@ import numpy as np
 from scipy import stats
 
 from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose import search as rule
-from quadid.diagnose.blocks import Gain, paired_gain
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.models import Model, extend
+from quadid.diagnose import log_evidence as rule
+from quadid.diagnose.cross_validation import Gain, paired_gain
+from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.model import Model, extend
 from quadid.diagnose.pipeline import Workings
-from quadid.diagnose.remainder import ALARM
+from quadid.diagnose.residual_tests import ALARM
 from quadid.diagnose.result import FoundParameter
-from quadid.diagnose.screen import screen
+from quadid.diagnose.score_test import screen
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
 from quadid.identify.covariance import Z95
@@ -67,9 +67,8 @@ def _gates(workings: Workings) -> dict[str, Any]:
     left = workings.remainder
     return {
         "screened": [float(stats.chi2.sf(s.drop, len(s.candidate.names))) for s in scores],
-        "errors": sum(t.gain.total > rule.ERRORS * t.gain.error for t in trials),
-        "gain": sum(t.gain.total > rule.LEAST_SHARE * model.rows for t in trials),
-        "chance": sum(t.chance < rule.FALSE_ALARM for t in trials),
+        "gain": sum(t.gain.total > rule.RELEVANT * model.rows for t in trials),
+        "chance": sum(t.likely for t in trials),
         "largest_gain": max((t.gain.total / model.rows for t in trials), default=0.0),
         "power": max((s.errors for s in left.channels), default=0.0),
         "follows": len(left.followed),
@@ -78,18 +77,18 @@ def _gates(workings: Workings) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Refit:
-    """One candidate refitted: its gain on blocks not fitted, and the chance of its evidence among all tried."""
+    """One candidate refitted: its gain on blocks not fitted, and whether its evidence is beyond chance."""
 
     gain: Gain
-    chance: float
+    likely: bool
 
 
 def _refit(shooting: Shooting, model: Model, candidate: Candidate, tests: int) -> Refit:
     """Refits one candidate as the selection does it."""
-    extended = extend(shooting, model, candidate)
-    evidence = min(model.deviance - extended.deviance, extended.wald(candidate))
-    chance = float(stats.chi2.sf(evidence, len(candidate.names))) * tests
-    return Refit(paired_gain(model.held_out, extended.held_out), chance)
+    extended = extend(shooting, model, candidate, tried=float(tests))
+    alike = rule.calibration([model, extended])
+    likely = rule.log_evidence(extended, alike) > rule.log_evidence(model, alike)
+    return Refit(paired_gain(model.held_out, extended.held_out), likely)
 
 
 def _errors(case: Case, found: Diagnosis) -> dict[str, dict[str, float]]:
@@ -152,7 +151,6 @@ def null_page(records: list[Record], seconds: float) -> str:
     rows = [
         ("a cause named", sum(bool(r["named"]) for r in good)),
         ("verdict `unknown`", sum(r["verdict"] == "unknown" for r in good)),
-        ("a trial gains more than two standard errors of its blocks", sum(g["errors"] > 0 for g in gates)),
         ("a trial gains the least share", sum(g["gain"] > 0 for g in gates)),
         ("a trial is beyond chance, all trials counted", sum(g["chance"] > 0 for g in gates)),
         ("remainder: power above the noise", sum(g["power"] > ALARM for g in gates)),
@@ -165,11 +163,11 @@ def null_page(records: list[Record], seconds: float) -> str:
     return (
         f"{n} flights of {seconds:.0f} s without any effect ({len(records) - n} failed); 95 % intervals of\n"
         "the binomial law, exact. The best three causes of each screening were refitted whatever they promised;\n"
-        "rows three to five say what each part of the rule alone would have let through. The selection\n"
-        "asks for all three.\n\n"
+        "rows three and four say what each part of the rule alone would have let through. The selection\n"
+        "asks for both.\n\n"
         f"| flights in which | share |\n|---|---|\n{table}\n\n"
         f"Largest gain on unseen blocks of any of these trials, as a share of the noise: median {largest[0]:.5f},\n"
-        f"95 % quantile {largest[1]:.5f}, largest {largest[2]:.5f}; the rule asks for {rule.LEAST_SHARE}.\n\n"
+        f"95 % quantile {largest[1]:.5f}, largest {largest[2]:.5f}; the rule asks for {rule.RELEVANT}.\n\n"
         f"Score tests of all causes with p below {tails}.\n"
         "Causes of one flight share its noise, so these intervals are too narrow."
     )
@@ -234,7 +232,7 @@ def main() -> None:
     for name, text in pages.items():
         print(f"\n## {name}\n\n{text}")
         if options.page:
-            put_section(options.page, "Diagnosis: the method", name, text)
+            put_section(options.page, "Diagnosis: false alarms and coverage", name, text)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.validation import settle
+from quadid.diagnose.attribution import settle
 from quadid.flight import draw_truth, fly
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import FitOptions, fit

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from quadid.chi_square import survival
-from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.models import Model
+from quadid.diagnose.attribution import Worth
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
-from quadid.diagnose.search import Search
-from quadid.diagnose.validation import Worth
-from quadid.diagnose.words import evidence
+from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
 from quadid.identify.covariance import Z95, uncertainty
 from quadid.identify.shooting import Shooting
@@ -50,7 +49,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         gain=benefit,
         p_value=_p_value(search, cause),
         alternatives=_alternatives(search, cause, benefit.mse_after),
-        evidence=evidence(cause.effect, values, benefit.mse_before, benefit.mse_after),
+        evidence=_sentence(cause.effect, values, benefit.mse_before, benefit.mse_after),
         per_log=EFFECTS[cause.effect].per_log,
         ordinary=worth.ordinary,
     )
@@ -100,11 +99,27 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
     """
     found: dict[str, Alternative] = {}
     for step in search.rounds:
-        if step.accepted is None or step.accepted.candidate.label != cause.label:
-            continue
-        mine = step.accepted.model
         for t in step.trials:
-            if t.candidate.effect != cause.effect and t.gain.total > 0.0:
+            holder = t.gone or (step.accepted.candidate if step.accepted else None)
+            mine = step.before if t.gone or step.accepted is None else step.accepted.model
+            if t.candidate is None or holder is None or holder.label != cause.label:
+                continue
+            if t.candidate.effect != cause.effect:
                 worse = float(t.model.held_out.sum() - mine.held_out.sum()) / mine.rows
                 found[t.candidate.effect] = Alternative(t.candidate.effect, mse_after + worse)
     return tuple(sorted(found.values(), key=lambda a: a.mse_after)[:MOST_ALTERNATIVES])
+
+
+def _sentence(effect: str, values: Mapping[str, float], before: float, after: float) -> str:
+    """Sentence of one finding.
+
+    Args:
+        effect: contract name.
+        values: its numbers in contract units.
+        before: mean squared error on unseen data without it (noise floor 1).
+        after: the same with it.
+    """
+    body = EFFECTS[effect].told(values)
+    return (
+        f"{body[0].upper()}{body[1:]}; on unseen data the error falls from {before:.3g} to {after:.3g} times the noise."
+    )

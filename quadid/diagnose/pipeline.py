@@ -8,22 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.acceptance import doubtful, prune
-from quadid.diagnose.backward import eliminate
-from quadid.diagnose.belief import beyond_belief
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.climb import LINEAR_MISFIT, is_long
-from quadid.diagnose.data_faults import data_faults, without_copies
+from quadid.data_faults import data_faults, without_copies
+from quadid.diagnose.attribution import validate
+from quadid.diagnose.extended_vehicle import Fitted, extended_vehicle
 from quadid.diagnose.findings import describe
-from quadid.diagnose.foresight import POOR, refit_to_predict
-from quadid.diagnose.form import inconstant
-from quadid.diagnose.models import Model, fit_model, free_names
-from quadid.diagnose.remainder import Remainder, remainder
+from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.model import Model, fit_model, free_names
+from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.prediction import POOR, refit_to_predict
+from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
-from quadid.diagnose.search import Search, select
-from quadid.diagnose.validation import validate
-from quadid.diagnose.vehicle_file import Fitted, extended_vehicle
-from quadid.diagnose.whole_rest import with_look_alike
+from quadid.diagnose.segment_schedule import is_long
+from quadid.diagnose.selection import Search, pruned, select
 from quadid.errors import NotIdentifiableError
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
@@ -103,15 +99,17 @@ def diagnose(
     begun, search = _select(windows, begun, report)
     decisive = search.shooting
     nominal = _usual_nominal(begun, search)
-    search, left = _with_rest(search, nominal, begun, seed)
+    left = remainder(decisive, search.model, seed)
     report("validation", 0.0)
     outcome, per_finding = validate(decisive, search, validation, begun.listed)
-    beyond, doubts = beyond_belief(begun.short, search.model), dict(inconstant(search.model, left))
-    verdict = judge(nominal, search.model, left)
+    doubts = impossible_causes(search.model) | inconstant_causes(search.model, left)
+    unnamed = sum(max(w.deviance, 0.0) for w in per_finding if w.cause.label in doubts)
+    verdict = judge(nominal, search.model, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
-    if search.model.causes and (outcome.contradicted or beyond or saturated or len(doubts) == len(search.model.causes)):
+    if search.model.causes and (outcome.contradicted or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
-    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c not in doubts]
+    alike = {c.family for c in search.model.causes if c.label in doubts}
+    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
     findings = describe(decisive, search, per_finding, believed)
     foresight, said = None, []
     if verdict is Verdict.UNKNOWN and search.model.reduced_chi_square > POOR:
@@ -126,7 +124,7 @@ def diagnose(
     text = extended_vehicle(vehicle, decisive.layout, fitted)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
-    warnings = (*(f.text for f in faults), *beyond, *doubts.values(), *said)
+    warnings = (*(f.text for f in faults), *doubts.values(), *said)
     result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, foresight)
     return result, Workings(search, begun.short, decisive, left)
 
@@ -136,14 +134,14 @@ class _Begun:
     """What the selection starts from.
 
     Attributes:
-        short: short segments; ladder: the lengths that may decide, short ones last.
+        short: short segments; schedule: the lengths that may decide, short ones last.
         nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
         elsewhere: other nominal parameters to start from, each of shape (6,).
         listed: the catalogue.
     """
 
     short: Shooting
-    ladder: list[Shooting]
+    schedule: list[Shooting]
     nominal: FloatArray
     flexible: FloatArray
     elsewhere: list[FloatArray]
@@ -151,7 +149,7 @@ class _Begun:
 
 
 def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
-    """Fits the nominal model, estimates the noise, cuts the data into the segments of the ladder."""
+    """Fits the nominal model, estimates the noise, cuts the data into the segments of the schedule."""
     short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
     free = short.free(NOMINAL_NAMES)
     start = short.layout.initial(vehicle)
@@ -170,22 +168,17 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     else:
         flexible = flexible_fit(windows, short, [first.theta], free, short.noise)
     short = short.with_noise(flexible.noise)
-    ladder = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
-    ladder = [*(s for s in ladder if s.count >= FEWEST_SEGMENTS), short]
+    schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
+    schedule = [*(s for s in schedule if s.count >= FEWEST_SEGMENTS), short]
     elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15)
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    return _Begun(short, ladder, first.theta, flexible.theta, elsewhere, listed)
+    return _Begun(short, schedule, first.theta, flexible.theta, elsewhere, listed)
 
 
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
-    """Selects causes forwards, where that leads nowhere backwards, and again when they show the noise to be less."""
-    search = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere)
-    if search.model.reduced_chi_square > LINEAR_MISFIT:
-        # One by one led nowhere; from everything at once it may.
-        general = eliminate(begun.short, begun.flexible, begun.listed)
-        other = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere, general)
-        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
+    """Selects causes, and again when they show the noise to be less."""
+    search = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere)
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
             break
@@ -198,12 +191,10 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple
         begun, search = _with_noise(noise, begun, search)
         if np.all(noise.variance > NOISE_FELL * before):
             break
-        again = select(begun.ladder, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
+        again = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    # Refitted on longer segments or under less noise, a cause may be nothing any more.
-    suspects = doubtful(search.model, search.tests)
-    model = prune(search.shooting, search.model, suspects, search.nominal, search.tests)
-    return begun, replace(search, model=model)
+    # Under less noise a cause may be nothing any more.
+    return begun, replace(search, model=pruned(search.shooting, search.model))
 
 
 def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:
@@ -214,12 +205,12 @@ def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> N
 
 def _with_noise(noise: NoiseModel, begun: _Begun, search: Search) -> tuple[_Begun, Search]:
     """Problems under another noise model, nominal and selected model refitted there."""
-    ladder = [s.with_noise(noise) for s in begun.ladder]
-    begun = replace(begun, ladder=ladder, short=ladder[-1])
+    schedule = [s.with_noise(noise) for s in begun.schedule]
+    begun = replace(begun, schedule=schedule, short=schedule[-1])
     decisive = search.shooting.with_noise(noise)
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
-    model = replace(model, worth=search.model.worth)
+    model = replace(model, tried=search.model.tried)
     return begun, replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
@@ -227,26 +218,21 @@ def _usual_nominal(begun: _Begun, search: Search) -> Model:
     """Nominal model on segments of usual length, from which the verdict counts what is explained."""
     if not is_long(search.shooting):
         return search.nominal
-    return fit_model(next(s for s in begun.ladder if not is_long(s)), search.nominal.theta, ())
+    return fit_model(next(s for s in begun.schedule if not is_long(s)), search.nominal.theta, ())
 
 
-def _with_rest(search: Search, nominal: Model, begun: _Begun, seed: int) -> tuple[Search, Remainder]:
-    """What the selection leaves; with one more look-alike of its causes if that leaves nothing."""
-    left = remainder(search.shooting, search.model, seed)
-    if judge(nominal, search.model, left) in (Verdict.NOTHING_FOUND, Verdict.EXPLAINED) or not search.model.causes:
-        return search, left
-    fuller = with_look_alike(search, nominal, left, begun.listed)
-    if fuller is None:
-        return search, left
-    rest = remainder(fuller.shooting, fuller.model, seed)
-    return (fuller, rest) if judge(nominal, fuller.model, rest) is Verdict.EXPLAINED else (search, left)
+def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Verdict:
+    """Verdict from what the causes explain and what is left.
 
-
-def judge(nominal: Model, model: Model, left: Remainder) -> Verdict:
-    """Verdict from what the causes explain and what is left."""
-    explained = max(float(nominal.held_out.sum() - model.held_out.sum()), 0.0)
+    Args:
+        nominal: model without causes.
+        model: the selected one.
+        left: what it leaves.
+        unnamed: deviance that causes which are not what their names say take away; it counts as left.
+    """
+    explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
     least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
-    structure = left.deviance if left.deviance > least else 0.0
+    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:

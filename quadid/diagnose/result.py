@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from quadid.diagnose.foresight import Foresight
-from quadid.diagnose.remainder import Remainder
+from quadid.diagnose.prediction import Foresight
+from quadid.diagnose.residual_tests import Remainder
 from quadid.jsonable import jsonable
 
 
@@ -70,7 +70,7 @@ class Finding:
         alternatives: look-alikes refitted in its place, best first.
         evidence: one sentence a pilot understands.
         per_log: its values belong to the flight, not the vehicle.
-        ordinary: no larger than it may be on any vehicle (`diagnose.clutter`); such come after all others.
+        ordinary: no larger than it may be on any vehicle (`diagnose.attribution`); such come after all others.
     """
 
     effect: str

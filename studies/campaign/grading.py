@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.diagnose import Diagnosis, Workings, diagnose
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.models import Model, extend, fit_model
-from quadid.diagnose.validation import block_deviance
+from quadid.diagnose.attribution import block_deviance
+from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.model import Model, extend, fit_model
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
 from quadid.identify.shooting import Shooting

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.models import Model, fit_model
+from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.model import Model, fit_model
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import polish

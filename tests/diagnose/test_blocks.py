@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import lfilter
 
-from quadid.diagnose.blocks import BLOCK_SECONDS, block_labels, held_out_deviance, paired_gain
-from quadid.diagnose.models import extend
-from quadid.diagnose.validation import settle
+from quadid.diagnose.attribution import settle
+from quadid.diagnose.cross_validation import BLOCK_SECONDS, block_labels, held_out_deviance, paired_gain
+from quadid.diagnose.model import extend
 from quadid.identify.gauss_newton import polish
 from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import MEASURED, Shooting

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnose.clutter import UNTIDY, clutter_names, ordinary, untidy_names, without_in_clutter
-from quadid.diagnose.models import Model, extend
+from quadid.diagnose.attribution import UNTIDY, clutter_names, ordinary, untidy_names, without_in_clutter
+from quadid.diagnose.model import Model, extend
 from quadid.identify.segment_cost import Linearised
 from quadid.parameters import NOMINAL_NAMES
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from quadid.diagnose import acceptance
-from quadid.diagnose.blocks import BLOCK_SECONDS
+from quadid.diagnose import log_evidence
+from quadid.diagnose.cross_validation import BLOCK_SECONDS
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
 
@@ -29,10 +29,8 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
 @pytest.mark.parametrize(
     "words",
     [
-        f"{acceptance.ERRORS:.0f} of its standard errors",
-        f"15, and {acceptance.LEAST_SHARE} of the independent residuals",
-        f"{acceptance.RELATIVE_GAIN:.4f} of all gains so far; {acceptance.FAMILY_SHARE} of what its own family",
-        f"chi-square tail below {acceptance.FALSE_ALARM} divided by",
+        f"{100 * log_evidence.RELEVANT:.1f} % of the independent residuals",
+        f"{log_evidence.FALSE_ALARM} divided by",
         f"blocks of {BLOCK_SECONDS:.0f} s",
         f"at least {100 * SHARE_TO_NAME:.0f} % of all structure",
     ],

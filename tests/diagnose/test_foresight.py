@@ -10,10 +10,10 @@ import pytest
 from quadid_replay import open_log
 
 from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose.candidates import candidates
-from quadid.diagnose.foresight import AHEAD, BETTER, Foresight, _relative, refit_to_predict
-from quadid.diagnose.models import Model, fit_model
-from quadid.diagnose.vehicle_file import extended_vehicle
+from quadid.diagnose.extended_vehicle import extended_vehicle
+from quadid.diagnose.hypotheses import candidates
+from quadid.diagnose.model import Model, fit_model
+from quadid.diagnose.prediction import AHEAD, BETTER, Foresight, _relative, refit_to_predict
 from quadid.effects import EFFECTS
 from quadid.flight import draw_truth, fly
 from quadid.grid import to_windows

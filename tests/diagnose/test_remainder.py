@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from quadid.diagnose.blocks import Gain
-from quadid.diagnose.models import Model
+from quadid.diagnose.cross_validation import Gain
+from quadid.diagnose.model import Model
 from quadid.diagnose.pipeline import judge
-from quadid.diagnose.probes import SITES, Follows
-from quadid.diagnose.remainder import ALARM, Remainder, Structure, remainder
+from quadid.diagnose.residual_regressors import SITES, Follows
+from quadid.diagnose.residual_tests import ALARM, Remainder, Structure, remainder
 from quadid.diagnose.result import Verdict
 from quadid.identify.noise_spectrum import mode_power
 from tests.diagnose.problems import Problem, clean, fitted, window_with

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from quadid.diagnose import acceptance, pipeline, search, trials
-from quadid.diagnose.candidates import Candidate, candidates
+from quadid.diagnose import pipeline, selection
+from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.log_evidence import better
 from quadid.model.layout import Layout
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
 
@@ -33,15 +34,13 @@ def test_an_effect_missing_from_the_catalogue_is_not_found(name: str, monkeypatc
 
 
 def inverted(*arguments: Any) -> bool:
-    """The acceptance decision the wrong way round."""
-    return not RULE(*arguments)
-
-
-RULE = acceptance.significant
+    """The one comparison the wrong way round."""
+    return not better(*arguments)
 
 
 def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceptance, "significant", inverted)
+    monkeypatch.setattr(selection, "better", inverted)
+    monkeypatch.setattr(selection, "MOST_ROUNDS", 3)
     case = single("motor_lag")
     found, _ = answer(case)
     with pytest.raises(AssertionError):
@@ -50,11 +49,10 @@ def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch:
 
 def test_with_the_decision_inverted_a_null_is_given_causes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only causes that promise something are refitted; on a null none does, so that check is taken out as well."""
-    monkeypatch.setattr(acceptance, "significant", inverted)
-    monkeypatch.setattr(trials, "LEAST_GAIN", 0.0)
-    monkeypatch.setattr(trials, "LEAST_SHARE", 0.0)
-    monkeypatch.setattr(trials, "FALSE_ALARM", 1.0)
-    monkeypatch.setattr(search, "MOST_CAUSES", 2)
+    monkeypatch.setattr(selection, "better", inverted)
+    monkeypatch.setattr(selection, "worth_a_refit", lambda *_: -1e9)
+    monkeypatch.setattr(selection, "MOST_ROUNDS", 2)
+    monkeypatch.setattr(pipeline, "pruned", lambda shooting, model: model)
     found, _ = answer(of_class("null", 0))
     assert found.findings
     with pytest.raises(AssertionError):

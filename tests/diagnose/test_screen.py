@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.diagnose.models import Model, extend
-from quadid.diagnose.screen import Score, screen
+from quadid.diagnose.model import Model, extend
+from quadid.diagnose.score_test import Score, screen
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 SMALL = {

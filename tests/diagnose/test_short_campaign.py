@@ -58,7 +58,8 @@ def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
     require_named(case, found)
     first = workings.search.rounds[0].accepted
     assert first is not None
-    assert first.candidate.label == "axial_inflow", "this case no longer asks for a second thought"
+    assert first.candidate is not None
+    assert first.candidate.label == "axial_inflow", "this case no longer asks for a swap"
 
 
 def test_inflow_too_small_for_segments_of_a_second_is_found_on_longer_ones() -> None:

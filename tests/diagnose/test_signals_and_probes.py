@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from quadid.diagnose.probes import SITES, Follows, follows
-from quadid.diagnose.signals import LAGS, signals
+from quadid.diagnose.residual_regressors import LAGS, SITES, Follows, follows, signals
 from quadid.flight import draw_truth, fly
 from quadid.identify.segment_jacobian import Columns
 from tests.diagnose.problems import SEED, Problem, clean, fitted, window_with

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.diagnose.data_faults import data_faults
+from quadid.data_faults import data_faults
 from quadid.inspection import inspect
 from quadid.online.quality import judge
 from quadid.saturation import at_limit

@@ -1,7 +1,7 @@
-"""What remains after the named causes: is it noise?
+"""What remains after the named causes: is it noise, and does it contradict them?
 
-Two looks: does the residual follow anything the vehicle did (`quadid.diagnose.probes`), and does its power stand above
-the noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into cosine
+Two looks: does the residual follow anything the vehicle did (`residual_regressors`), and does its power stand above the
+noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into cosine
 modes.  Pure noise leaves every mode with the power that the elimination itself leaves it, which is computed with the
 same projection on drawn noise.  Modes that stand above the noise model by more than chance are structure, at a
 frequency, in a channel.  The noise model is that of a flexible fit, flat below 3 Hz, so slow structure cannot hide
@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.models import Model
-from quadid.diagnose.probes import Alone, Follows, follows
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model
+from quadid.diagnose.residual_regressors import SITES, Alone, Follows, follows
+from quadid.effects import EFFECTS
 from quadid.identify.noise_estimation import SPECTRUM_SECONDS
 from quadid.identify.noise_spectrum import LOWEST, mode_power
 from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
@@ -32,6 +34,12 @@ RESOLVED = SPECTRUM_SMOOTH / (2.0 * SPECTRUM_SECONDS)
 that spectrum resolves: a line of vibration narrower than it is noise."""
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
+CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
+"""How the name of a signal begins that an offset may follow: warming up, vibration, acceleration."""
+CHANGE_ALARM = 30.0
+"""Chi-square of one signal alone that no luck brings among a few hundred …"""
+CHANGE_SHARE = 0.008
+"""… and the share of the finding's own chi-square that it must reach: an untidy vehicle has a little of everything."""
 _ATTITUDE = (3, 4, 5)
 
 
@@ -134,3 +142,34 @@ def _band(
     modes = np.convolve(usable.astype(float), kernel, mode="same")
     error = np.sqrt(2.0 / (segments * np.maximum(modes, 1.0)))
     return ratio, np.where(usable, (ratio - 1.0) / error, 0.0)
+
+
+def inconstant_causes(model: Model, left: Remainder) -> dict[str, str]:
+    """Offsets in `model` that are not constant, and what they follow, by label.
+
+    A bias is constant.  Anything whose mean is not zero looks like one at first: a gyro that senses acceleration, warms
+    up or is shaken.  What tells them apart is small beside the mean: the rest at the same sensor follows acceleration,
+    thrust or time.  A test of all generic signals together is too blunt for that; each alone is not.
+    """
+    told = {c.label: _inconstant(model, c, left) for c in model.causes}
+    return {label: reason for label, reason in told.items() if reason}
+
+
+def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
+    """What an offset that is not constant follows; empty where it follows nothing, or claims no constancy."""
+    kind = EFFECTS[cause.effect].constant_on
+    if not kind:
+        return ""
+    group = {s.name: s.group for s in SITES}
+    least = max(CHANGE_ALARM, CHANGE_SHARE * model.wald(cause))
+    here = [a for a in left.alone if a.site.startswith(kind) and a.signal.startswith(CHANGES)]
+    here = [a for a in here if a.chi_square > least and a.chi_square >= _elsewhere(left, a, group)]
+    if not here:
+        return ""
+    worst = max(here, key=lambda a: a.chi_square)
+    return f"{cause.effect} is not constant (what remains at {worst.site} follows {worst.signal})"
+
+
+def _elsewhere(left: Remainder, found: Alone, group: dict[str, str]) -> float:
+    """The most that the same signal explains at any site that looks alike from afar."""
+    return max(a.chi_square for a in left.alone if a.signal == found.signal and group[a.site] == group[found.site])

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.blocks import block_labels, held_out_deviance
-from quadid.diagnose.candidates import Candidate
+from quadid.diagnose.cross_validation import block_labels, held_out_deviance
+from quadid.diagnose.hypotheses import Candidate
+from quadid.effects import NEVER
 from quadid.identify.covariance import score_products
 from quadid.identify.gauss_newton import (
     Polished,
@@ -41,7 +42,7 @@ class Model:
         cost: deviance with prior.
         states: initial states that belong to it.
         held_out: deviance of each block under parameters fitted to the others.
-        worth: gain of each cause when it was accepted, by label.
+        tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
     """
 
     causes: tuple[Candidate, ...]
@@ -52,7 +53,7 @@ class Model:
     cost: float
     states: InitialStates
     held_out: FloatArray
-    worth: dict[str, float] = field(default_factory=dict)
+    tried: dict[str, float] = field(default_factory=dict)
 
     @property
     def deviance(self) -> float:
@@ -70,10 +71,14 @@ class Model:
         return float(self.lin.cost.sum()) / max(self.rows, 1.0)
 
     @property
+    def precision(self) -> FloatArray:
+        """Of the prior on each scaled parameter, shape (P,)."""
+        return np.asarray(self.prior.sigma**-2.0)
+
+    @property
     def covariance(self) -> FloatArray:
         """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
-        precision = 1.0 / self.prior.sigma**2
-        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(precision))
+        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision))
         meat, _ = score_products(self.lin)
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         widen = np.sqrt(np.maximum(ratio, 1.0))
@@ -214,21 +219,42 @@ def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Mode
 
 def extend(
     shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | Sketch | None = None,
-    iterations: int = 6,
+    iterations: int = 6, tried: float = 1.0,
 ) -> Model:  # fmt: skip
     """Refits `model` with `candidate` added, from `start` or where its sketch leads.
 
     Args:
         shooting: the problem.
         model: what to extend.
-        candidate: the cause to add.
+        candidate: the cause to add; one that stands for two adds both.
         start: full vector to start from, or a sketch on the same segments; one without states begins at measured ones.
         iterations: linearisations to spend; four times as many from measured states.
+        tried: how many alternatives were looked at.
     """
     begun = sketch(shooting, model, candidate) if start is None else start
     theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
-    causes = (*model.causes, candidate)
-    return replace(
-        fit_model(shooting, theta, causes, states, iterations if states else 4 * iterations, tolerance=0.2),
-        worth=model.worth,
+    new = [c for c in candidate.split or (candidate,) if c.label not in {x.label for x in model.causes}]
+    fitted = fit_model(
+        shooting, theta, (*model.causes, *new), states, iterations if states else 4 * iterations, tolerance=0.2
     )
+    return replace(fitted, tried={**model.tried, **{c.label: tried for c in new}})
+
+
+def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
+    """Refits `model` without `cause` and what requires it."""
+    left = taken_out(shooting, model, cause)
+    return replace(fit_model(shooting, left.theta, left.causes, model.states, tolerance=0.2), tried=model.tried)
+
+
+def taken_out(shooting: Shooting, model: Model, cause: Candidate | None) -> Model:
+    """`model` with `cause` and what requires it at neutral, nothing refitted: its deviance stays that of `model`."""
+    if cause is None:
+        return model
+    left = tuple(c for c in model.causes if c.label != cause.label and c.requires != cause.effect)
+    theta = model.theta.copy()
+    for c in model.causes:
+        if c not in left:
+            theta[shooting.free(list(c.names)).index] = 0.0
+            if c.timed is not None:
+                theta[c.timed] = NEVER
+    return replace(model, causes=left, theta=theta)

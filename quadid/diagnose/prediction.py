@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.models import Model
-from quadid.diagnose.vehicle_file import Fitted
+from quadid.diagnose.extended_vehicle import Fitted
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
 from quadid.identify.multistep_fit import STAGES, fit_ahead
 from quadid.identify.noise_estimation import FLEXIBLE_DRAG

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.diagnose.candidates import Candidate
-from quadid.diagnose.models import Model
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model
 from quadid.identify.covariance import uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,7 +79,7 @@ def _in_wind(listed: list[Candidate]) -> Candidate:
     return Candidate("rotor_drag", (*drag.names, *wind.names), (start,), label="rotor_drag in wind", split=(drag, wind))
 
 
-def all_names(listed: list[Candidate]) -> list[str]:
+def all_names(listed: Sequence[Candidate]) -> list[str]:
     """Entries of all candidates, each once."""
     return list(dict.fromkeys(n for c in listed for n in c.names))
 

@@ -1,0 +1,70 @@
+"""The one score: is model B better than model A?
+
+Twice the logarithm of the marginal likelihood by Laplace's approximation, with the priors that exist: on parameters
+those of the fit, on models that a cause is absent until proven (`FALSE_ALARM` shared by all that were tried).  Where
+the model leaves more than noise, or noise with a memory, squared errors count for less than they say: deviances are
+divided by the ratio of the scores' true variance to that which the model counts on (Godambe, Ann. Math. Stat. 31 (1960)
+1208; as magnitude adjustment of a composite likelihood in Ribatet, Cooley and Davison, Statistica Sinica 22 (2012)
+813).  A cause must besides be of use: on blocks of data that its fit did not see it has to gain a share of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.chi_square import exceeded
+from quadid.diagnose.cross_validation import paired_gain
+from quadid.diagnose.model import Model
+from quadid.identify.covariance import score_products
+
+FloatArray = NDArray[np.float64]
+
+FALSE_ALARM = 1e-3
+"""Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
+RELEVANT = 0.002
+"""Share of the noise that a cause must take away on unseen blocks.  Less is of no use to anybody, and within what the
+time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
+
+
+def calibration(models: Sequence[Model]) -> float:
+    """By how much the scores of the best-fitting of `models` vary more than its deviance counts on, at least 1."""
+    best = min(models, key=lambda m: m.deviance)
+    covariance = np.linalg.inv(best.lin.gram.sum(axis=0) + np.diag(best.precision))
+    return max(float(np.mean(np.diag(covariance @ score_products(best.lin)[0]))), 1.0)
+
+
+def log_evidence(model: Model, calibration: float) -> float:
+    """Twice the log evidence of `model`; differences count, between models of the same data, noise and calibration.
+
+    Args:
+        model: fitted; its deviance holds the quadratic part of its prior.
+        calibration: `calibration` of the models compared.
+    """
+    gram = model.lin.gram.sum(axis=0) / np.sqrt(np.outer(model.precision, model.precision))
+    occam = float(np.linalg.slogdet(np.eye(len(gram)) + gram / calibration)[1])
+    prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes)
+    return -model.deviance / calibration - occam - float(prior)
+
+
+def relevant(small: Model, large: Model) -> bool:
+    """Whether what `large` has more gains enough on unseen blocks, and half of that without the best of them."""
+    gain = paired_gain(small.held_out, large.held_out)
+    return min(gain.total, 2.0 * (gain.total - float(np.max(gain.blocks)))) > RELEVANT * small.rows
+
+
+def better(b: Model, a: Model, calibration: float) -> bool:
+    """Whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
+    more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
+    if more < less:
+        return not better(a, b, calibration)
+    if less < more and not relevant(a, b):
+        return False
+    return log_evidence(b, calibration) > log_evidence(a, calibration)
+
+
+def worth_a_refit(tests: int, rows: float) -> float:
+    """Predicted fall of the deviance below which a cause cannot win: half of what it must gain."""
+    return 0.5 * max(exceeded(FALSE_ALARM / tests, 1), RELEVANT * rows)

@@ -1,0 +1,50 @@
+"""Numbers that no vehicle has: what carries them fits, but stands for something else.
+
+A fit takes whatever lowers its cost.  Air that pushes, drag that acts a foot above the vehicle, an accelerometer off by
+half of gravity may all be near enough to something that the catalogue lacks; they are not what their names say.  The
+selection prefers causes whose numbers are possible; where none is, the finding is listed without confidence.
+"""
+
+from __future__ import annotations
+
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model
+from quadid.effects import EFFECTS
+from quadid.identify.covariance import Z95
+from quadid.model.layout import Entry
+
+LIKELY_SENSOR = 10.0
+"""Typical sizes beyond which an error of a sensor is not believed."""
+WRONG_SIGN = 0.1
+"""Share of its typical size by which a number that cannot be negative may be, for what a fit lays beside the truth."""
+AT_BOUND = 1e-3
+"""Share of the width of the bounds within which a number rests on one of them (contract §7)."""
+
+
+def impossible_causes(model: Model) -> dict[str, str]:
+    """Causes of `model` with a number that no vehicle has, and which, by label."""
+    told = {c.label: impossible(model, c) for c in model.causes}
+    return {label: reason for label, reason in told.items() if reason}
+
+
+def impossible(model: Model, cause: Candidate) -> str:
+    """Which number of `cause` no vehicle has; empty when all are possible."""
+    sigma = dict(zip(model.free.names, model.sigma, strict=True))
+    for e in model.free.entries:
+        if e.name not in cause.names:
+            continue
+        value = float(model.theta[e.index])
+        size, shown = (value - e.neutral) / e.typical, f"{e.name} = {value:.3g} {e.unit}".rstrip()
+        if EFFECTS[cause.effect].sized and abs(size) > LIKELY_SENSOR:
+            return f"{shown} is more than a sensor that works can have ({LIKELY_SENSOR * e.typical:.3g} {e.unit})"
+        if e.sign > 0 and size + Z95 * sigma[e.name] < -WRONG_SIGN:
+            return f"{shown} cannot be negative"
+        if (bound := _bound(e, value)) is not None:
+            return f"{shown} rests on its bound ({bound:.3g} {e.unit})"
+    return ""
+
+
+def _bound(entry: Entry, value: float) -> float | None:
+    """The bound, other than neutral, that a number rests on."""
+    near = AT_BOUND * (entry.upper - entry.lower)
+    return next((b for b in (entry.lower, entry.upper) if b != entry.neutral and abs(value - b) <= near), None)

@@ -1,0 +1,173 @@
+"""Score tests: what each move of the selection should bring, from one linearisation of everything.
+
+One Jacobian of the whole catalogue, with initial states eliminated segment by segment, gives the predicted deviance of
+every model that adds a cause, drops one or puts one in another's place, by linear algebra (Rao, Proc. Camb. Phil. Soc.
+44 (1948) 50).  Causes that begin at an unknown time are scanned over all segment boundaries by sums from the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
+from quadid.diagnose.model import Model, settled_states
+from quadid.identify.shooting import Linearised, Shooting
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Score:
+    """Linear prediction for one move.
+
+    Attributes:
+        candidate: the cause that comes in.
+        drop: predicted fall of the deviance on the fitted data, negative for a rise.
+        z: scaled parameters of `candidate` at the predicted optimum, shape (its names,).
+        time: best moment of onset [s] for timed causes.
+        trials: how many alternatives were looked at for it.
+        gone: the cause that leaves; None: none does.
+    """
+
+    candidate: Candidate
+    drop: float
+    z: FloatArray
+    time: float | None = None
+    trials: int = 1
+    gone: Candidate | None = None
+
+
+class _Own(NamedTuple):
+    """The model's own parameters: their information with prior (o, o), gradient (o,) and columns.
+
+    At the optimum of the model the gradient is that of the prior and counts as zero.
+    """
+
+    h: FloatArray
+    g: FloatArray
+    place: NDArray[np.intp]
+
+    @property
+    def fall(self) -> float:
+        """Fall of the deviance when they alone follow."""
+        return float(self.g @ np.linalg.solve(self.h, self.g))
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The current model linearised with every candidate's entries free.
+
+    Attributes:
+        model: the current model; lin: its linearisation; place: column of each entry.
+    """
+
+    model: Model
+    lin: Linearised
+    place: dict[str, int]
+
+    @classmethod
+    def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Everything:
+        """Linearises `model` with all of `listed` free."""
+        names = list(dict.fromkeys([*model.free.names, *all_names(listed)]))
+        theta = unset_times(model.theta, model.effects)
+        lin = shooting.linearise(theta, shooting.free(names), settled_states(shooting, model))
+        return cls(model, lin, {n: i for i, n in enumerate(names)})
+
+    def loss(self, gone: Candidate) -> float:
+        """Predicted rise of the deviance when `gone`, and what requires it, is dropped."""
+        _, own, risen = self._left(gone)
+        return risen - own.fall
+
+    def scores(self, listed: Sequence[Candidate], gone: Candidate | None = None) -> list[Score]:
+        """What each of `listed` that is not in the model would do, in the place of `gone` if given; best first."""
+        lin, own, risen = self._left(gone)
+        present = {c.label for c in self.model.causes}
+        effects = {c.effect for c in self.model.causes} - {gone.effect if gone else ""}
+        out = []
+        for candidate in listed:
+            if (
+                candidate.label in present
+                or any(c.label in present for c in candidate.split)
+                or (candidate.requires and candidate.requires not in effects)
+            ):
+                continue
+            mine = np.array([self.place[n] for n in candidate.names])
+            found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)
+            out.append(replace(found, drop=found.drop - risen, gone=gone))
+        return sorted(out, key=lambda s: -s.drop)
+
+    def _left(self, gone: Candidate | None) -> tuple[Linearised, _Own, float]:
+        """The quadratic, the model's parameters and the rise of the deviance where `gone` is neutral."""
+        model = self.model
+        leaving = (
+            [] if gone is None else [c for c in model.causes if c.label == gone.label or c.requires == gone.effect]
+        )
+        lost = [n for n in model.free.names if any(n in c.names for c in leaving)]
+        kept = [(self.place[n], p) for n, p in zip(model.free.names, model.precision, strict=True) if n not in lost]
+        place = np.array([i for i, _ in kept])
+        lin, risen = self._moved(lost)
+        h = lin.gram.sum(axis=0)[np.ix_(place, place)] + np.diag([p for _, p in kept])
+        return lin, _Own(h, (lin.grad - self.lin.grad).sum(axis=0)[place], place), risen
+
+    def _moved(self, lost: Sequence[str]) -> tuple[Linearised, float]:
+        """The quadratic around the point where entries `lost` are neutral, and by how much it is higher there."""
+        if not lost:
+            return self.lin, 0.0
+        z = np.zeros(len(self.place))
+        away = dict(zip(self.model.free.names, self.model.free.from_neutral(self.model.theta), strict=True))
+        for n in lost:
+            z[self.place[n]] = -away[n]
+        moved = self.lin.gram @ z
+        risen = float(np.sum(2.0 * self.lin.grad @ z + moved @ z))
+        return replace(self.lin, grad=self.lin.grad + moved), risen
+
+
+def screen(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> list[Score]:
+    """Scores all candidates not yet in the model, best first."""
+    return Everything.of(shooting, model, listed).scores(listed)
+
+
+def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> tuple[FloatArray, FloatArray]:
+    """Predicted fall of the deviance and step of candidates' parameters, the model's own refitted.
+
+    Args:
+        h_mm: products of the parameters with themselves, (n, m, m).
+        h_mo: and with those of the model, (n, m, o).
+        g_m: gradient of the parameters (n, m).
+        own: the model's parameters.
+    """
+    n, m, o = h_mo.shape
+    solved = np.linalg.solve(own.h, np.column_stack([h_mo.reshape(n * m, o).T, own.g]))
+    s = h_mm - np.matmul(h_mo, solved[:, :-1].T.reshape(n, m, o).transpose(0, 2, 1))
+    g = g_m - h_mo @ solved[:, -1]
+    # Directions the model's own parameters already explain carry no information; keep them finite.
+    s[:, range(m), range(m)] += 1e-9 * np.einsum("nii->ni", h_mm) + 1e-2
+    z = -np.linalg.solve(s, g[..., None])[..., 0]
+    return own.fall - np.sum(g * z, axis=1), z
+
+
+def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: NDArray[np.intp]) -> Score:
+    h, g = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
+    drop, z = _reduced(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
+    return Score(candidate, float(drop[0]), z[0])
+
+
+def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: NDArray[np.intp]) -> Score:
+    """Scans the onset over segment boundaries: sums from the end turn the whole-log column into masked ones."""
+    order = np.argsort(lin.time, kind="stable")
+    from_end = slice(None, None, -1)
+    h_mm = np.cumsum(lin.gram[order[:, None, None], mine[:, None], mine][from_end], axis=0)[from_end]
+    h_mo = np.cumsum(lin.gram[order[:, None, None], mine[:, None], own.place][from_end], axis=0)[from_end]
+    g_m = np.cumsum(lin.grad[order][:, mine][from_end], axis=0)[from_end]
+    margin = max(len(order) // 40, 3)
+    tried = slice(margin, len(order) - margin)
+    drop, z = _reduced(h_mm[tried], h_mo[tried], g_m[tried], own)
+    if not len(drop):
+        return Score(candidate, -np.inf, np.zeros(len(mine)))
+    best = int(np.argmax(drop))
+    return Score(candidate, float(drop[best]), z[best], float(lin.time[order[margin + best]]), len(order))

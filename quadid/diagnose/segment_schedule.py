@@ -1,0 +1,87 @@
+"""Which lengths of segments decide: continuation from short ones to long ones as the model gets better."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.model import Model, fit_model
+from quadid.identify.shooting import Shooting
+
+FloatArray = NDArray[np.float64]
+
+LINEAR_MISFIT = 4.0
+"""Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""
+USUAL_SECONDS = 1.0
+"""Longer segments decide only where airspeed matters and is not measured: every segment has a velocity of its own to
+find, short ones hardly find it, and then drag comes out too large and one kind of it passes for another …"""
+CLEAN_MISFIT = 1.2
+"""… and where the model leaves hardly more than noise in them: a cause not found yet grows with their length."""
+
+
+def is_long(shooting: Shooting) -> bool:
+    """Whether segments are longer than usual: there the cost of a missing moment grows beyond all measure."""
+    return shooting.seconds > 1.5 * USUAL_SECONDS
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where the continuation stands.
+
+    Attributes:
+        schedule: the data cut into segments of falling length.
+        rung: the one in use.
+        model: fitted on it.
+    """
+
+    schedule: Sequence[Shooting]
+    rung: int
+    model: Model
+
+    @classmethod
+    def begin(cls, schedule: Sequence[Shooting], theta: FloatArray, known: Model | None = None) -> Stage:
+        """The longest segments that the nominal model at `theta`, or the `known` one, follows; else the shortest."""
+        like = known or fit_model(schedule[-1], theta, ())
+        shortest = cls(schedule, len(schedule) - 1, like)
+        if known is not None:
+            shortest = replace(shortest, model=shortest.refitted(shortest.rung))
+        return shortest.continued()
+
+    @property
+    def shooting(self) -> Shooting:
+        """The problem in use."""
+        return self.schedule[self.rung]
+
+    def refitted(self, rung: int) -> Model:
+        """The model on another rung."""
+        fitted = fit_model(self.schedule[rung], self.model.theta, self.model.causes, iterations=10)
+        return replace(fitted, tried=self.model.tried)
+
+    def continued(self) -> Stage:
+        """On the longest segments that may decide about the model and that it follows, never shorter without need."""
+        longest = 0 if self.model.finds_velocity else self.usual
+        for rung in range(longest, self.rung):
+            model = self.refitted(rung)
+            if follows(self.schedule[rung], model):
+                return replace(self, rung=rung, model=model)
+        return self if self.rung >= longest else replace(self, rung=longest, model=self.refitted(longest))
+
+    def longest(self) -> Stage | None:
+        """The longest segments of all, where the model leaves hardly more than noise in them."""
+        if self.rung == 0 or not is_long(self.schedule[0]):
+            return None
+        model = self.refitted(0)
+        return replace(self, rung=0, model=model) if follows(self.schedule[0], model) else None
+
+    @property
+    def usual(self) -> int:
+        """Rung of the longest segments of no more than usual length."""
+        return next(rung for rung, shooting in enumerate(self.schedule) if not is_long(shooting))
+
+
+def follows(shooting: Shooting, model: Model) -> bool:
+    """Whether segments are not too long for `model` to decide on them."""
+    return model.reduced_chi_square < (CLEAN_MISFIT if is_long(shooting) else LINEAR_MISFIT)

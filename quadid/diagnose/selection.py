@@ -1,0 +1,273 @@
+"""Selection of causes: add, drop or swap while the model gets better, on segments that grow as it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.log_evidence import better, calibration, log_evidence, worth_a_refit
+from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, thinned, without
+from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.score_test import Everything, Score
+from quadid.diagnose.segment_schedule import LINEAR_MISFIT, Stage
+from quadid.identify.shooting import MEASURED, Shooting
+
+FloatArray = NDArray[np.float64]
+
+NEAR = 0.4
+"""Moves predicted to gain this share of what the best one should are refitted beside it; a swap, when it should regain
+this share of what is lost."""
+ALIKE = 0.8
+"""Share of what is lost that a cause of another family should regain by the linear prediction to be looked at."""
+FEWEST_REFITS, MOST_REFITS = 3, 7
+"""Fewest and most causes refitted in one round: the prediction is linear, the effects are not."""
+MOST_ROUNDS = 40
+"""Moves after which the selection ends anyhow."""
+FAR_SEGMENTS = 60
+"""Segments on which causes are compared while the misfit is large, and so any difference shows on a few."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A move made: the cause that came (None: none), the one that left (None: none), and the refitted model."""
+
+    candidate: Candidate | None
+    gone: Candidate | None
+    model: Model
+
+
+@dataclass(frozen=True)
+class Round:
+    """One step of the selection: the moves refitted, and the one made (or None)."""
+
+    before: Model
+    trials: tuple[Trial, ...]
+    accepted: Trial | None
+
+
+@dataclass(frozen=True)
+class Search:
+    """Outcome of the selection.
+
+    Attributes:
+        shooting: the problem that decided.
+        nominal: model without causes; model: the selected one.
+        rounds: what was tried, in order.
+        tests: number of causes looked at in one round.
+    """
+
+    shooting: Shooting
+    nominal: Model
+    model: Model
+    rounds: tuple[Round, ...]
+    tests: int
+
+
+def select(
+    schedule: Sequence[Shooting], theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None],
+    elsewhere: Sequence[FloatArray] = (), known: Model | None = None,
+) -> Search:  # fmt: skip
+    """Selects the causes that the data support.
+
+    Args:
+        schedule: the data cut into segments of falling length.
+        theta: nominal optimum.
+        listed: causes to try.
+        report: progress.
+        elsewhere: nominal parameters, shape (6,), to start from too while the misfit is large.
+        known: selection to go on from.
+    """
+    stage = Stage.begin(schedule, theta, known)
+    rounds: list[Round] = []
+    while len(rounds) < MOST_ROUNDS:
+        report("search", len(rounds) / (len(rounds) + 2.0))
+        rounds.append(_round(stage.shooting, stage.model, listed, elsewhere))
+        if rounds[-1].accepted is None:
+            # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
+            far = None if stage.model.causes else stage.longest()
+            if far is None:
+                break
+            airborne = [c for c in listed if far.shooting.finds_velocity(c.names)]
+            rounds.append(_round(far.shooting, far.model, airborne, elsewhere))
+            if rounds[-1].accepted is None:
+                break
+            stage = far
+        accepted = rounds[-1].accepted
+        assert accepted is not None
+        stage = replace(stage, model=accepted.model).continued()
+    nominal = fit_model(stage.shooting, theta, ()) if stage.model.causes else stage.model
+    return Search(stage.shooting, nominal, stage.model, tuple(rounds), len(listed))
+
+
+def pruned(shooting: Shooting, model: Model) -> Model:
+    """`model` without the causes that make it no better."""
+    while True:
+        trials = [Trial(None, c, without(shooting, model, c)) for c in _removable(model)]
+        best = _best(model, trials)
+        if best is None:
+            return model
+        model = best.model
+
+
+def _round(shooting: Shooting, model: Model, listed: Sequence[Candidate], elsewhere: Sequence[FloatArray]) -> Round:
+    """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
+    everything = Everything.of(shooting, model, listed)
+    least = worth_a_refit(len(listed), model.rows)
+    trials: list[Trial] = []
+    for moves in (_adds_and_drops, _swaps):
+        trials += moves(shooting, everything, listed, least, elsewhere)
+        best = _best(model, trials)
+        if best is not None:
+            return Round(model, tuple(trials), best)
+    best = _possible(shooting, model, trials)
+    return Round(model, tuple(trials), best)
+
+
+def _possible(shooting: Shooting, model: Model, trials: Sequence[Trial]) -> Trial | None:
+    """The best swap of a cause with an impossible number for a possible one that is better than nothing in its place.
+
+    What no vehicle has stands for something else, and a true cause need not fit as well as a stand-in of any sign: a
+    lag that the model lacks comes out as damping that drives the rotation.
+    """
+    told = impossible_causes(model)
+    for cause in _removable(model):
+        mine = [t for t in trials if t.gone is cause and t.candidate and not impossible_causes(t.model)]
+        if cause.label in told and mine and (best := _best(without(shooting, model, cause), mine)):
+            return best
+    return None
+
+
+def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
+    """The most likely of the trials that are better than `model`, before all others those with possible numbers."""
+    if not trials:
+        return None
+    alike = calibration([model, *(t.model for t in trials)])
+    good = [t for t in trials if better(t.model, model, alike)]
+    return max(good, key=lambda t: (not impossible_causes(t.model), log_evidence(t.model, alike)), default=None)
+
+
+def _adds_and_drops(
+    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float,
+    elsewhere: Sequence[FloatArray],
+) -> Iterator[Trial]:  # fmt: skip
+    model = everything.model
+    for draft in _drafts(shooting, model, everything.scores(listed), least, elsewhere):
+        yield _tried(shooting, model, draft, len(listed))
+    for cause in _removable(model):
+        if everything.loss(cause) < 4.0 * least:
+            yield Trial(None, cause, without(shooting, model, cause))
+
+
+def _swaps(
+    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float,
+    elsewhere: Sequence[FloatArray],
+) -> Iterator[Trial]:  # fmt: skip
+    """The best two in the place of each cause, among those that should regain enough of what its loss costs.
+
+    In the place of one with an impossible number anything that should regain something.
+    """
+    model, told = everything.model, impossible_causes(everything.model)
+    for cause in _removable(model):
+        scores = everything.scores(listed, cause)
+        lost = everything.loss(cause)
+        rest = taken_out(shooting, model, cause)
+        share = 0.0 if cause.label in told else ALIKE
+        rivals = [s for s in scores if _rivals(s.candidate, cause, lost + s.drop > max(share * lost, least))]
+        drafts = [_draft(shooting, rest, s, ()) for s in rivals]
+        share = 0.0 if cause.label in told else NEAR
+        drafts = sorted((d for d in drafts if lost + d.drop > share * lost), key=lambda d: -d.drop)
+        for draft in drafts[: MOST_REFITS if cause.label in told else 2]:
+            yield _tried(shooting, rest, draft, len(listed))
+
+
+def _rivals(candidate: Candidate, cause: Candidate, alike: bool) -> bool:
+    """Whether a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
+    if candidate.split or candidate.effect == cause.effect:
+        return False
+    return alike or (candidate.family == cause.family and candidate.timed is None)
+
+
+def _removable(model: Model) -> list[Candidate]:
+    return [c for c in model.causes if not any(x.requires == c.effect for x in model.causes)]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A move worth making: what it should gain, and where to start."""
+
+    score: Score
+    drop: float
+    start: FloatArray | Sketch | None
+
+
+def _drafts(
+    shooting: Shooting, model: Model, scores: list[Score], least: float, elsewhere: Sequence[FloatArray]
+) -> list[Draft]:
+    """Causes to add: the best by prediction, and those that come near them."""
+    far = model.reduced_chi_square > LINEAR_MISFIT
+    linear = [s for s in scores if s.candidate.starts or s.drop > least]
+    if far:
+        thin, base, every = thinned(shooting, model, FAR_SEGMENTS)
+        drafts = [_far_draft(thin, base, every, s, elsewhere) for s in _one_corner(linear)]
+    else:
+        drafts = [_draft(shooting, model, s, ()) for s in _one_corner(linear)]
+    drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)
+    near = [d for d in drafts if d.drop > NEAR * drafts[0].drop]
+    return near[:MOST_REFITS] if len(near) > FEWEST_REFITS else drafts[:FEWEST_REFITS]
+
+
+def _draft(shooting: Shooting, model: Model, score: Score, elsewhere: Sequence[FloatArray]) -> Draft:
+    """Linear causes start from the model, others where one linearisation from the best of their starts leads."""
+    if score.candidate.starts:
+        drawn = sketch(shooting, model, score.candidate, elsewhere)
+        return Draft(score, drawn.drop, drawn)
+    return Draft(score, score.drop, model.theta)
+
+
+def _far_draft(thin: Shooting, base: Model, every: int, score: Score, elsewhere: Sequence[FloatArray]) -> Draft:
+    """Far from the optimum the model's initial states are as wrong as its parameters: begin at measured ones."""
+    if score.candidate.timed is not None:
+        return Draft(score, score.drop, base.theta)
+    drawn = sketch(thin, base, score.candidate, elsewhere)
+    return Draft(score, max(every * drawn.drop, score.drop), replace(drawn, states=MEASURED))
+
+
+def _one_corner(scores: list[Score]) -> list[Score]:
+    """Of the rotors, only the two best need a refit."""
+    weak = [s for s in scores if s.candidate.effect == "weak_rotor"]
+    drop = {id(s) for s in weak[2:]}
+    return [s for s in scores if id(s) not in drop]
+
+
+def _tried(shooting: Shooting, model: Model, draft: Draft, tests: int) -> Trial:
+    """Refits `model` with the cause of a draft; `tests` alternatives were looked at."""
+    candidate, time = draft.score.candidate, draft.score.time
+    start = draft.start
+    if candidate.timed is not None and time is not None:
+        start = model.theta.copy()
+        start[candidate.timed] = time
+    extended = extend(shooting, model, candidate, start, tried=float(tests * draft.score.trials))
+    if candidate.timed is not None:
+        extended = _refine_time(shooting, extended, candidate)
+    return Trial(candidate, draft.score.gone, extended)
+
+
+def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Model:
+    """Moves the onset in ever smaller steps around the best, other parameters fixed, then refits."""
+    assert candidate.timed is not None
+    none = shooting.free([])
+    best_theta = model.theta
+    step = 0.25 * shooting.seconds  # the scan knows it to a segment
+    while step > 0.01:
+        costs = []
+        for offset in (-2.0, -1.0, 0.0, 1.0, 2.0):
+            theta = best_theta.copy()
+            theta[candidate.timed] += offset * step
+            costs.append((float(shooting.linearise(theta, none, model.states).cost.sum()), offset, theta))
+        best_theta = min(costs, key=lambda c: c[0])[2]
+        step *= 0.25
+    return replace(fit_model(shooting, best_theta, model.causes, model.states, iterations=4), tried=model.tried)

@@ -1,0 +1,122 @@
+"""The flights an ablation runs on: hidden effects of the campaign, independent cases, recorded and foreign flights."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+from quadid.workflow.loading import GRID, load_logs, load_vehicle
+from studies.campaign import Case, cases, flown
+
+DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
+CLASSES = {"single": 25, "null": 5, "pair": 10, "look_alike": 6, "clutter": 6, "outside": 12}
+"""Cases of each class of the campaign, numbers from 0."""
+PINNED = (("single", 1083), ("single", 1055), ("look_alike", 15), ("clutter", 10), ("clutter", 2005))
+"""Cases that tests name."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One diagnosis to make.
+
+    Attributes:
+        name: of the case or the vehicle; kind: ``campaign``, ``cases`` or ``recorded``.
+        case: of the campaign.
+        train, held: logs below the data folder, each with `@from:to` where cut; vehicle: its file there.
+        hidden: what a case hides; None where nobody knows.
+    """
+
+    name: str
+    kind: str
+    case: Case | None = None
+    train: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    vehicle: str = ""
+    hidden: tuple[str, ...] | None = None
+
+
+_VEHICLES = str(Path(__file__).parents[1] / "vehicles")
+_RECORDED = (
+    ("iris", "iris/vehicle.yaml", "pitch_yaw.csv", "sideways.csv"),
+    ("sitl square", "ardupilot_sitl/quad_sq.yaml", "quad_sq.bin@20:100", "quad_sq.bin@100:160"),
+    ("sitl x", "ardupilot_sitl/sitl_x.yaml", "x.bin@20:100", "x.bin@100:160"),
+    ("brushed rpm", "brushed/vehicle.yaml", "jana00.csv", "jana02.csv"),
+    ("brushed pwm", "brushed/vehicle_pwm.yaml", "jana00_pwm.csv", "jana02_pwm.csv"),
+    ("arpl", "arpl/vehicle.yaml", "log15.csv", ""),
+    ("nanobench", "nanobench/vehicle.yaml", "B2_circle_fast_rep1.csv", "B9_trefoil_fast_rep10.csv"),
+    ("crazyflie", "crazyflie_rpm/vehicle.yaml", "figure8_22.csv figure8_34.csv", "figure8_30.csv"),
+    ("nano-drone", "nanodrone/vehicle.yaml", "random_run1.csv square_run1.csv", "random_run3.csv"),
+    ("log171", f"{_VEHICLES}/log171.yaml", "log171.bin@76:146", "log171.bin@146:216"),
+)
+"""Name, vehicle file, logs to diagnose, logs to measure on, in the folder of the vehicle file or `ardupilot`."""
+
+
+def _recorded() -> list[Flight]:
+    out = []
+    for name, vehicle, train, held in _RECORDED:
+        folder = "ardupilot" if vehicle.startswith("/") else vehicle.split("/")[0]
+        logs = [tuple(f"{folder}/{log}" for log in names.split()) for names in (train, held)]
+        out.append(Flight(name, "recorded", None, logs[0], logs[1], vehicle))
+    return out
+
+
+def flights(kinds: Sequence[str], classes: dict[str, int] | None = None) -> list[Flight]:
+    """All flights of the kinds asked for.
+
+    Args:
+        kinds: of ``campaign``, ``cases``, ``recorded``.
+        classes: cases of each class of the campaign, `CLASSES` by default.
+    """
+    out: list[Flight] = []
+    if "campaign" in kinds:
+        chosen = [c for group, n in (classes or CLASSES).items() for c in cases(group, n)]
+        chosen += [c for group, n in PINNED for c in cases(group, 1, n)]
+        out += [Flight(f"{c.group} {c.number}", "campaign", c, hidden=c.expected) for c in chosen]
+    if "cases" in kinds:
+        out += [f for folder in ("cases", "cases_hub") for f in _independent(folder)]
+    return out + (_recorded() if "recorded" in kinds else [])
+
+
+def _independent(folder: str) -> list[Flight]:
+    """The cases of an independent simulator in one folder."""
+    answers = json.loads((DATA / folder / "answers.json").read_text(encoding="utf-8"))
+    return [
+        Flight(
+            f"{folder} {a['case']}", "cases", None, (f"{folder}/{a['case']}/train.csv",),
+            (f"{folder}/{a['case']}/validate.csv",), f"{folder}/{a['case']}/vehicle.yaml", tuple(a["effects"]),
+        )
+        for a in answers
+    ]  # fmt: skip
+
+
+def load(flight: Flight, cache: Path | None = None) -> tuple[list[Window], list[Window], Vehicle]:
+    """Windows to diagnose, windows to measure the gain on, and the vehicle as guessed.
+
+    Args:
+        flight: which.
+        cache: folder that keeps flights once flown or read; they do not depend on the diagnosis.
+    """
+    kept = None if cache is None else cache / f"{flight.name.replace(' ', '-').replace('/', '-')}.pickle"
+    if kept is not None and kept.exists():
+        out: tuple[list[Window], list[Window], Vehicle] = pickle.loads(kept.read_bytes())
+        return out
+    if flight.case is not None:
+        train, held, vehicle = flown(flight.case)
+        out = [train], [held], vehicle
+    else:
+        vehicle = load_vehicle(str(DATA / flight.vehicle))
+        out = _windows(flight.train, vehicle), _windows(flight.held, vehicle), vehicle
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_bytes(pickle.dumps(out))
+    return out
+
+
+def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:
+    return [w for log in load_logs([str(DATA / n) for n in names], vehicle, GRID) for w in log.windows]

@@ -1,0 +1,104 @@
+"""Numbers that no vehicle has are not believed, nor a bias that is not constant; others are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from quadid.diagnose.model import Model, extend
+from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.residual_tests import inconstant_causes, remainder
+from tests.diagnose.hidden import answer, of_class
+from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
+
+
+@lru_cache(maxsize=1)
+def dragged() -> tuple[Problem, Model]:
+    """A flight with rotor drag and its moment, and the model that says so."""
+    hidden = {"rotor_drag": {"k_x": 0.3, "k_y": 0.25}, "rotor_drag_moment": {"h_x": 0.03, "h_y": 0.03}}
+    problem = fitted(window_with(hidden), clean().shooting.noise)
+    model = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), iterations=12)
+    return problem, extend(problem.shooting, model, cause(problem, "rotor_drag_moment"), iterations=12)
+
+
+def doubts(model: Model) -> list[str]:
+    return list(impossible_causes(model).values())
+
+
+def with_number(name: str, value: float) -> list[str]:
+    problem, model = dragged()
+    theta = model.theta.copy()
+    theta[problem.shooting.layout.entry(name).index] = value
+    return doubts(replace(model, theta=theta))
+
+
+def test_what_a_vehicle_may_have_is_believed() -> None:
+    assert doubts(dragged()[1]) == []
+    assert with_number("rotor_drag.k_x", -0.001) == []
+    assert with_number("rotor_drag_moment.h_x", -0.06) == []
+
+
+def test_air_that_pushes_is_not_believed() -> None:
+    (told,) = with_number("rotor_drag.k_y", -0.09)
+    assert told.startswith("rotor_drag.k_y = -0.09 1/s cannot be negative")
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_number_on_its_bound_is_not_believed(sign: float) -> None:
+    problem, _ = dragged()
+    entry = problem.shooting.layout.entry("rotor_drag_moment.h_x")
+    (told,) = with_number(entry.name, sign * entry.upper)
+    assert "rests on its bound" in told
+    assert with_number("rotor_drag_moment.h_x", 0.9 * sign * entry.upper) == []
+
+
+def test_lift_that_grows_with_airspeed_is_not_called_drag() -> None:
+    """The nearest the catalogue comes to it is air that pushes, or drag a foot below the vehicle."""
+    found, _ = answer(of_class("outside", 1029, 120.0))
+    assert found.verdict.value == "unknown"
+    assert not [f for f in found.findings if f.confident]
+    pushing = [p for f in found.findings for p in f.parameters if p.name in ("k_x", "k_y", "k_z") and p.ci95[1] < 0.0]
+    assert not pushing or any("it stands for something else" in w for w in found.warnings)
+    assert found.unexplained or found.unexplained_follows, "an unknown must say where it sits"
+
+
+BIAS = np.array([0.03, -0.02, 0.01])
+
+
+def with_bias(problem: Problem, effect: str) -> Model:
+    """The nominal model extended by a bias."""
+    cause = next(c for c in problem.listed if c.effect == effect)
+    return extend(problem.shooting, problem.nominal, cause)
+
+
+def doubts_about(problem: Problem, effect: str) -> dict[str, str]:
+    model = with_bias(problem, effect)
+    return inconstant_causes(model, remainder(problem.shooting, model))
+
+
+def test_a_constant_bias_is_believed() -> None:
+    n = len(clean().window.t)
+    problem = fitted(window_with(None, gyro=np.tile(BIAS, (n, 1))), clean().shooting.noise)
+    assert doubts_about(problem, "gyro_bias") == {}
+
+
+@pytest.mark.parametrize("follows", ["time", "acceleration"])
+def test_a_bias_that_changes_is_doubted(follows: str) -> None:
+    window = clean().window
+    assert window.accel is not None
+    change = {
+        "time": 1.0 - np.exp(-window.t / 20.0),
+        "acceleration": np.roll(window.accel[:, 2], 1) / np.mean(window.accel[:, 2]),
+    }[follows]
+    problem = fitted(window_with(None, gyro=change[:, None] * BIAS), clean().shooting.noise)
+    ((label, sentence),) = doubts_about(problem, "gyro_bias").items()
+    assert label == "gyro_bias"
+    assert "not constant" in sentence
+    assert ("time" in sentence) == (follows == "time")
+
+
+def test_other_findings_are_not_asked_for_constancy() -> None:
+    assert doubts_about(clean(), "rate_damping") == {}
