@@ -1,0 +1,86 @@
+"""Healthy or changed, and by what: one Student-t likelihood for all explanations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, f as fisher, norm, t as student
+
+from quadid.health.hypotheses import Hypothesis
+from quadid.health.spread import Healthy
+
+FloatArray = NDArray[np.float64]
+
+
+class Explained(NamedTuple):
+    """One explanation after the fact.
+
+    Attributes:
+        hypothesis: what may have changed.
+        log_evidence: of the change of trim, with the prior odds.
+        value: posterior mean of the parameters, shape (parameters,).
+        covariance: posterior covariance.
+        p_value: chance that healthy flights differ so much along this explanation.
+    """
+
+    hypothesis: Hypothesis
+    log_evidence: float
+    value: FloatArray
+    covariance: FloatArray
+    p_value: float
+
+
+def distance(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> FloatArray:
+    """Each trim's change as a standard normal deviate of the same probability as its Student t, shape (4,)."""
+    z = np.abs(change) / deviation
+    far = np.asarray(norm.isf(np.maximum(student.sf(z, freedom), 1e-300)))
+    return np.asarray(np.sign(change) * far)
+
+
+def p_healthy(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> float:
+    """Chance that healthy flights differ by `change` or more: chi-square of its `distance`."""
+    return float(chi2.sf((distance(change, deviation, freedom) ** 2).sum(), len(change)))
+
+
+def explain(change: FloatArray, healthy: Healthy, flights: int, hypothesis: Hypothesis) -> Explained:
+    """Evidence and posterior of one explanation.
+
+    The change is Student-t with the spread's mean degrees of freedom v and p = 4 dimensions:
+    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = c' S^-1 c, to a constant.  Parameters that cannot
+    be negative restrict the Gaussian posterior; the restriction's odds (posterior over prior) count.
+    """
+    deviation = healthy.predictive(flights)
+    noise = np.diag(deviation**2)
+    a, p = hypothesis.effect, hypothesis.prior
+    freedom = float(healthy.freedom.mean())
+    spread = noise + a @ p @ a.T
+    gain = np.linalg.solve(spread, a @ p).T
+    value = gain @ change
+    quadratic = float(change @ np.linalg.solve(spread, change))
+    tail = (freedom + len(change)) / 2.0
+    scale = (freedom + quadratic) / (freedom + len(change))
+    covariance = scale * (p - gain @ a @ p)
+    evidence = -tail * np.log1p(quadratic / freedom) - 0.5 * float(np.linalg.slogdet(spread)[1])
+    for k in hypothesis.positive:
+        evidence += float(norm.logcdf(value[k] / np.sqrt(covariance[k, k]))) + np.log(2.0)
+    return Explained(
+        hypothesis, evidence + hypothesis.log_odds, value, covariance, _along(change, deviation, a, freedom)
+    )
+
+
+def _along(change: FloatArray, deviation: FloatArray, a: FloatArray, freedom: float) -> float:
+    """F test of the part of the change that an explanation's free parameters account for."""
+    scaled, z = a / deviation[:, None], change / deviation
+    basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
+    kept = basis[:, sizes > 1e-9 * sizes[0]]
+    part = float(((kept.T @ z) ** 2).sum())
+    return float(fisher.sf(part / kept.shape[1], kept.shape[1], freedom))
+
+
+def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
+    """All explanations, the most probable first."""
+    found = [explain(change, healthy, flights, one) for one in offered]
+    return sorted(found, key=lambda one: -one.log_evidence)

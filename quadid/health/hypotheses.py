@@ -1,0 +1,102 @@
+"""What may have changed, and what it would do to the trim: linear in its parameters, with priors from physics.
+
+A rotor j with share s_j of the load that loses the fraction l of its thrust and q of its drag torque moves the trim by
+l s_j (G_kj - trim_k) in roll and pitch, by q s_j G_3j - l s_j trim_3 in yaw and by l s_j in effort.  A mass m w at
+(x, y) from the centre moves it by -w y / arm, w x / arm, 0 and w.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.health.trims import trim_directions
+from quadid.vehicle import Vehicle
+
+FloatArray = NDArray[np.float64]
+
+LOSS = 0.2
+"""Prior standard deviation of a rotor's loss of thrust."""
+DRAG_APART = 0.08
+"""Prior standard deviation of its loss of drag torque from its loss of thrust: a cut blade loses about as much of both."""
+MASS = 0.1
+"""Prior standard deviation of an added mass, as a fraction."""
+REACH = 0.7
+"""An added mass sits this far from the centre, in arms (standard deviation of each coordinate)."""
+SHIFT = 0.05
+"""Prior standard deviation of a shift of the CG without mass, in arms: a battery that has slid."""
+MOST_ROTORS = 3
+"""Most rotors that are damaged at once."""
+_KINDS = {"weak_rotor": 0.7, "payload": 0.2, "cg_offset": 0.06, "effort": 0.04}
+"""Prior odds of the kinds of change; a further damaged rotor costs `_ANOTHER`."""
+_ANOTHER = 0.3
+_MASSES = (0.0125, 0.025, 0.05, 0.1)
+
+
+class Hypothesis(NamedTuple):
+    """One explanation of a change of trim.
+
+    Attributes:
+        kind: weak_rotor, payload (mass_change with cg_offset), cg_offset, effort (mass_change or thrust_drop).
+        rotors: the damaged ones, from 0.
+        effect: change of trim per parameter, shape (4, parameters).
+        prior: covariance of the parameters, shape (parameters, parameters), mean zero.
+        positive: which parameters cannot be negative.
+        log_odds: prior.
+    """
+
+    kind: str
+    rotors: tuple[int, ...]
+    effect: FloatArray
+    prior: FloatArray
+    positive: tuple[int, ...]
+    log_odds: float
+
+
+def rotor_effect(vehicle: Vehicle, rotor: int, share: float, trim: FloatArray) -> FloatArray:
+    """Change of trim per loss of thrust and per loss of drag torque of one rotor, shape (4, 2)."""
+    g = trim_directions(vehicle)[:, rotor]
+    return share * np.array([[g[0] - trim[0], 0.0], [g[1] - trim[1], 0.0], [-trim[2], g[2]], [1.0, 0.0]])
+
+
+def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[Hypothesis]:
+    """Every explanation that is compared.
+
+    Args:
+        vehicle: geometry.
+        shares: each rotor's share of the load in the flights in question, shape (rotors,).
+        trim: healthy trim, shape (4,).
+    """
+    rotors = range(len(vehicle.rotors))
+    single = [rotor_effect(vehicle, j, float(shares[j]), trim) for j in rotors]
+    block = np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + DRAG_APART**2]])
+    out = []
+    for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
+        chosen = list(combinations(rotors, count))
+        odds = np.log(_KINDS["weak_rotor"] * _ANOTHER ** (count - 1) / len(chosen))
+        for group in chosen:
+            effect = np.hstack([single[j] for j in group])
+            positive = tuple(range(0, 2 * count, 2))
+            out.append(Hypothesis("weak_rotor", group, effect, np.kron(np.eye(count), block), positive, float(odds)))
+    return [*out, *_of_mass()]
+
+
+def _of_mass() -> Sequence[Hypothesis]:
+    """Added masses of several sizes at a place, a shifted CG, and more effort alone."""
+    shift = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # per x and y of the CG, in arms
+    effort = np.array([[0.0], [0.0], [0.0], [1.0]])
+    odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
+    out = [
+        Hypothesis(
+            "payload", (), np.hstack([shift, effort]), np.diag([(REACH * w) ** 2, (REACH * w) ** 2, w**2]), (2,),
+            odds["payload"] - float(np.log(len(_MASSES))),
+        )
+        for w in _MASSES
+    ]  # fmt: skip
+    out.append(Hypothesis("cg_offset", (), shift, SHIFT**2 * np.eye(2), (), odds["cg_offset"]))
+    out.append(Hypothesis("effort", (), effort, np.array([[MASS**2]]), (), odds["effort"]))
+    return out

@@ -1,0 +1,205 @@
+"""What one flight shows of its trim: how the rotors share the load when nothing is commanded.
+
+In steady flight the rotors balance moments and weight.  With w_i the square of rotor i's speed (or its commanded
+thrust), G the rows of `trim_directions` and f the specific force along -z, a flight's trim is
+
+    (G w)_k / sum(w)  for roll, pitch, yaw,   and   log(sum(w) / f),
+
+each a mean over blocks of a second, at zero velocity and zero angular acceleration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import NotIdentifiableError
+from quadid.inspection.airborne import flying_spans
+from quadid.resample import sample_period
+from quadid.rotor_signal import rotor_signal
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Channel, Recording
+
+FloatArray = NDArray[np.float64]
+
+AXES = ("roll", "pitch", "yaw", "effort")
+"""What a trim consists of; effort is the logarithm of rotor thrust commanded per specific force."""
+BLOCK = 1.0
+"""Trims are means over this long [s]."""
+_CLIMB_OUT = 1.5
+"""Seconds after take-off and before landing that are no steady flight."""
+_FEWEST = 5
+"""A flight with fewer blocks shows no trim."""
+_AIR_SLOPE = 0.02
+"""Prior standard deviation of a trim's change with velocity [1 per m/s], as drag at the hubs makes."""
+
+
+class FlightTrim(NamedTuple):
+    """The trim of one flight.
+
+    Attributes:
+        name: of the log.
+        mean: trim at zero velocity, shape (4,), see `AXES`.
+        parts: the same of parts of the flight (between landings, else thirds), shape (parts, 4).
+        shares: each rotor's share of sum(w), shape (rotors,).
+        vibration: logarithm of the accelerometer's noise above a quarter of its rate [log m/s²]; NaN without it.
+        seconds: of steady flight.
+        channels: what the effort and the motion were taken from, for people.
+    """
+
+    name: str
+    mean: FloatArray
+    parts: FloatArray
+    shares: FloatArray
+    vibration: float
+    seconds: float
+    channels: str
+
+
+def trim_directions(vehicle: Vehicle) -> FloatArray:
+    """Rows of G, shape (3, rotors): what a unit of thrust of each rotor adds to roll, pitch, yaw, in units of the arm.
+
+    Roll and pitch are moments over the arm about the centroid of the rotors, yaw is the spin.
+    """
+    arms = vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[:, :2].mean(axis=0)
+    return np.stack([-arms[:, 1] / vehicle.arm, arms[:, 0] / vehicle.arm, vehicle.spins])
+
+
+def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
+    """The trim of one flight from whatever channels its log holds.
+
+    Args:
+        recording: a log with rotor speeds, motor commands or mixer inputs.
+        vehicle: geometry, and what the rotor columns mean.
+
+    Raises:
+        LogError: no rotor signal, or one that does not fit the vehicle.
+        NotIdentifiableError: too little steady flight.
+    """
+    rotors = rotor_signal(recording, vehicle)
+    spans = [(a + _CLIMB_OUT, b - _CLIMB_OUT) for a, b in flying_spans(recording, vehicle)]
+    starts = [np.arange(a, b - BLOCK + 1e-9, BLOCK) for a, b in spans if b - a >= BLOCK]
+    edges = np.concatenate(starts) if starts else np.empty(0)
+    load, kept = _block_means(rotors.t, rotors.values**2, edges)
+    if kept.sum() < _FEWEST:
+        raise NotIdentifiableError(
+            f"{recording.name}: {kept.sum() * BLOCK:.0f} s of steady flight",
+            f"{_FEWEST * BLOCK:.0f} s or more between take-off and landing", "fly longer, a hover will do",
+        )  # fmt: skip
+    edges, load = edges[kept], load[kept]
+    force, told = _specific_force(recording, edges)
+    total = load.sum(axis=1)
+    trims = np.column_stack([load @ trim_directions(vehicle).T / total[:, None], np.log(total / force)])
+    motion, moved = _motion(recording, vehicle, edges)
+    mean, rest = _at_rest(trims, motion)
+    parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
+    return FlightTrim(
+        recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), _vibration(recording, edges),
+        len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
+    )  # fmt: skip
+
+
+def _block_means(t: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Means over the blocks that begin at `edges`, shape (blocks, columns), and which blocks hold enough samples."""
+    first, end = np.searchsorted(t, edges), np.searchsorted(t, edges + BLOCK)
+    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
+    count = end - first
+    enough = count >= max(0.6 * BLOCK / sample_period(t), 2.0)
+    return (sums[end] - sums[first]) / np.maximum(count, 1)[:, None], enough
+
+
+def _specific_force(recording: Recording, edges: FloatArray) -> tuple[FloatArray, str]:
+    """Thrust over mass in each block [m/s²], shape (blocks,); that of hover without an accelerometer."""
+    for name in ("accel", "accel_z", "accel_world"):
+        channel = recording.channels.get(name)
+        if channel is None or len(channel.t) < 2:
+            continue
+        world = name == "accel_world"
+        values = np.linalg.norm(channel.values, axis=1)[:, None] if world else -channel.values[:, -1:]
+        means, enough = _block_means(channel.t, values, edges)
+        if enough.all() and (means > 0.1 * GRAVITY).all():
+            return means[:, 0], f"force from {channel.source or name}"
+    return np.full(len(edges), GRAVITY), "force taken for that of hover"
+
+
+def _motion(recording: Recording, vehicle: Vehicle, edges: FloatArray) -> tuple[FloatArray, str]:
+    """What moves a trim beside the vehicle itself, in units of its prior size: velocity and angular acceleration."""
+    columns, told = [], "no motion"
+    velocity = _velocity(recording, edges)
+    if velocity is not None:
+        columns.append(velocity * _AIR_SLOPE)
+        told = "motion from position or velocity"
+    elif "accel" in recording.channels:
+        force, _ = _block_means(recording.channels["accel"].t, recording.channels["accel"].values[:, :2], edges)
+        columns.append(force * _AIR_SLOPE)
+        told = "motion from in-plane force"
+    gyro = recording.channels.get("gyro")
+    if gyro is not None and len(gyro.t) > 1:
+        turned = _at(gyro, edges + BLOCK) - _at(gyro, edges)
+        inertia = np.array([vehicle.parameters[f"J_{a}{a}"].initial for a in "xyz"])
+        yaw_arm = vehicle.parameters["d"].initial / vehicle.parameters["b"].initial
+        authority = vehicle.mass * GRAVITY * np.array([vehicle.arm, vehicle.arm, yaw_arm])
+        columns.append(2.0 * turned / BLOCK * inertia / authority)
+    return (np.hstack(columns) if columns else np.empty((len(edges), 0))), told
+
+
+def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
+    """Mean velocity of each block [m/s], shape (blocks, 3), turned with the heading where it is known; else None."""
+    position, velocity = recording.channels.get("position"), recording.channels.get("velocity")
+    if velocity is not None and len(velocity.t) > 1:
+        means, _ = _block_means(velocity.t, velocity.values, edges)
+    elif position is not None and len(position.t) > 1:
+        means = (_at(position, edges + BLOCK) - _at(position, edges)) / BLOCK
+    else:
+        return None
+    attitude = recording.channels.get("attitude")
+    if attitude is not None and len(attitude.t) > 1:
+        w, x, y, z = _at(attitude, edges + 0.5 * BLOCK).T
+        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        c, s = np.cos(heading), np.sin(heading)
+        means = np.column_stack([c * means[:, 0] + s * means[:, 1], c * means[:, 1] - s * means[:, 0], means[:, 2]])
+    return means
+
+
+def _at(channel: Channel, t: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(t, channel.t, column) for column in channel.values.T])
+
+
+def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Regresses trims on motion with its prior; returns the trim at rest (4,) and what remains, shape (blocks, 4)."""
+    if motion.shape[1] == 0:
+        mean = trims.mean(axis=0)
+        return mean, trims - mean
+    noise = np.median(np.abs(trims - np.median(trims, axis=0)), axis=0) / 0.6745 + 1e-6
+    out = np.empty(trims.shape[1])
+    rest = np.empty_like(trims)
+    for k, column in enumerate(trims.T):
+        design = np.column_stack([np.ones(len(motion)), motion])
+        ridge = np.diag([0.0, *[float(noise[k] ** 2)] * motion.shape[1]])
+        solved = np.linalg.solve(design.T @ design + ridge, design.T @ column)
+        out[k], rest[:, k] = solved[0], column - design @ solved
+    return out, rest
+
+
+def _parts(edges: FloatArray) -> Sequence[NDArray[np.intp]]:
+    """Blocks of each part of a flight: between landings, else thirds."""
+    breaks = np.flatnonzero(np.diff(edges) > 2.0 * BLOCK) + 1
+    parts = np.split(np.arange(len(edges)), breaks)
+    long = [part for part in parts if len(part) >= 3]
+    return long if len(long) > 1 else np.array_split(np.arange(len(edges)), 3)
+
+
+def _vibration(recording: Recording, edges: FloatArray) -> float:
+    """Logarithm of the root mean square of second differences of the force along z, as a level of white noise."""
+    for name in ("accel", "accel_z", "accel_world"):
+        channel = recording.channels.get(name)
+        if channel is None or len(channel.t) < 3:
+            continue
+        inside = np.searchsorted(edges, channel.t, side="right") - 1
+        flying = (inside >= 0) & (channel.t - edges[np.maximum(inside, 0)] < BLOCK)
+        bend = np.diff(channel.values[:, -1], 2)[flying[1:-1]]
+        return float(np.log(np.sqrt(np.mean(bend**2) / 6.0) + 1e-9)) if len(bend) else np.nan
+    return np.nan
