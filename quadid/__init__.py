@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle as Vehicle
     from quadid.workflow.diagnose import diagnose as diagnose
     from quadid.workflow.export import export as export
+    from quadid.workflow.health import health as health
     from quadid.workflow.identify import identify as identify
     from quadid.workflow.inspect import inspect as inspect
     from quadid.workflow.loading import load as load
@@ -33,6 +34,7 @@ _PUBLIC = {
     "inspect": "quadid.workflow.inspect",
     "identify": "quadid.workflow.identify",
     "diagnose": "quadid.workflow.diagnose",
+    "health": "quadid.workflow.health",
     "score": "quadid.workflow.score",
     "simulate": "quadid.workflow.simulate",
     "export": "quadid.workflow.export",
@@ -40,7 +42,7 @@ _PUBLIC = {
     "ParameterSet": "quadid.parameters",
 }
 """Public names and where they are defined."""
-_ROOMS = ("identify", "diagnose")
+_ROOMS = ("identify", "diagnose", "health")
 """Names that are packages too: those are callable (`quadid.callable_room`)."""
 __all__ = [*_PUBLIC]
 

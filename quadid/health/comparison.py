@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f as fisher, norm, t as student
+from scipy.stats import chi2, norm
+from scipy.stats import f as fisher
+from scipy.stats import t as student
 
 from quadid.health.hypotheses import Hypothesis
 from quadid.health.spread import Healthy
@@ -81,6 +83,13 @@ def _along(change: FloatArray, deviation: FloatArray, a: FloatArray, freedom: fl
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
-    """All explanations, the most probable first."""
-    found = [explain(change, healthy, flights, one) for one in offered]
+    """All explanations, the most probable first; those of one kind and rotors count as one, with the best's values."""
+    groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
+    for one in offered:
+        groups.setdefault((one.kind, one.rotors), []).append(explain(change, healthy, flights, one))
+    found = []
+    for group in groups.values():
+        best = max(group, key=lambda one: one.log_evidence)
+        total = float(np.logaddexp.reduce([one.log_evidence for one in group]))
+        found.append(best._replace(log_evidence=total))
     return sorted(found, key=lambda one: -one.log_evidence)

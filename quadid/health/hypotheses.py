@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 LOSS = 0.2
 """Prior standard deviation of a rotor's loss of thrust."""
 DRAG_APART = 0.08
-"""Prior standard deviation of its loss of drag torque from its loss of thrust: a cut blade loses about as much of both."""
+"""Prior standard deviation of its loss of drag torque from that of thrust: a cut blade loses about as much of both."""
 MASS = 0.1
 """Prior standard deviation of an added mass, as a fraction."""
 REACH = 0.7

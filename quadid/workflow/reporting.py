@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
     from quadid.workflow.diagnose import Diagnosed
+    from quadid.workflow.health import HealthOutcome
     from quadid.workflow.identify import Identified
     from quadid.workflow.loading import Log
 
@@ -92,6 +93,29 @@ def diagnose_html(done: Diagnosed, command: str = LIBRARY) -> str:
     return render(
         diagnose_page(done.result, done.nominal.name, done.sets, done.noise, logs, rows, warnings, done.maps())
     )
+
+
+def health_html(done: HealthOutcome, command: str = LIBRARY) -> str:
+    """The HTML report of a comparison with healthy flights."""
+    import numpy as np
+
+    from quadid.health.trims import AXES
+    from quadid.report.airframe_picture import airframe_picture
+    from quadid.report.health_page import health_page, trim_figure
+    from quadid.report.page import render
+
+    found = done.found
+    now = np.mean([flight.shares for flight in found.flights], axis=0)
+    picture = airframe_picture(done.vehicle, now.tolist(), found.healthy.shares.tolist(), done.result["changes"])
+    rows = [
+        (role, flight.name, ((flight.mean - found.healthy.mean) / found.healthy.deviation).tolist())
+        for role, part in (("measured", found.baseline), ("after", found.flights))
+        for flight in part
+    ]
+    made = provenance([], command) + [
+        {"name": recording.name, "value": f"sha256 {recording.sha256 or 'unknown'}"} for recording in done.recordings
+    ]
+    return render(health_page(done.result, picture, made, [trim_figure(rows, AXES)]))
 
 
 def quality(log: Log) -> dict[str, Any]:

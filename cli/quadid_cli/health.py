@@ -1,0 +1,42 @@
+"""`quadid health`: what changed in the vehicle since the baseline flights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from quadid_cli.options import JsonTarget, Logs, OutFolder, Preset, ReportFile, Unchecked, VehicleName
+
+Baseline = Annotated[
+    list[str], typer.Option("--baseline", metavar="LOG", help="A healthy flight of this vehicle; may be given again.")
+]
+
+
+def health(
+    logs: Logs,
+    baseline: Baseline,
+    vehicle: VehicleName,
+    report: ReportFile = None,
+    preset: Preset = "auto",
+    unchecked: Unchecked = False,
+    json: JsonTarget = None,
+    out: OutFolder = Path(),
+) -> None:
+    """What changed since the baseline flights: which rotor, mass, centre of gravity, thrust, how much, how sure."""
+    from quadid.workflow import health as work
+    from quadid.workflow.loading import load_vehicle
+    from quadid_cli import output, tables, terminal
+    from quadid_cli.explaining import explained
+
+    output.check_file(json, "--json")
+    output.check_file(report, "--report")
+    output.out_folder(out)
+    described = load_vehicle(vehicle)
+    with explained(report, f"Health of {described.name}", [*logs, *baseline], described, preset):
+        done = work.health(logs, baseline, vehicle=described, preset=preset, unchecked=unchecked)
+    if report is not None:
+        done.result["report"] = str(done.report(report, output.command_line()))
+    output.write_json(done.result, json)
+    tables.print_outcome(terminal.console(quiet=json == "-"), done)

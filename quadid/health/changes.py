@@ -1,0 +1,230 @@
+"""From trims to an answer: healthy or changed, which rotors, masses or shifts, how much, and how sure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from quadid.health.comparison import Explained, compare, distance, p_healthy
+from quadid.health.hypotheses import hypotheses
+from quadid.health.spread import Healthy, healthy_spread
+from quadid.health.trims import AXES, FlightTrim
+from quadid.vehicle import Vehicle
+
+FloatArray = NDArray[np.float64]
+
+SIGNIFICANT = 0.01
+"""A change is one that healthy flights make less often than this."""
+_SURE = 0.75
+"""A change is named with confidence where explanations that hold it have this much of the probability."""
+_UNEXPLAINED = 1e-3
+"""An explanation that leaves a rest less probable than this explains nothing."""
+_RIVALS = 3
+_Z95 = 1.959964
+
+
+class Rival(NamedTuple):
+    """An explanation that lost: names of the contract, rotors from 1, p-value, probability among all explanations."""
+
+    effects: tuple[str, ...]
+    rotors: tuple[int, ...]
+    p_value: float
+    share: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of contract form."""
+        more = {"with": list(self.effects[1:])} if len(self.effects) > 1 else {}
+        rotors = {"rotors": list(self.rotors)} if self.rotors else {}
+        return {"effect": self.effects[0], **more, **rotors, "p_value": self.p_value, "probability": self.share}
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that changed.
+
+    Attributes:
+        effect: name of the contract.
+        parameters: (name, unit, value, 95 % interval or None).
+        p_value: chance that healthy flights differ so much along this explanation.
+        share: probability of the explanations that hold it, among all.
+        confident: whether it is certain enough to act on.
+        rivals: other explanations, the most probable first.
+        evidence: one sentence.
+    """
+
+    effect: str
+    parameters: tuple[tuple[str, str, float, tuple[float, float] | None], ...]
+    p_value: float
+    share: float
+    confident: bool
+    rivals: tuple[Rival, ...]
+    evidence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of contract form."""
+        return {
+            "effect": self.effect,
+            "confident": self.confident,
+            "p_value": self.p_value,
+            "probability": self.share,
+            "alternatives": [rival.to_dict() for rival in self.rivals],
+            "evidence": self.evidence,
+            "parameters": [
+                {"name": n, "unit": u, "value": v if ci else int(v), "ci95": None if ci is None else list(ci)}
+                for n, u, v, ci in self.parameters
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class Health:
+    """What changed since the baseline flights.
+
+    Attributes:
+        verdict: unchanged, changed or unknown.
+        changes: the most probable explanation; without confidence where the verdict is unchanged.
+        score: how far the flights are from healthy ones, in standard deviations of these.
+        p_value: chance that healthy flights differ so much.
+        trim: of the flights in question, shape (4,), see `trims.AXES`.
+        distance: of each trim from healthy, in standard deviations, shape (4,).
+        healthy: the baseline's trim and spread.
+        flights: trims of the flights in question.
+        baseline: trims of the baseline flights.
+    """
+
+    verdict: str
+    changes: tuple[Change, ...]
+    score: float
+    p_value: float
+    trim: FloatArray
+    distance: FloatArray
+    healthy: Healthy
+    flights: tuple[FlightTrim, ...]
+    baseline: tuple[FlightTrim, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of the form ``quadid.health/1``, without the names of files."""
+        origin = np.where(np.array(AXES) == "effort", self.healthy.mean, 0.0)  # effort counts from the baseline's
+        trims = self.trim - origin, self.healthy.mean - origin
+        each = zip(AXES, *trims, self.healthy.deviation, self.distance, strict=True)
+        return {
+            "schema": "quadid.health/1",
+            "verdict": self.verdict,
+            "changes": [change.to_dict() for change in self.changes],
+            "score": self.score,
+            "p_value": self.p_value,
+            "trim": [
+                {"name": n, "value": v, "baseline": m, "spread": s, "distance": d} for n, v, m, s, d in each
+            ],
+        }  # fmt: skip
+
+
+def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicle: Vehicle) -> Health:
+    """Compares flights with healthy ones of the same vehicle.
+
+    Args:
+        flights: trims of the flights in question, which share what changed.
+        baseline: trims of healthy flights.
+        vehicle: geometry.
+    """
+    healthy = healthy_spread(baseline)
+    trim = np.mean([flight.mean for flight in flights], axis=0)
+    shares = np.mean([flight.shares for flight in flights], axis=0)
+    change, deviation = trim - healthy.mean, healthy.predictive(len(flights))
+    far = distance(change, deviation, healthy.freedom)
+    p_value = p_healthy(change, deviation, healthy.freedom)
+    found = compare(change, healthy, len(flights), hypotheses(vehicle, shares, healthy.mean))
+    changed = p_value < SIGNIFICANT
+    rest = change - found[0].hypothesis.effect @ found[0].value
+    left = float((distance(rest, deviation, healthy.freedom) ** 2).sum())
+    explained = float(chi2.sf(left, len(AXES))) > _UNEXPLAINED
+    verdict = "unchanged" if not changed else "changed" if explained else "unknown"
+    changes = _changes(found, vehicle, verdict == "changed")
+    score = float(np.sqrt((far**2).sum()))
+    return Health(
+        verdict, () if verdict == "unknown" else changes, score, p_value, trim, far, healthy, tuple(flights),
+        tuple(baseline),
+    )  # fmt: skip
+
+
+def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool) -> tuple[Change, ...]:
+    """The best explanation as changes, largest first, with the explanations that lost."""
+    shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
+    shares /= shares.sum()
+    best, lost = found[0], _rivals(found, shares)
+    if best.hypothesis.kind == "weak_rotor":
+        out = []
+        for k, rotor in enumerate(best.hypothesis.rotors):
+            sure = float(sum(s for one, s in zip(found, shares, strict=True) if rotor in one.hypothesis.rotors))
+            out.append(_weak_rotor(best, k, sure, changed, lost))
+        return tuple(sorted(out, key=lambda c: -abs(c.parameters[1][2])))
+    return _of_mass(best, vehicle, float(shares[0]), changed, lost)
+
+
+def _rivals(found: Sequence[Explained], shares: FloatArray) -> tuple[Rival, ...]:
+    """Explanations other than the first, the most probable ones."""
+    others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
+    return tuple(Rival(*_names(one), one.p_value, float(share)) for one, share in others)
+
+
+def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """An explanation in names of the contract, and its rotors from 1."""
+    kind = one.hypothesis.kind
+    if kind == "effort":
+        return ("thrust_drop" if one.value[0] > 0.0 else "mass_change",), ()
+    effects = ("cg_offset", "mass_change") if kind == "payload" else (kind,)
+    return effects, tuple(j + 1 for j in one.hypothesis.rotors)
+
+
+def _interval(one: Explained, k: int, scale: float = 1.0) -> tuple[float, tuple[float, float]]:
+    value, half = float(one.value[k]) * scale, _Z95 * float(np.sqrt(one.covariance[k, k])) * scale
+    return value, (value - half, value + half)
+
+
+def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...]) -> Change:
+    rotor = one.hypothesis.rotors[k] + 1
+    loss, loss_ci = _interval(one, 2 * k)
+    drag, drag_ci = _interval(one, 2 * k + 1)
+    sentence = (
+        f"Rotor {rotor} needs {100.0 * loss:.0f} % more command for its share of the load than in the baseline, "
+        f"and its drag torque is {100.0 * abs(drag):.0f} % {'lower' if drag >= 0.0 else 'higher'}."
+    )
+    parameters = (
+        ("rotor", "", float(rotor), None), ("loss", "", loss, loss_ci), ("drag_loss", "", drag, drag_ci),
+    )  # fmt: skip
+    return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
+
+
+def _of_mass(
+    one: Explained, vehicle: Vehicle, share: float, changed: bool, lost: tuple[Rival, ...]
+) -> tuple[Change, ...]:
+    """A payload as mass_change and cg_offset, a shifted CG, or effort alone."""
+    kind, sure = one.hypothesis.kind, changed and share > _SURE
+
+    def change(effect: str, parameters: Any, sentence: str, rivals: Any = lost) -> Change:
+        return Change(effect, tuple(parameters), one.p_value, share, sure, rivals, sentence)
+
+    if kind == "effort":
+        value, (low, high) = _interval(one, 0)
+        more = (
+            f"All rotors together need {100.0 * value:+.1f} % command for the same force, their balance is as it was."
+        )
+        rival = Rival(("mass_change" if value > 0.0 else "thrust_drop",), (), one.p_value, share)
+        if value > 0.0:
+            drop = [1.0 - float(np.exp(-v)) for v in (value, low, high)]
+            return (change("thrust_drop", [("fraction", "", drop[0], (drop[1], drop[2]))], more, (rival, *lost)),)
+        return (change("mass_change", [("fraction", "", value, (low, high))], more, (rival, *lost)),)
+    arm = vehicle.arm
+    place = [(name, "m", *_interval(one, k, arm)) for k, name in enumerate("xy")]
+    where = ", ".join(f"{1e3 * p[2]:+.1f} mm along {p[0]}" for p in place)
+    shift = change("cg_offset", place, f"The centre of gravity moved by {where}; the yaw trim stayed.")
+    if kind == "cg_offset":
+        return (shift,)
+    mass, interval = _interval(one, 2)
+    more = f"The rotors carry {100.0 * mass:.1f} % more, off centre."
+    return (change("mass_change", [("fraction", "", mass, interval)], more), shift)

@@ -1,0 +1,198 @@
+"""Health for people: verdict, tables, and the page with a picture of the airframe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from quadid.report.text_table import Cell, Column, TextTable
+from quadid.report.verdict import Level, Verdict
+
+JsonDict = Mapping[str, Any]
+
+_LEVELS: dict[str, Level] = {"unchanged": "good", "changed": "poor", "unknown": "poor"}
+_WORDS = {
+    "mass_change": "mass", "cg_offset": "centre of gravity", "thrust_drop": "thrust of all rotors",
+    "weak_rotor": "rotor",
+}  # fmt: skip
+_STEPS = {
+    "weak_rotor": "Look at the propeller (cuts, tape, loose on its shaft) and the motor of rotor {rotor}; "
+    "exchange the propeller and fly again.",
+    "mass_change": "Look for what was added or removed; if it is meant to be there, make new baseline flights.",
+    "cg_offset": "Check that the battery sits where it did, and what hangs on the arms.",
+    "thrust_drop": "Check the battery (age, charge) and all propellers.",
+}
+
+
+def _number(change: JsonDict, name: str) -> float:
+    return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
+
+
+def change_words(change: JsonDict) -> str:
+    """A change in a few words: ``rotor 3: 21 % less thrust``."""
+    effect = change["effect"]
+    if effect == "weak_rotor":
+        return f"rotor {_number(change, 'rotor'):.0f}: {100.0 * _number(change, 'loss'):.0f} % less thrust"
+    if effect == "cg_offset":
+        shift = [1e3 * _number(change, axis) for axis in "xy"]
+        return f"centre of gravity moved by {shift[0]:+.1f} mm (forward) and {shift[1]:+.1f} mm (right)"
+    fraction = 100.0 * _number(change, "fraction")
+    return (
+        f"{_WORDS[effect]}: {fraction:+.0f} %" if effect == "mass_change" else f"{_WORDS[effect]}: {-fraction:+.0f} %"
+    )
+
+
+def rival_words(rival: JsonDict) -> str:
+    """An explanation that lost, with its probability: ``weak rotor 3, 4 (0.08)``."""
+    names = " and ".join([rival["effect"], *rival.get("with", ())]).replace("_", " ")
+    rotors = ", ".join(map(str, rival.get("rotors", ())))
+    return f"{names} {rotors}".rstrip() + f" ({rival['probability']:.2f})"
+
+
+def health_verdict(result: JsonDict) -> Verdict:
+    """Judges a result of the form ``quadid.health/1``."""
+    verdict, changes = result["verdict"], result["changes"]
+    n = len(result["baseline"])
+    chance = f"Healthy flights differ this much with probability {result['p_value']:.2g}"
+    against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
+    details = [f"{chance} ({against})."]
+    if verdict == "unchanged":
+        suspects = ", ".join(change_words(c) for c in changes)
+        details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
+        return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
+    if verdict == "unknown":
+        step = "Look the vehicle over; compare with `quadid diagnose`, which fits the motion."
+        return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), (step,))
+    sure = [c for c in changes if c["confident"]] or changes[:1]
+    rest = [c for c in changes if c not in sure]
+    headline = f"The vehicle has changed: {'; '.join(change_words(c) for c in sure)}."
+    if not changes[0]["confident"]:
+        details.append("Other explanations are nearly as probable, see below.")
+    details += [f"Less certain: {'; '.join(change_words(c) for c in rest)}."] if rest else []
+    steps = dict.fromkeys(_step(c) for c in sure)
+    return Verdict(_LEVELS[verdict], headline, tuple(details), tuple(steps))
+
+
+def _step(change: JsonDict) -> str:
+    text = _STEPS[change["effect"]]
+    return text.format(rotor=f"{_number(change, 'rotor'):.0f}") if "{rotor}" in text else text
+
+
+def change_table(changes: Sequence[JsonDict]) -> TextTable:
+    """What changed, with intervals and the explanations that lost."""
+    columns = (
+        Column("change"), Column("value"), Column("95 % interval"), Column("p", right=True, rank=1),
+        Column("probability", right=True, rank=2), Column("rejected alternative", rank=3),
+    )  # fmt: skip
+    rows: list[tuple[str | Cell, ...]] = []
+    for c in changes:
+        first = True
+        rival = c["alternatives"][0] if c["alternatives"] else None
+        other = rival_words(rival) if rival else ""
+        name = Cell(c["effect"].replace("_", " "), "poor" if c["confident"] else "fair")
+        for p in c["parameters"]:
+            if p["name"] == "rotor":
+                name = Cell(f"{name.text} {p['value']:.0f}", name.tone)
+                continue
+            low, high = p["ci95"]
+            row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
+            more = (f"{c['p_value']:.1g}", f"{c['probability']:.2f}", other) if first else ("", "", "")
+            rows.append((name if first else "", *row, *more))
+            first = False
+    return TextTable("What changed since the baseline flights", columns, tuple(rows))
+
+
+def trim_table(result: JsonDict) -> TextTable:
+    """Each trim of the flights in question against the baseline."""
+    columns = (
+        Column("trim"), Column("now", right=True), Column("baseline", right=True), Column("spread", right=True, rank=1),
+        Column("distance", right=True),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            t["name"], f"{t['value']:.4f}", f"{t['baseline']:.4f}", f"{t['spread']:.4f}",
+            Cell(f"{t['distance']:+.1f}", "poor" if abs(t["distance"]) > 3.0 else ""),
+        )
+        for t in result["trim"]
+    )  # fmt: skip
+    return TextTable("Trim, as shares of the load (effort: logarithm); distance in healthy spreads", columns, rows)
+
+
+def health_page(
+    result: JsonDict, picture: str, provenance: Sequence[JsonDict], history: Sequence[JsonDict] = ()
+) -> dict[str, Any]:
+    """Builds the page.
+
+    Args:
+        result: of the form ``quadid.health/1``.
+        picture: SVG of the airframe.
+        provenance: rows of name and value.
+        history: figures of the baseline and the flights in question.
+    """
+    from dataclasses import asdict
+
+    n, m = len(result["logs"]), len(result["baseline"])
+    caption = (
+        "From above, nose up. Dashed: the load that each rotor carries in the baseline flights. Filled: now, a pixel a "
+        "per cent. Red: damaged; yellow: suspected."
+    )
+    changes = [
+        {
+            "head": ["Change", "Found", "Rejected alternatives (probability)"],
+            "rows": [
+                [change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."), _rivals(c)]
+                for c in result["changes"]
+            ],
+        }
+    ]
+    trims = trim_table(result)
+    head = [column.heading for column in trims.columns]
+    rows = [[cell.text if isinstance(cell, Cell) else cell for cell in row] for row in trims.rows]
+    return {
+        "title": f"Health of {result['vehicle']}",
+        "subtitle": f"{n} flight{'s' * (n != 1)} against {m} baseline flight{'s' * (m != 1)}",
+        "verdict": asdict(health_verdict(result)),
+        "sections": [
+            {"id": "airframe", "title": "Airframe", "intro": caption, "picture": picture, "figures": [], "tables": []},
+            {
+                "id": "changes", "title": "What changed", "figures": [], "tables": changes if result["changes"] else [],
+                "intro": "" if result["changes"] else "Nothing that has a name.",
+            },
+            {
+                "id": "trim", "title": "Trim", "intro": trims.title, "figures": list(history),
+                "tables": [{"head": head, "rows": rows}],
+            },
+        ],
+        "warnings": result["warnings"],
+        "provenance": provenance,
+    }  # fmt: skip
+
+
+def _rivals(change: JsonDict) -> str:
+    return ", ".join(map(rival_words, change["alternatives"])) or "none"
+
+
+def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequence[str]) -> JsonDict:
+    """Every flight's trims in healthy spreads from the baseline's mean.
+
+    Args:
+        rows: role (baseline or flight), name and distances of each flight.
+        names: of the trims.
+    """
+    data = [
+        {
+            "role": role, "name": label, "type": "scatter", "mode": "markers", "text": [n for _, n, _ in part],
+            "x": [k + 0.06 * (i - 0.5 * (len(part) - 1)) for k in range(len(names)) for i in range(len(part))],
+            "y": [float(d[k]) for k in range(len(names)) for _, _, d in part],
+        }
+        for role, label in (("measured", "baseline"), ("after", "now"))
+        for part in [[r for r in rows if r[0] == role]]
+    ]  # fmt: skip
+    layout = {
+        "xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)},
+        "yaxis": {"title": {"text": "healthy spreads"}},
+    }
+    return {
+        "id": "trims", "title": "Every flight", "caption": "distance from the baseline's mean",
+        "views": [{"label": "", "data": data, "layout": layout}], "height": 300,
+    }  # fmt: skip

@@ -1,0 +1,168 @@
+"""Health: what changed in a vehicle since the baseline flights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import LogError
+from quadid.workflow.loading import (
+    Cut,
+    Log,
+    as_vehicle,
+    check_conventions,
+    first_imu_time,
+    open_recording,
+    parse_cut,
+)
+from quadid.workflow.outcome import Outcome
+
+if TYPE_CHECKING:
+    from quadid.health.changes import Health
+    from quadid.health.trims import FlightTrim
+    from quadid.report.text_table import TextTable
+    from quadid.report.verdict import Verdict
+    from quadid.vehicle import Vehicle
+    from quadid.window import Recording
+
+Flight = str | Path | Log
+"""A log: its path, with a span if wanted, or as `quadid.load` returns it."""
+
+
+@dataclass(frozen=True, repr=False)
+class HealthOutcome(Outcome):
+    """What changed.
+
+    Attributes:
+        result: of the form ``quadid.health/1``.
+        found: the comparison itself.
+        vehicle: whose flights they are.
+        recordings: the logs as read, those in question first.
+    """
+
+    result: dict[str, Any]
+    found: Health
+    vehicle: Vehicle
+    recordings: tuple[Recording, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Healthy or changed, and what to do."""
+        from quadid.report.health_page import health_verdict
+
+        return health_verdict(self.result)
+
+    def tables(self) -> list[TextTable]:
+        """Changes, and each trim against the baseline."""
+        from quadid.report.health_page import change_table, trim_table
+
+        changes = [change_table(self.result["changes"])] if self.result["changes"] else []
+        return [*changes, trim_table(self.result)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a number of a change."""
+        return [
+            {"effect": c["effect"], "confident": c["confident"], "parameter": p["name"], "unit": p["unit"],
+             "value": p["value"], "low": low, "high": high, "p_value": c["p_value"]}
+            for c in self.result["changes"]
+            for p in c["parameters"]
+            for low, high in [p["ci95"] or (None, None)]
+        ]  # fmt: skip
+
+    def report(self, path: str | Path, command: str | None = None) -> Path:
+        """Writes the HTML report; `command` is the command line that led to it, if one did."""
+        from quadid.workflow.files import write_text
+        from quadid.workflow.reporting import LIBRARY, health_html
+
+        return write_text(path, health_html(self, command=command or LIBRARY))
+
+
+def health(
+    logs: Flight | Sequence[Flight], baseline: Flight | Sequence[Flight], *, vehicle: str | Path | Vehicle,
+    preset: str = "auto", unchecked: bool = False,
+) -> HealthOutcome:  # fmt: skip
+    """Compares flights with healthy flights of the same vehicle: which rotor, mass, centre of gravity, thrust.
+
+    Works on gentle flights: hover for 5 s or more between take-off and landing.  All baseline flights share one healthy
+    vehicle, all `logs` one that may have changed; how far healthy flights differ is estimated from the baseline.
+
+    Args:
+        logs: a flight or several in question.
+        baseline: a healthy flight or, much better, several.
+        vehicle: a shipped name, a YAML file or a `Vehicle`; geometry counts, its parameters may be poorly known.
+        preset: topic names of ROS logs.
+        unchecked: use logs even when their units, frames or motors look wrong.
+
+    Raises:
+        LogError: no log, one that cannot be read, or a flight that is in both lists.
+        NotIdentifiableError: too little steady flight.
+    """
+    from quadid.health.changes import assess
+
+    described = as_vehicle(vehicle)
+    tested, healthy = _several(logs), _several(baseline)
+    if not tested or not healthy:
+        missing = "flight in question" if not tested else "baseline flight"
+        raise LogError(f"no {missing}", "one log or more of each", "name healthy flights with --baseline")
+    warnings: list[str] = []
+    opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
+    trims = [[_trim(recording, described) for recording in part] for part in opened]
+    _distinct(*opened)
+    found = assess(trims[0], trims[1], described)
+    if len(trims[1]) < 3:
+        warnings.append(
+            f"{len(trims[1])} baseline flight{'s' * (len(trims[1]) > 1)}: the spread of healthy flights is mostly "
+            "assumed; give five or more, with other batteries"
+        )
+    result = found.to_dict()
+    result["vehicle"] = described.name
+    result["logs"], result["baseline"] = ([recording.name for recording in part] for part in opened)
+    result["warnings"] = warnings
+    return HealthOutcome(result, found, described, tuple(opened[0] + opened[1]))
+
+
+def _several(given: Flight | Sequence[Flight]) -> list[Flight]:
+    return [given] if isinstance(given, str | Path | Log) else list(given)
+
+
+def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warnings: list[str]) -> Recording:
+    """The recording, cut to the part that is used; adds what looks wrong to `warnings`."""
+    if isinstance(given, Log):
+        recording, cut = given.recording, given.cut
+    else:
+        cut = parse_cut(str(given))
+        recording = open_recording(cut.path, preset)
+    doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle)
+    warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]
+    return _part(recording, cut)
+
+
+def _part(recording: Recording, cut: Cut) -> Recording:
+    """The part of a recording between the limits of `cut`."""
+    if cut.start is None and cut.stop is None:
+        return recording
+    zero = first_imu_time(recording)
+    low = zero + (cut.start if cut.start is not None else -float("inf"))
+    high = zero + (cut.stop if cut.stop is not None else float("inf"))
+    channels = {}
+    for name, channel in recording.channels.items():
+        kept = (channel.t >= low) & (channel.t <= high)
+        if kept.any():
+            channels[name] = replace(channel, t=channel.t[kept], values=channel.values[kept])
+    return replace(recording, channels=channels)
+
+
+def _trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
+    from quadid.health.trims import flight_trim
+
+    return flight_trim(recording, vehicle)
+
+
+def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None:
+    """Raises LogError where one flight is in both lists: it would be compared with itself."""
+    known = {(one.sha256, one.name) for one in healthy if one.sha256}
+    for one in tested:
+        if (one.sha256, one.name) in known:
+            raise LogError(f"{one.name} is in question and in the baseline", "each flight once", "remove it from one")

@@ -1,0 +1,54 @@
+"""`quadid health` and `quadid.health`: contract JSON, exit codes, report, and recorded flights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import quadid
+from quadid.errors import LogError
+
+HEALTHY = ("controller_067", "controller_068", "motor_144", "motor_145", "motor_146")
+"""Healthy flights of airframe E9, both kinds of log."""
+
+
+def paths(folder: Path, *names: str) -> list[str]:
+    return [str(folder / "crazypad" / f"{name}.usd") for name in names]
+
+
+def test_a_cut_propeller_is_named_in_the_form_of_the_contract(data_dir: Path, tmp_path: Path) -> None:
+    done = quadid.health(paths(data_dir, "controller_055"), paths(data_dir, *HEALTHY), vehicle="crazyflie")
+    result = json.loads(done.to_json())
+    assert result["schema"] == "quadid.health/1"
+    assert (result["verdict"], result["logs"]) == ("changed", ["controller_055.usd"])
+    assert len(result["baseline"]) == len(HEALTHY)
+    change = result["changes"][0]
+    assert change["effect"] == "weak_rotor"
+    assert change["p_value"] < 0.01
+    numbers = {p["name"]: p for p in change["parameters"]}
+    assert (numbers["rotor"]["value"], numbers["rotor"]["ci95"]) == (3, None)
+    assert numbers["loss"]["ci95"][0] < numbers["loss"]["value"] < numbers["loss"]["ci95"][1]
+    assert change["alternatives"][0]["p_value"] > 0.0
+    page = done.report(tmp_path / "health.html").read_text()
+    assert 'class="disc damaged"' in page or 'class="disc suspect"' in page
+    assert "Next:" in done.text()
+
+
+def test_a_healthy_flight_of_either_kind_is_unchanged(data_dir: Path) -> None:
+    for name in HEALTHY:
+        rest = [other for other in HEALTHY if other != name]
+        done = quadid.health(paths(data_dir, name), paths(data_dir, *rest), vehicle="crazyflie")
+        assert done.result["verdict"] == "unchanged", name
+
+
+def test_a_flight_is_not_compared_with_itself(data_dir: Path) -> None:
+    with pytest.raises(LogError, match="in question and in the baseline"):
+        quadid.health(paths(data_dir, "motor_144"), paths(data_dir, *HEALTHY), vehicle="crazyflie")
+
+
+def test_one_baseline_is_said_to_be_few(data_dir: Path) -> None:
+    done = quadid.health(paths(data_dir, "motor_145"), paths(data_dir, "motor_144"), vehicle="crazyflie")
+    assert any("1 baseline flight" in text for text in done.warnings)
+    assert done.result["verdict"] == "unchanged"

@@ -1,0 +1,152 @@
+"""Health from trims: each damage is named with its size, healthy flights are left alone, whatever the airframe."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadid.errors import NotIdentifiableError
+from quadid.health import Health, assess, flight_trim, healthy_spread
+from quadid.health.comparison import p_healthy
+from quadid.health.hypotheses import hypotheses
+from quadid.health.trims import trim_directions
+from quadid.vehicle import Vehicle
+from quadid.window import Recording
+from tests.health.hover import Wrong, hover, squared_speeds
+
+PELICAN_X, PELICAN = Vehicle.shipped("pelican_x"), Vehicle.shipped("pelican")
+
+
+def judged(vehicle: Vehicle, wrong: Wrong | None, seed: int, baselines: int = 6) -> Health:
+    healthy = [flight_trim(hover(vehicle, seed=1000 * seed + k), vehicle) for k in range(1, baselines + 1)]
+    return assess([flight_trim(hover(vehicle, wrong, seed=1000 * seed), vehicle)], healthy, vehicle)
+
+
+def named(found: Health) -> dict[str, dict[str, float]]:
+    """Numbers of the changes, by effect; of several rotors by ``weak_rotor 3``."""
+    out = {}
+    for change in found.changes:
+        numbers = {name: value for name, _, value, _ in change.parameters}
+        rotor = numbers.pop("rotor", None)
+        out[change.effect if rotor is None else f"{change.effect} {rotor:.0f}"] = numbers
+    return out
+
+
+@pytest.mark.parametrize("name", ["pelican", "pelican_x", "crazyflie_brushless", "hummingbird"])
+@pytest.mark.parametrize("rotor", [1, 2, 3, 4])
+def test_a_weak_rotor_is_named_with_its_loss(name: str, rotor: int) -> None:
+    vehicle = Vehicle.shipped(name)
+    found = judged(vehicle, Wrong({rotor: 0.15}, {rotor: 0.15}), seed=rotor)
+    assert found.verdict == "changed"
+    assert list(named(found)) == [f"weak_rotor {rotor}"]
+    assert named(found)[f"weak_rotor {rotor}"]["loss"] == pytest.approx(0.15, abs=0.04)
+    assert found.changes[0].confident
+
+
+def test_a_weak_rotor_of_a_hexacopter_is_named() -> None:
+    vehicle = Vehicle.shipped("hexacopter")
+    found = judged(vehicle, Wrong({2: 0.25}, {2: 0.25}), seed=5)
+    assert next(iter(named(found))) == "weak_rotor 2"
+
+
+def test_two_weak_rotors_are_both_named() -> None:
+    found = judged(PELICAN_X, Wrong({1: 0.25, 2: 0.15}, {1: 0.25, 2: 0.15}), seed=6)
+    assert list(named(found)) == ["weak_rotor 1", "weak_rotor 2"]
+
+
+def test_thrust_and_drag_may_be_lost_in_different_shares() -> None:
+    found = judged(PELICAN_X, Wrong({4: 0.2}, {4: 0.05}), seed=7)
+    numbers = named(found)["weak_rotor 4"]
+    assert numbers["loss"] == pytest.approx(0.2, abs=0.05)
+    assert numbers["drag_loss"] < 0.13
+
+
+def test_a_weight_on_an_arm_is_a_payload_and_no_rotor() -> None:
+    place = PELICAN_X.rotors[2].position
+    found = judged(PELICAN_X, Wrong(mass=0.15 * PELICAN_X.mass, place=place[:2]), seed=8)
+    assert set(named(found)) == {"mass_change", "cg_offset"}
+    assert named(found)["mass_change"]["fraction"] == pytest.approx(0.15, abs=0.05)
+    shift = 0.15 / 1.15 * np.array(place[:2])
+    assert named(found)["cg_offset"]["x"] == pytest.approx(shift[0], rel=0.3)
+    assert named(found)["cg_offset"]["y"] == pytest.approx(shift[1], rel=0.3)
+
+
+def test_more_command_in_the_same_balance_is_thrust_or_mass() -> None:
+    found = judged(PELICAN, Wrong(effort=0.15), seed=9)
+    (change,) = found.changes
+    assert change.effect == "thrust_drop"
+    assert change.rivals[0].effects == ("mass_change",)
+    assert change.parameters[0][2] == pytest.approx(1.0 - 1.0 / 1.15, abs=0.03)
+
+
+def test_healthy_flights_are_left_alone() -> None:
+    verdicts = [judged(PELICAN_X, None, seed).verdict for seed in range(20, 60)]
+    assert verdicts.count("unchanged") >= 38  # at 1 %, more than 2 of 40 has a chance of 1 %
+
+
+def test_the_score_grows_with_the_damage() -> None:
+    scores = [judged(PELICAN_X, Wrong({3: loss}, {3: loss}), seed=3).score for loss in (0.0, 0.05, 0.1, 0.2, 0.3)]
+    assert scores == sorted(scores)
+
+
+def test_one_baseline_flight_is_enough_for_a_large_loss_only() -> None:
+    large = judged(PELICAN_X, Wrong({3: 0.3}, {3: 0.3}), seed=4, baselines=1)
+    small = judged(PELICAN_X, Wrong({3: 0.02}, {3: 0.02}), seed=4, baselines=1)
+    assert (large.verdict, small.verdict) == ("changed", "unchanged")
+    assert not any(change.confident for change in small.changes)
+
+
+def test_effects_of_the_hypotheses_are_those_of_balance() -> None:
+    """Each column against the exact balance of a slightly damaged vehicle: linear to second order."""
+    trim, small = np.zeros(4), 1e-4
+    vehicle, none = PELICAN_X, np.zeros(4)
+    directions = trim_directions(vehicle)
+
+    def trims(wrong: Wrong) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        w, mass = squared_speeds(vehicle, wrong, none), 1.0 + wrong.mass / vehicle.mass
+        felt = np.log(w.sum() / squared_speeds(vehicle, Wrong(), none).sum())
+        assert mass >= 1.0
+        return np.array([*(directions @ w / w.sum()), felt])
+
+    offered = hypotheses(vehicle, np.full(4, 0.25), trim)
+    for one in offered:
+        if one.kind == "weak_rotor" and len(one.rotors) == 1:
+            (j,) = one.rotors
+            for k, wrong in enumerate((Wrong({j + 1: small}), Wrong({}, {j + 1: small}))):
+                np.testing.assert_allclose(trims(wrong) / small, one.effect[:, k], atol=2e-3)
+    payload = next(one for one in offered if one.kind == "payload")
+    moved = trims(Wrong(mass=small * vehicle.mass, place=(0.1, 0.05)))
+    numbers = np.array([0.1 / vehicle.arm, 0.05 / vehicle.arm, 1.0])
+    np.testing.assert_allclose(moved / small, payload.effect @ numbers, atol=2e-3)
+
+
+def test_p_values_of_healthy_flights_are_uniform() -> None:
+    """Drawn from the model of the spread itself, with its few degrees of freedom."""
+    rng = np.random.default_rng(5)
+    freedom = np.array([6.0, 6.0, 3.0, 3.0])
+    draws = rng.normal(size=(4000, 4)) / np.sqrt(rng.chisquare(freedom, size=(4000, 4)) / freedom)
+    p = np.array([p_healthy(row, np.ones(4), freedom) for row in draws])
+    for level in (0.01, 0.1, 0.5):
+        assert np.mean(p < level) == pytest.approx(level, abs=4.0 * np.sqrt(level * (1 - level) / 4000))
+
+
+def test_spread_comes_from_baselines_and_is_shared_by_roll_and_pitch() -> None:
+    flights = [flight_trim(hover(PELICAN_X, seed=k, spread=0.04), PELICAN_X) for k in range(1, 40)]
+    wide = healthy_spread(flights)
+    # A rotor's share of 1/4 times its sd, four of them, over sqrt(2) of the diagonal arms; yaw without that.
+    np.testing.assert_allclose(wide.deviation[:3], [0.0141, 0.0141, 0.02], rtol=0.25)
+    assert wide.deviation[0] == wide.deviation[1]
+
+
+def test_partial_channels_are_enough() -> None:
+    vehicle = PELICAN_X
+    whole = hover(vehicle, Wrong({3: 0.2}, {3: 0.2}), seed=1)
+    bare = Recording(whole.name, whole.format, {"rotor_speed": whole.channels["rotor_speed"]})
+    a, b = flight_trim(whole, vehicle), flight_trim(bare, vehicle)
+    np.testing.assert_allclose(a.mean[:3], b.mean[:3], atol=2e-3)
+    assert "hover" in b.channels
+
+
+def test_too_little_flight_is_refused_with_what_is_needed() -> None:
+    with pytest.raises(NotIdentifiableError, match="5 s or more between take-off and landing"):
+        flight_trim(hover(PELICAN_X, seconds=4.0), PELICAN_X)
