@@ -48,7 +48,7 @@ $(ROS): pyproject.toml $(DEV)
 $(ROS_VERSIONS): $(ROS)
 	@:
 
-$(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg)
+$(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg msgs/srv/*.srv)
 	tools/build_messages.sh $(VENV)
 	@touch $@
 

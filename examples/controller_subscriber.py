@@ -4,12 +4,13 @@
     python controller_subscriber.py                        # your controller
     python controller_subscriber.py --show-tracking        # also fly a simulation with old and new gains
 
-What a controller should check before it applies a set, in this order:
+What a controller should check before it applies a set, in this order (docs/using-with-ros.md):
 1. the schema version is one it knows, and the vehicle is its own;
-2. the sequence number is newer than that of the set in use (a rollback comes with a new number too);
-3. the state is one it wants: ACCEPTED and ROLLED_BACK were in force, STALE is from before a restart and not yet
-   confirmed by this flight;
-4. units and values are what its formulas expect, and the step from what it uses now is one it can bear.
+2. the sequence number is higher than that of the set in use: numbers rise, also over rollbacks and restarts;
+3. the state is ACCEPTED or ROLLED_BACK (STALE is from before a restart, not yet confirmed by this flight), the set is
+   not known to be out of date, and the mass it rests on is the controller's;
+4. units and values are what its formulas expect, and the step from what it uses now is one it can bear, the first too;
+5. what it uses is identified: a value that the data do not determine stays as it is.
 It then computes its own gains: quadid never sends gains and never touches a flight controller.
 """
 
@@ -26,44 +27,70 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-SCHEMA = 1
+SCHEMA = 2
 UNITS = {
     "b": "N s^2/rad^2", "d": "N m s^2/rad^2", "J_xx": "kg m^2", "J_yy": "kg m^2", "J_zz": "kg m^2", "J_r": "kg m^2",
 }  # fmt: skip
-LARGEST_STEP = 0.5
-"""This controller bears parameters that change by half; yours may not."""
+NEEDED = ("b", "J_xx", "J_yy")
+"""Without these the set is of no use; the others may stay as they are."""
+IN_FORCE = (ParameterSet.STATE_ACCEPTED, ParameterSet.STATE_ROLLED_BACK)
+LARGEST_STEP = 1.0
+"""This controller bears parameters that change by a factor of two, as its first guess may be off; yours may not."""
+SAME_MASS = 0.02
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Model:
-    """The parameters in use."""
+    """The parameters in use, and the mass [kg] they belong to; 0: any."""
 
-    def __init__(self, values: dict[str, float]) -> None:
-        self.values, self.sequence = values, 0
+    def __init__(self, values: dict[str, float], mass: float = 0.0) -> None:
+        self.values, self.mass, self.sequence = values, mass, 0
 
     def objection(self, message: Any, vehicle: str) -> str:
         """Says why a set is not applied; empty when it may be."""
-        found = dict(zip(message.names, message.values, strict=True))
-        units = dict(zip(message.names, message.units, strict=True))
+        return self._not_ours(message, vehicle) or self._not_valid_now(message) or self._not_usable(message)
+
+    def apply(self, message: Any) -> None:
+        """Takes the values that the data determine; the others stay."""
+        for name, value, status in zip(message.names, message.values, message.status, strict=True):
+            if name in UNITS and status == ParameterSet.STATUS_IDENTIFIED:
+                self.values[name] = value
+        self.sequence = message.sequence
+
+    def _not_ours(self, message: Any, vehicle: str) -> str:
         if message.schema_version != SCHEMA:
             return f"schema {message.schema_version}, this controller knows {SCHEMA}"
         if vehicle and message.vehicle_id != vehicle:
             return f"it belongs to {message.vehicle_id}"
         if message.sequence <= self.sequence:
             return f"set {message.sequence} is not newer than {self.sequence}"
-        if message.state not in (ParameterSet.STATE_ACCEPTED, ParameterSet.STATE_ROLLED_BACK):
-            return (
-                "it is from before a restart"
-                if message.state == ParameterSet.STATE_STALE
-                else f"its state is {message.state}"
-            )
+        return ""
+
+    def _not_valid_now(self, message: Any) -> str:
+        if message.state == ParameterSet.STATE_STALE:
+            return "it is from before a restart"
+        if message.state not in IN_FORCE:
+            return f"its state is {message.state}"
+        if message.out_of_date:
+            return f"it is out of date: {message.out_of_date_reason}"
+        if self.mass and not abs(message.mass / self.mass - 1.0) <= SAME_MASS:
+            return f"it rests on a mass of {message.mass:.3g} kg, the vehicle has {self.mass:.3g} kg"
+        return ""
+
+    def _not_usable(self, message: Any) -> str:
+        found = dict(zip(message.names, zip(message.values, message.units, message.status, strict=True), strict=True))
         for name, unit in UNITS.items():
-            if units.get(name) != unit:
-                return f"{name} is in '{units.get(name)}', wanted '{unit}'"
-            if not (math.isfinite(found[name]) and found[name] > 0.0):
-                return f"{name} = {found[name]}"
-            if abs(math.log(found[name] / self.values[name])) > math.log1p(LARGEST_STEP) and self.sequence:
-                return f"{name} would change from {self.values[name]:.3g} to {found[name]:.3g}"
+            value, given, status = found.get(name, (math.nan, "", ParameterSet.STATUS_PRIOR_DOMINATED))
+            if status != ParameterSet.STATUS_IDENTIFIED:
+                if name in NEEDED:
+                    return f"the data do not determine {name}"
+                continue
+            if given != unit:
+                return f"{name} is in '{given}', wanted '{unit}'"
+            if not (math.isfinite(value) and value > 0.0):
+                return f"{name} = {value}"
+            if abs(math.log(value / self.values[name])) > math.log1p(LARGEST_STEP):
+                return f"{name} would change from {self.values[name]:.3g} to {value:.3g}"
         return ""
 
 
@@ -111,8 +138,7 @@ class Controller(Node):
         if reason:
             print(f"set {message.sequence} not applied: {reason}", flush=True)
             return
-        self.model.values = dict(zip(message.names, message.values, strict=True))
-        self.model.sequence = message.sequence
+        self.model.apply(message)
         shown = ", ".join(f"{n} = {v:.4g}" for n, v in self.model.values.items())
         print(f"set {message.sequence} applied ({message.reason}): {shown}", flush=True)
 
@@ -129,9 +155,10 @@ def main() -> None:
 
     from quadid.vehicle import Vehicle
 
-    first = {n: p.initial for n, p in Vehicle.shipped(given.vehicle).parameters.items()}
+    described = Vehicle.shipped(given.vehicle)
+    first = {n: p.initial for n, p in described.parameters.items()}
     rclpy.init(args=[sys.argv[0], *rest])
-    controller = Controller(given.vehicle_id, Model(dict(first)))
+    controller = Controller(given.vehicle_id, Model(dict(first), described.mass))
     try:
         while rclpy.ok():
             rclpy.spin_once(controller, timeout_sec=0.2)

@@ -13,7 +13,6 @@ from quadid.errors import QuadidError
 from quadid_cli.options import JsonTarget, Preset, Seed, VehicleName
 
 if TYPE_CHECKING:
-    from quadid_node.messages import Clock
     from quadid_node.publication import Output
     from quadid_node.recorder import Beginning
     from quadid_node.service import Service
@@ -65,7 +64,6 @@ def replay(
     json: JsonTarget = None,
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
-    from quadid_node.messages import Clock
     from quadid_node.playback import arrivals, stream
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
@@ -81,20 +79,20 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
-    recording, clock = open_log(log, preset), Clock()
+    recording = open_log(log, preset)
     if as_recorded:
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle
         service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored)
-        samples = arrivals(Path(log), beginning.source, len(described.rotors), clock)
+        samples = arrivals(Path(log), beginning.source, len(described.rotors))
     else:
         service = Service(described, settings, InlineWorker())
-        samples = stream(recording, clock)
+        samples = stream(recording)
     with terminal.progress() as advance:
         outputs = play(recording, samples, service, pace, advance)
-    result = summary(recording, service, outputs, clock, candidates)
+    result = summary(recording, service, outputs, candidates)
     if out is not None:
-        write_outputs(out, outputs, described.name, clock)
+        write_outputs(out, outputs, described.name)
         result["out"] = str(out.absolute())
     output.write_json(result, json)
     show(result, quiet=json == "-")
@@ -179,9 +177,9 @@ def parse_pairs(text: str) -> dict[str, float]:
 
 
 def summary(
-    recording: Recording, service: Service, outputs: Sequence[Output], clock: Clock, candidates: bool = False
+    recording: Recording, service: Service, outputs: Sequence[Output], candidates: bool = False
 ) -> dict[str, Any]:
-    """The replay as JSON, of the form ``quadid.replay/1``; times count from ``epoch`` [s, UNIX], 0 for boot time."""
+    """The replay as JSON, of the form ``quadid.replay/1``; times [s, UNIX], or since boot in a log that has no more."""
     from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
 
     from quadid.online import Diagnosed, Event, Publish
@@ -195,7 +193,7 @@ def summary(
     return {
         "schema": "quadid.replay/1",
         "log": recording.name,
-        "epoch": (clock.base_ns or 0) // 10**9,
+        "epoch": 0,
         "vehicle": service.vehicle.name,
         "published": [set_to_dict(s) for s in sets],
         **({"candidates": [set_to_dict(s, covariance=False) for s in every]} if candidates else {}),
@@ -209,8 +207,9 @@ def summary(
     }
 
 
-def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str, clock: Clock) -> None:
+def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
     """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
+    from quadid_node.stamps import nanoseconds
     from quadid_replay import TopicWriter
 
     from quadid.online import Diagnosed, Publish
@@ -220,13 +219,13 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str, clock: Cl
         for item in outputs:
             if isinstance(item, Publish):
                 kind, topic = messages.PARAMETER_SET, messages.TOPICS[item.topic]
-                message, t = messages.parameter_set(item.item, vehicle, clock), item.item.stop
+                message, t = messages.parameter_set(item.item, vehicle), item.item.stop
             elif isinstance(item, Diagnosed):
                 kind, topic = messages.DIAGNOSIS, messages.TOPICS["diagnosis"]
-                message, t = messages.diagnosis(item, vehicle, clock), item.t
+                message, t = messages.diagnosis(item, vehicle), item.t
             else:
                 continue
-            writer.write(topic, kind, message, max(clock.nanoseconds(t), 0))
+            writer.write(topic, kind, message, nanoseconds(t))
 
 
 def show(result: dict[str, Any], quiet: bool) -> None:

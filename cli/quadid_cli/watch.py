@@ -35,7 +35,7 @@ def watch(
     ] = "local",
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
     approve: Annotated[
-        str, typer.Option("--approve", metavar="VEHICLE", help="Approve its waiting set, and end.")
+        str, typer.Option("--approve", metavar="VEHICLE[=N]", help="Approve set N, or the newest that waits, and end.")
     ] = "",
     rollback: Annotated[str, typer.Option("--rollback", metavar="VEHICLE", help="Take its set back, and end.")] = "",
     json: JsonTarget = None,
@@ -68,7 +68,13 @@ def watch(
 
 def _command(fleet: Fleet, vehicle: str, name: str) -> dict[str, Any]:
     """What the vehicle said to a command that it carried out, of the form ``quadid.command/1``."""
-    done, text = fleet.command(vehicle, name)
+    vehicle, _, number = vehicle.partition("=")
+    sequence = int(number) if number.isdigit() else None
+    if name == "approve" and sequence is None:
+        end = time.monotonic() + SETTLE
+        while not (sequence := fleet.waiting(vehicle)) and time.monotonic() < end:
+            time.sleep(0.05)
+    done, text = fleet.command(vehicle, name, sequence)
     if not done:
         raise WatchError(f"{vehicle}: {name} was not done: {text}")
     return {"schema": "quadid.command/1", "vehicle": vehicle, "command": name, "text": plain(text)}

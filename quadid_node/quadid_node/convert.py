@@ -19,8 +19,8 @@ from quadid_replay.signal_columns import SignalColumns
 from quadid.errors import QuadidError
 from quadid.window import Block, Sample
 from quadid_node.chooser import Chooser
-from quadid_node.messages import Clock
 from quadid_node.presets import Input
+from quadid_node.stamps import many_seconds, seconds
 
 FEWEST = 2
 """Fewer messages than these are quicker read one by one."""
@@ -38,10 +38,19 @@ def message_class(name: str) -> Any:
     Raises:
         MessageTypeError: the package is not installed, or has no such type.
     """
+    return _interface(name, "msg")
+
+
+def service_class(name: str) -> Any:
+    """The class of the service ``package/Type``; raises MessageTypeError."""
+    return _interface(name, "srv")
+
+
+def _interface(name: str, folder: str) -> Any:
     package, kind = name.split("/")[0], name.split("/")[-1]
     apt = f"ros-jazzy-{package.replace('_', '-')}"
     try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind)
+        return getattr(importlib.import_module(f"{package}.{folder}"), kind)
     except ModuleNotFoundError as error:
         fix = "colcon build the msgs folder, or run 'make messages'" if package == "quadid_msgs" else f"install {apt}"
         raise MessageTypeError(f"message type {name}: package {package} is not installed", fix=fix) from error
@@ -67,13 +76,12 @@ class Decoder:
     """
 
     def __init__(
-        self, entry: Input, clock: Clock, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any]
+        self, entry: Input, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any]
     ) -> None:  # fmt: skip
         """Prepares for one input.
 
         Args:
             entry: topic, type, channels with ranks.
-            clock: of the stamps.
             chooser: shared by all topics.
             rotors: number of rotors; surplus motor outputs are left out.
             decode: serialized bytes to a message of the type; see `deserializer`.
@@ -81,7 +89,7 @@ class Decoder:
         kind = TYPES[entry.type]
         self._kind, self._columns = kind, SignalColumns(kind)
         self._ranks = dict(entry.channels)
-        self._clock, self._chooser, self._rotors = clock, chooser, rotors
+        self._chooser, self._rotors = chooser, rotors
         self.failed = 0
 
         self._layout: BlockReader | None = None
@@ -115,7 +123,7 @@ class Decoder:
         ns = read.seconds * 10**9 + read.nanoseconds
         if not (ns > 0).all():
             return None
-        t = self._clock.many(ns)
+        t = many_seconds(ns)
         columns = []
         for name, values in told:
             channel, convert = SIGNALS[name]
@@ -144,7 +152,7 @@ class Decoder:
         if ns <= 0:
             self.failed += 1
             return
-        t = self._clock.seconds(ns)
+        t = seconds(ns)
         for name, values in signals:
             channel, convert = SIGNALS[name]
             rank = self._ranks.get(channel)

@@ -1,10 +1,11 @@
-"""A live vehicle's MAVLink messages to samples, on its boot clock; the rules are those of telemetry logs."""
+"""A live vehicle's MAVLink messages to samples, at absolute times; the rules are those of telemetry logs."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from quadid_replay.boot_clock import BootClock
@@ -15,6 +16,8 @@ from quadid.window import Sample
 from quadid_node.chooser import Chooser
 
 ARDUPILOT = 3
+REBOOT = 1.0
+"""The vehicle's clock this far back [s] is one that began anew."""
 MOTOR_PREFERENCE = {
     "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
     "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
@@ -37,14 +40,15 @@ class MavlinkDecoder:
         autopilot: its MAV_AUTOPILOT.
     """
 
-    def __init__(self, rotors: int) -> None:
-        """Expects a vehicle with `rotors` rotors."""
+    def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
+        """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
         self.counts: Counter[str] = Counter()
         self.parameters: dict[str, float] = {}
         self.autopilot = 0
         self._rotors = rotors
         self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
+        self._wall, self._epoch, self._newest = wall, 0.0, math.inf
         self._row: list[float] = []
         self._row_time = math.nan
 
@@ -71,7 +75,14 @@ class MavlinkDecoder:
         for waited, t in placed:
             if t is not None:
                 for reading in waited:
-                    yield from self._channel(t, reading)
+                    yield from self._channel(self._absolute(t), reading)
+
+    def _absolute(self, boot: float) -> float:
+        """UNIX time of a time of the vehicle's clock, set by ours when it is first heard and when it reboots."""
+        if boot < self._newest - REBOOT:
+            self._epoch, self._newest = self._wall() - boot, boot
+        self._newest = max(self._newest, boot)
+        return boot + self._epoch
 
     def _channel(self, t: float, reading: Reading) -> Iterator[Sample]:
         source = reading.source.split(" ")[0]

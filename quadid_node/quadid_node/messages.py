@@ -1,6 +1,6 @@
 """What the service publishes, as plain dictionaries with the fields of quadid_msgs: for ROS topics and for MCAP alike.
 
-Times inside are stamps in seconds; `stamp` turns them into the two integers of builtin_interfaces/Time.
+Times inside are stamps; `stamps.stamp` turns them into the two integers of builtin_interfaces/Time.
 """
 
 from __future__ import annotations
@@ -8,14 +8,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SetState
 from quadid.online.status import SessionStatus
-from quadid.parameters import NOMINAL_NAMES, Status
+from quadid.parameters import NOMINAL_NAMES
 from quadid_node.codec import Z95
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
+from quadid_node.stamps import stamp
 
 Message = dict[str, Any]
 
@@ -23,13 +21,14 @@ PARAMETER_SET = "quadid_msgs/msg/ParameterSet"
 DIAGNOSIS = "quadid_msgs/msg/Diagnosis"
 FIT_STATUS = "quadid_msgs/msg/FitStatus"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+HEALTH = "quadid_msgs/msg/Health"
 TOPICS = {"parameters": "quadid/parameters", "candidate": "quadid/candidate", "diagnosis": "quadid/diagnosis"}
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 BODY_FRAME = "base_link_frd"
 SET_STATES = {
     SetState.REJECTED: 1, SetState.PENDING: 2, SetState.ACCEPTED: 3, SetState.ROLLED_BACK: 4, SetState.STALE: 5,
 }  # fmt: skip
-STATUSES = {Status.IDENTIFIED: 0, Status.RATIO_ONLY: 1, Status.PRIOR_DOMINATED: 2}
+STATUSES = {"identified": 0, "ratio_only": 1, "prior_dominated": 2, "unreliable": 4}
 PHASES = {
     Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
     Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
@@ -40,56 +39,28 @@ BEHIND = 10.0
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
 
-class Clock:
-    """Stamps: nanoseconds of headers to seconds, and back; seconds count from midnight before the first stamp."""
-
-    def __init__(self, base_ns: int | None = None) -> None:
-        """Counts from `base_ns`, by default from midnight before the first stamp seen."""
-        self.base_ns = base_ns
-
-    def seconds(self, ns: int) -> float:
-        """Seconds since the base."""
-        if self.base_ns is None:
-            self.base_ns = ns // _DAY_NS * _DAY_NS
-        return (ns - self.base_ns) * 1e-9
-
-    def many(self, ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """As `seconds`, for many stamps."""
-        if self.base_ns is None:
-            self.base_ns = int(ns[0]) // _DAY_NS * _DAY_NS
-        return np.asarray((ns - self.base_ns) * 1e-9)
-
-    def nanoseconds(self, t: float) -> int:
-        """Nanoseconds of a time [s]; 0 for none."""
-        return round(t * 1e9) + (self.base_ns or 0) if math.isfinite(t) else 0
-
-    def stamp(self, t: float) -> Message:
-        """builtin_interfaces/Time of a time [s]."""
-        ns = max(self.nanoseconds(t), 0)
-        return {"sec": ns // 10**9, "nanosec": ns % 10**9}
-
-
-_DAY_NS = 86400 * 10**9
-
-
-def parameter_set(item: OnlineSet, vehicle: str, clock: Clock) -> Message:
-    """quadid_msgs/ParameterSet of a set."""
+def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
+    """quadid_msgs/ParameterSet of a set; `boot_id` of the run of the service, empty for a replay."""
     parameters = list(item.parameters)
     return {
-        "header": {"stamp": clock.stamp(item.stop), "frame_id": BODY_FRAME},
+        "header": {"stamp": stamp(item.stop), "frame_id": BODY_FRAME},
         "schema_version": SCHEMA_VERSION,
         "vehicle_id": vehicle,
         "sequence": item.sequence,
+        "boot_id": boot_id,
         "state": SET_STATES[item.state],
         "reason": item.reason if not item.check else f"{item.check}: {item.reason}",
+        "out_of_date": bool(item.outdated),
+        "out_of_date_reason": item.outdated,
+        "mass": item.mass,
         "names": [p.name for p in parameters],
         "units": [p.unit or "1" for p in parameters],
         "values": [p.value for p in parameters],
         "covariance": item.parameters.covariance.ravel().tolist(),
-        "status": [STATUSES[p.status] for p in parameters],
+        "status": [STATUSES[p.status.value] for p in parameters],
         "relative_to": [p.relative_to or "" for p in parameters],
-        "window_start": clock.stamp(item.start),
-        "window_end": clock.stamp(item.stop),
+        "window_start": stamp(item.start),
+        "window_end": stamp(item.stop),
         "samples": item.samples,
         "mse": item.mse,
         "mse_held_out": item.mse_held_out,
@@ -98,27 +69,26 @@ def parameter_set(item: OnlineSet, vehicle: str, clock: Clock) -> Message:
     }
 
 
-def diagnosis(item: Diagnosed, vehicle: str, clock: Clock) -> Message:
+def diagnosis(item: Diagnosed, vehicle: str) -> Message:
     """quadid_msgs/Diagnosis of what was found."""
     nan = math.nan
     first = item.findings[0] if item.findings else None
     return {
-        "header": {"stamp": clock.stamp(item.t), "frame_id": BODY_FRAME},
+        "header": {"stamp": stamp(item.t), "frame_id": BODY_FRAME},
         "vehicle_id": vehicle,
         "verdict": VERDICTS.get(item.verdict, 3),
-        "findings": [_finding(f, clock) for f in item.findings],
+        "findings": [_finding(f) for f in item.findings],
         "mse_nominal": first.mse_before if first else nan,
         "mse_extended": first.mse_after if first else nan,
         "unexplained_channels": [],
         "unexplained": [],
-        "window_start": clock.stamp(item.start),
-        "window_end": clock.stamp(item.stop),
+        "window_start": stamp(item.start),
+        "window_end": stamp(item.stop),
     }
 
 
-def _finding(finding: OnlineFinding, clock: Clock) -> Message:
-    # A time among the numbers counts from the UNIX epoch like every stamp, not from our base.
-    values = {n: clock.nanoseconds(v) * 1e-9 if n == "time" else v for n, v in finding.values.items()}
+def _finding(finding: OnlineFinding) -> Message:
+    values = finding.values
     half = {n: Z95 * finding.sigma.get(n, math.nan) for n in values}
     return {
         "effect": finding.effect,
@@ -138,10 +108,10 @@ def _finding(finding: OnlineFinding, clock: Clock) -> Message:
     }
 
 
-def fit_status(status: SessionStatus, vehicle: str, clock: Clock, seconds: float = math.nan) -> Message:
+def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -> Message:
     """quadid_msgs/FitStatus; `seconds` is how long the last fit took."""
     return {
-        "header": {"stamp": clock.stamp(status.t), "frame_id": BODY_FRAME},
+        "header": {"stamp": stamp(status.t), "frame_id": BODY_FRAME},
         "vehicle_id": vehicle,
         "state": PHASES[status.phase],
         "reason": f"{status.phase.value}: {status.reason}",
@@ -157,14 +127,14 @@ def fit_status(status: SessionStatus, vehicle: str, clock: Clock, seconds: float
     }
 
 
-def diagnostics(health: Health, name: str, hardware: str, stamp: Message, notes: dict[str, str]) -> Message:
+def diagnostics(health: Health, name: str, hardware: str, now: Message, notes: dict[str, str]) -> Message:
     """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).
 
     Args:
         health: of the service.
         name: full node name.
         hardware: vehicle.
-        stamp: now.
+        now: stamp of the report.
         notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
     """
     status = health.status
@@ -182,7 +152,7 @@ def diagnostics(health: Health, name: str, hardware: str, stamp: Message, notes:
     history_level = OK if health.history in ("", "none kept") else ERROR
     history = _entry(name, "history", hardware, history_level, health.history or "written", {})
     entries = [session, _inputs(health, name, hardware, notes), worker, history]
-    return {"header": {"stamp": stamp, "frame_id": ""}, "status": entries}
+    return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
 
 
 def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str]) -> Message:

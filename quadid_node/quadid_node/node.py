@@ -16,13 +16,12 @@ from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
-from std_srvs.srv import Trigger
 
 from quadid.errors import QuadidError
 from quadid.online import Event, Publish
-from quadid.online.active_set import Answer
 from quadid_node import messages
 from quadid_node.chooser import Chooser
+from quadid_node.commands import Commands
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
 from quadid_node.intake import DEPTH, Intake
 from quadid_node.neighbours import Neighbours, Offer
@@ -123,7 +122,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
         preset = source(values["source"])
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])
-        self._stamps = messages.Clock()
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
         self._neighbours = Neighbours(inputs, self._offers_on, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
@@ -144,7 +142,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _subscribe(self, preset: Source, rotors: int) -> None:
         chooser = Chooser(best_ranks(preset.inputs))
         for entry in preset.inputs:
-            decoder = Decoder(entry, self._stamps, chooser, rotors, deserializer(entry.type))
+            decoder = Decoder(entry, chooser, rotors, deserializer(entry.type))
             topic = self.resolve_topic_name(entry.topic)
             take = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS)
             self._intake.open(entry, topic, decoder, take)
@@ -156,9 +154,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _offer(self) -> None:
         self._speaker = Speaker(self, self._observer)
-        for name, answer in (("fit_now", self._fit_now), ("approve", self._approve), ("rollback", self._roll_back)):
-            service = self.create_service(Trigger, f"quadid/{name}", answer)
-            self._open.append((self.destroy_service, service))
+        commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
+        for name, kind, answer in commands.offered():
+            self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
         self._open.append((self.destroy_timer, self.create_timer(STEP_SECONDS, self._step, clock=self._steady)))
 
     def _tear_down(self) -> None:
@@ -227,12 +225,12 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _put(self, output: Output) -> None:
         if isinstance(output, Event):
             self._log(output.level, output.text)
-        elif self._speaker is None or self._speaker.silent:
+        elif self._service is None or self._speaker is None or self._speaker.silent:
             return
         elif isinstance(output, Publish):
-            self._speaker.publish(output.topic, messages.parameter_set(output.item, self._id, self._stamps))
+            self._speaker.publish(output.topic, messages.parameter_set(output.item, self._id, self._service.boot_id))
         else:
-            self._speaker.publish("diagnosis", messages.diagnosis(output, self._id, self._stamps))
+            self._speaker.publish("diagnosis", messages.diagnosis(output, self._id))
 
     def _log(self, level: str, text: str) -> None:
         """One call a level: rclpy remembers the level of each line of code and refuses another."""
@@ -255,7 +253,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._neighbours.note(speaker.ours, speaker.problem)
         yield
         health = service.health()
-        fields = messages.fit_status(health.status, self._id, self._stamps, health.fit_seconds)
+        fields = messages.fit_status(health.status, self._id, health.fit_seconds)
         if "no rotor speeds" in fields["reason"]:
             fields["reason"] += f"; here: {self._hint}"
         speaker.publish("status", fields)
@@ -276,22 +274,3 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 if change.name == "approval":
                     self._service.decide_approval(change.value)
         return SetParametersResult(successful=True)
-
-    def _fit_now(self, request: Any, response: Any) -> Any:
-        return self._answer(response, lambda service: service.session.fit_now())
-
-    def _approve(self, request: Any, response: Any) -> Any:
-        return self._answer(response, lambda service: service.approve("ros service"))
-
-    def _roll_back(self, request: Any, response: Any) -> Any:
-        return self._answer(response, lambda service: service.roll_back("ros service"))
-
-    def _answer(self, response: Any, command: Callable[[Service], Answer]) -> Any:
-        if self._service is None or not self._active:
-            response.success, response.message = False, "the node is not active; fix: activate it (ros2 lifecycle set)"
-            return response
-        answer = command(self._service)
-        response.success, response.message = answer.done, answer.text
-        for output in self._service.step(WORK_SECONDS):
-            self._put(output)
-        return response

@@ -18,8 +18,8 @@ from quadid.errors import LogError
 from quadid.window import Recording, Sample
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks
-from quadid_node.messages import Clock
 from quadid_node.presets import source
+from quadid_node.stamps import seconds
 
 _BASE = re.compile(r"times count from UNIX time (\d+) s")
 
@@ -33,8 +33,8 @@ def base_seconds(recording: Recording) -> int:
     return 0
 
 
-def stream(recording: Recording, clock: Clock) -> Iterator[Sample]:
-    """Yields all samples in time order, in the seconds of `clock`; at equal times in the order of the channels.
+def stream(recording: Recording) -> Iterator[Sample]:
+    """Yields all samples in time order, at equal times by channel; absolute where the log's times are.
 
     Times are brought back to whole nanoseconds, as they came in headers, so that a replayed log gives the numbers of
     the live run bit for bit.
@@ -50,17 +50,16 @@ def stream(recording: Recording, clock: Clock) -> Iterator[Sample]:
     for i, row in zip(which[order].tolist(), rows[order].tolist(), strict=True):
         channel = recording.channels[names[i]]
         ns = round(float(channel.t[row]) * 1e9) + base
-        yield Sample(clock.seconds(ns), names[i], tuple(channel.values[row].tolist()))
+        yield Sample(seconds(ns), names[i], tuple(channel.values[row].tolist()))
 
 
-def arrivals(path: Path, preset: str, rotors: int, clock: Clock) -> Iterator[Sample]:
+def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
     """Yields the samples of a node's recording as the node's session got them: the same numbers in the same order.
 
     Args:
         path: the recording.
         preset: whose topic names and types it holds.
         rotors: of the vehicle.
-        clock: of the stamps.
 
     Raises:
         LogError: a message definition that cannot be used.
@@ -78,6 +77,6 @@ def arrivals(path: Path, preset: str, rotors: int, clock: Clock) -> Iterator[Sam
             raise LogError(
                 f"{path.name}: the definition of {topic.type} is damaged ({type(error).__name__})"
             ) from error
-        decoders[number] = Decoder(entry, clock, chooser, rotors, decode)
+        decoders[number] = Decoder(entry, chooser, rotors, decode)
     for number, _, data in file.messages(decoders.keys()):
         yield from decoders[number].samples(data)

@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
@@ -105,6 +106,11 @@ class Service:
     def published(self) -> OnlineSet | None:
         """The set that the parameter topic holds: in force, and on the disk where a history is kept."""
         return self._publication.in_force
+
+    @property
+    def history(self) -> Path | None:
+        """File of the history; None: none is kept."""
+        return self._store.path if self._store is not None else None
 
     @property
     def ready(self) -> bool:

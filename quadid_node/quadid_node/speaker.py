@@ -30,9 +30,11 @@ LATCHED_QOS = QoSProfile(
 )  # fmt: skip
 KINDS = {
     "parameters": messages.PARAMETER_SET, "candidate": messages.PARAMETER_SET, "diagnosis": messages.DIAGNOSIS,
-    "status": messages.FIT_STATUS, "diagnostics": messages.DIAGNOSTICS,
+    "health": messages.HEALTH, "status": messages.FIT_STATUS, "diagnostics": messages.DIAGNOSTICS,
 }  # fmt: skip
-_NAMES = {**messages.TOPICS, "status": "quadid/status", "diagnostics": "/diagnostics"}
+_NAMES = {**messages.TOPICS, "health": "quadid/health", "status": "quadid/status", "diagnostics": "/diagnostics"}
+LATCHED = ("diagnosis", "health")
+"""Topics whose last message is for late joiners too, as is that of the parameters."""
 
 
 class Speaker:
@@ -51,7 +53,11 @@ class Speaker:
         """
         self._node = node
         self.ours = node.resolve_topic_name(_NAMES["parameters"])
-        self._publishers = {topic: self._create(topic, USUAL_QOS) for topic in KINDS if topic != "parameters"}
+        self._publishers = {
+            topic: self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS)
+            for topic in KINDS
+            if topic != "parameters"
+        }
         self._claim: Claim | None = None
         if not observer:
             self._claim = Claim(

@@ -40,13 +40,15 @@ class StoreError(QuadidError):
     """A history that another service writes, or that is not there."""
 
 
-def read_history(path: Path, vehicle: str, candidates: int = 0, events: int = 0) -> dict[str, list[dict[str, Any]]]:
+def read_history(
+    path: Path, vehicle: str, candidates: int = 0, events: int = 0, sets: int = -1
+) -> dict[str, list[dict[str, Any]]]:  # fmt: skip
     """Reads a history without touching it: sets, newest candidates and events, and the names of all vehicles.
 
     Args:
         path: database file.
         vehicle: name of the vehicle.
-        candidates: newest candidates to return; events: newest events.
+        candidates: newest candidates to return; events: newest events; sets: newest sets, -1: all.
 
     Raises:
         StoreError: no such file, or not a history.
@@ -56,7 +58,7 @@ def read_history(path: Path, vehicle: str, candidates: int = 0, events: int = 0)
     try:
         with contextlib.closing(connect(path, read_only=True)) as db:
             return {
-                "sets": _rows(db, "SELECT wall, data FROM sets WHERE vehicle = ? ORDER BY rowid", (vehicle,)),
+                "sets": _newest(db, "SELECT wall, data", "sets", vehicle, sets),
                 "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),
                 "events": _newest(db, "SELECT wall, t, level, kind, text", "events", vehicle, events),
                 "vehicles": [{"name": n} for (n,) in db.execute(_NAMES)],
@@ -68,7 +70,7 @@ def read_history(path: Path, vehicle: str, candidates: int = 0, events: int = 0)
 
 
 def _newest(db: sqlite3.Connection, what: str, table: str, vehicle: str, most: int) -> list[dict[str, Any]]:
-    found = _rows(db, f"{what} FROM {table} WHERE vehicle = ? ORDER BY id DESC LIMIT ?", (vehicle, most))
+    found = _rows(db, f"{what} FROM {table} WHERE vehicle = ? ORDER BY rowid DESC LIMIT ?", (vehicle, most))
     return found[::-1]
 
 

@@ -5,7 +5,7 @@
     quadid/<vehicle>/diagnosis    findings                           latest value kept
     quadid/<vehicle>/health       once a second                      latest value kept
     quadid/<vehicle>/alive        liveliness token
-    quadid/<vehicle>/command/approve, …/rollback, …/fit_now          queries, answered with JSON; access control decides
+    quadid/<vehicle>/command/approve?sequence=N, …/rollback, …/fit_now   queries; access control decides
 
 TLS and access control come from a Zenoh configuration file (docs/online.md, examples/zenoh).
 """
@@ -175,7 +175,7 @@ class ZenohLink:
             except queue.Empty:
                 return
             with query:
-                done, text = self._carry_out(name)
+                done, text = self._carry_out(name, str(query.selector.parameters))
                 query.reply(query.key_expr, json.dumps({"done": done, "text": text}), encoding=_JSON)
 
     def close(self) -> None:
@@ -192,11 +192,14 @@ class ZenohLink:
                 if kind in self._latest and kind in self._publishers:
                     self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 
-    def _carry_out(self, name: str) -> tuple[bool, str]:
+    def _carry_out(self, name: str, asked: str) -> tuple[bool, str]:
         if self._service is None:
             return False, "this service takes no commands"
+        number = re.fullmatch(r"sequence=(\d{1,18})", asked)
+        if name == "approve" and number is None:
+            return False, "say which set: approve?sequence=N"
         calls: dict[str, Callable[[], Any]] = {
-            "approve": lambda: self._service.approve("zenoh"),  # type: ignore[union-attr]
+            "approve": lambda: self._service.approve("zenoh", int(number[1])),  # type: ignore[union-attr, index]
             "rollback": lambda: self._service.roll_back("zenoh"),  # type: ignore[union-attr]
             "fit_now": lambda: self._service.session.fit_now(),  # type: ignore[union-attr]
         }
@@ -251,9 +254,23 @@ class Fleet:
         ]
         self._session.get(everything, self._on_reply)
 
-    def command(self, vehicle: str, name: str, seconds: float = 5.0) -> tuple[bool, str]:
-        """Sends a command to one vehicle; returns whether it was done, and what the vehicle said."""
-        for reply in self._session.get(key_of(vehicle, f"command/{name}"), timeout=seconds):
+    def waiting(self, vehicle: str) -> int:
+        """Number of the newest set that waits for approval on a vehicle, by its last report; 0: none."""
+        status = self.latest.get(vehicle, {}).get("health", {}).get("status", {})
+        pending = status.get("pending", 0) if isinstance(status, dict) else 0
+        return pending if isinstance(pending, int) else 0
+
+    def command(self, vehicle: str, name: str, sequence: int | None = None, seconds: float = 5.0) -> tuple[bool, str]:
+        """Sends a command to one vehicle; returns whether it was done, and what the vehicle said.
+
+        Args:
+            vehicle: its name.
+            name: approve, rollback or fit_now.
+            sequence: of the set to approve.
+            seconds: how long to wait for the answer.
+        """
+        asked = f"?sequence={sequence}" if sequence is not None else ""
+        for reply in self._session.get(key_of(vehicle, f"command/{name}") + asked, timeout=seconds):
             if reply.ok is not None:
                 answer = _parse(reply.ok.payload)
                 if answer is not None:

@@ -11,7 +11,6 @@ from mcap_ros2._dynamic import generate_dynamic
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks
 from quadid_node.intake import SLICE, Intake
-from quadid_node.messages import Clock
 from quadid_node.presets import Input, source
 from quadid_replay import write_mcap
 from quadid_replay.mcap_messages import TYPES
@@ -42,10 +41,10 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     return [(file.topics[number].name, data) for number, _, data in file.messages(file.topics.keys())]
 
 
-def decoder(entry: Input, clock: Clock, chooser: Chooser) -> Decoder:
+def decoder(entry: Input, chooser: Chooser) -> Decoder:
     kind = entry.type.replace("/", "/msg/")
     decode = generate_dynamic(kind, schema_text(kind))[kind]
-    return Decoder(entry, clock, chooser, 4, decode)
+    return Decoder(entry, chooser, 4, decode)
 
 
 def flat(items: Iterator[Sample | Block]) -> list[Sample]:
@@ -54,12 +53,12 @@ def flat(items: Iterator[Sample | Block]) -> list[Sample]:
 
 def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message], int]:
     """Samples, what was recorded, and how many blocks there were, when taken in every `batch` messages."""
-    clock, chooser, now = Clock(), Chooser(best_ranks(INPUTS)), [0.0]
+    chooser, now = Chooser(best_ranks(INPUTS)), [0.0]
     intake = Intake(lambda: now[0])
     arrived: dict[str, deque[bytes]] = {e.topic: deque() for e in INPUTS}
     for e in INPUTS:
         waiting = arrived[e.topic]
-        intake.open(e, e.topic, decoder(e, clock, chooser), lambda q=waiting: q.popleft() if q else None)  # type: ignore[misc]
+        intake.open(e, e.topic, decoder(e, chooser), lambda q=waiting: q.popleft() if q else None)  # type: ignore[misc]
     out: list[Sample] = []
     recorded: list[Message] = []
     blocks = 0
@@ -75,8 +74,8 @@ def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[M
 
 
 def one_by_one(messages: list[Message]) -> list[Sample]:
-    clock, chooser = Clock(), Chooser(best_ranks(INPUTS))
-    known = {e.topic: decoder(e, clock, chooser) for e in INPUTS}
+    chooser = Chooser(best_ranks(INPUTS))
+    known = {e.topic: decoder(e, chooser) for e in INPUTS}
     return [s for topic, data in messages for s in known[topic].samples(data)]
 
 
@@ -108,8 +107,8 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
     imu = [data for topic, data in messages if topic == "imu"][:40]
     imu[20] = imu[20][:30]
     entry = next(e for e in INPUTS if e.topic == "imu")
-    whole = decoder(entry, Clock(), Chooser(best_ranks(INPUTS)))
-    single = decoder(entry, Clock(), Chooser(best_ranks(INPUTS)))
+    whole = decoder(entry, Chooser(best_ranks(INPUTS)))
+    single = decoder(entry, Chooser(best_ranks(INPUTS)))
     assert flat(whole.take(imu)) == [s for data in imu for s in single.samples(data)]
     assert whole.failed == single.failed == 1
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_node.messages import Clock
 from quadid_node.playback import arrivals, stream
 from quadid_node.presets import source
 from quadid_node.recorder import RECORD, Beginning, Recorder, read_beginning
@@ -64,9 +63,8 @@ def test_messages_come_back_in_the_order_of_arrival(tmp_path: Path) -> None:
         recorder.take(topic, kind, data)
     recorder.close()
     assert messages(path) == shuffled
-    clock = Clock()
-    got = list(arrivals(path, "canonical", 4, clock))
-    sorted_ones = list(stream(open_log(str(log)), Clock()))
+    got = list(arrivals(path, "canonical", 4))
+    sorted_ones = list(stream(open_log(str(log))))
     assert sorted(got, key=lambda s: (s.channel, s.t)) == sorted(sorted_ones, key=lambda s: (s.channel, s.t))
     assert got != sorted(got, key=lambda s: s.t)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,13 +13,16 @@ from quadid_node.chooser import DECIDE, SILENT, Chooser
 from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, vehicle_id
 from quadid_node.playback import base_seconds, stream
 from quadid_node.presets import source
+from quadid_node.stamps import stamp
 from quadid_replay import open_log, write_mcap
 from quadid_replay.mcap_messages import TYPES
 
 from quadid.errors import QuadidError
+from quadid.parameters import Status
 from quadid.window import Sample
 from quadid_node import messages
 from tests.online.driving import flight
+from tests.online.test_gate import TRUE, online_set
 
 
 def test_everything_but_the_nodes_imports_without_ros() -> None:
@@ -123,7 +127,15 @@ def test_stamps_come_back_to_the_nanosecond(tmp_path: Path) -> None:
     write_mcap(tmp_path / "f.mcap", recording, epoch_ns=1_700_000_123 * 10**9)
     read = open_log(tmp_path / "f.mcap")
     assert base_seconds(read) == 1_700_000_123
-    clock = messages.Clock()
-    first = next(iter(stream(read, clock)))
-    assert clock.base_ns == 1_700_000_123 // 86400 * 86400 * 10**9
-    assert clock.stamp(first.t) == {"sec": 1_700_000_123, "nanosec": 0}
+    first = next(iter(stream(read)))
+    assert stamp(first.t) == {"sec": 1_700_000_123, "nanosec": 0}
+
+
+def test_a_set_carries_its_mass_whether_it_is_out_of_date_and_what_is_unreliable() -> None:
+    item = replace(online_set(TRUE), mass=1.3, outdated="mass +15 % since", start=1.7e9, stop=1.7e9 + 30.25)
+    told = messages.parameter_set(item, "quad1", "ab" * 16)
+    assert (told["mass"], told["out_of_date"], told["out_of_date_reason"]) == (1.3, True, "mass +15 % since")
+    assert told["boot_id"] == "ab" * 16
+    assert told["window_end"] == {"sec": 1_700_000_030, "nanosec": 250_000_000}
+    assert set(messages.STATUSES) >= {s.value for s in Status}
+    assert messages.STATUSES["unreliable"] == 4

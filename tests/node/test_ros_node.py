@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     """Vehicle, node, recorder; a controller that comes late; the recording replayed; a restart."""
     from diagnostic_msgs.msg import DiagnosticArray
     from quadid_msgs.msg import FitStatus, ParameterSet
+    from quadid_msgs.srv import GetHistory
 
     history, recorded = tmp_path / "h.sqlite", tmp_path / "recorded.mcap"
     with node(history, record=recorded) as identify:
@@ -65,7 +67,10 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
         assert identify.end()[0] == 0
     accepted = next(c for c in candidates if c.state == ParameterSet.STATE_ACCEPTED)
     assert dict(zip(accepted.names, accepted.values, strict=True))["b"] == pytest.approx(2.33e-5, rel=0.01)
-    assert accepted.schema_version == 1
+    assert accepted.schema_version == ParameterSet.SCHEMA_VERSION
+    assert len(accepted.boot_id) == 32
+    assert (accepted.mass, accepted.out_of_date) == (1.3, False)
+    assert abs(accepted.window_end.sec - time.time()) < 3600.0, "absolute, not seconds of the day"
     assert accepted.vehicle_id == "pelican"
 
     out = tmp_path / "result.json"
@@ -86,10 +91,18 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
         assert stale[-1].state == ParameterSet.STATE_STALE
         assert list(stale[-1].values) == list(accepted.values)
         assert "not yet confirmed" in stale[-1].reason
+        assert stale[-1].sequence > accepted.sequence
+        assert stale[-1].boot_id != accepted.boot_id
+        assert stale[-1].window_end == accepted.window_end, "the same instant after a restart"
+        found = ear.call("quadid/get_history", GetHistory, GetHistory.Request(most=2))
+        assert found.success
+        assert [s.sequence for s in found.sets][-1] == stale[-1].sequence
+        assert len(found.sets) == 2
 
 
 def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, tmp_path: Path, ear: Ear) -> None:
     from quadid_msgs.msg import ParameterSet
+    from quadid_msgs.srv import Approve
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
     from rcl_interfaces.srv import SetParameters
     from std_srvs.srv import Trigger
@@ -102,7 +115,7 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
     with node(tmp_path / "h.sqlite", approval="manual") as identify:
         sets = ear.listen("quadid/parameters", ParameterSet, latched())
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
-        answer = ear.call("quadid/approve", Trigger, seconds=90.0)
+        answer = ear.call("quadid/approve", Approve, seconds=90.0)
         assert not answer.success
         assert not change("gate.width", double_value=5.0).successful, "outside its range"
         refused = change("window", double_value=8.0)
@@ -115,17 +128,24 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
                 identify.text
             )
             assert not sets, "nothing is published before a person approves"
-            assert ear.call("quadid/approve", Trigger).success
+            waiting = next(c for c in candidates if c.state == ParameterSet.STATE_PENDING)
+            wrong = ear.call("quadid/approve", Approve, Approve.Request(sequence=waiting.sequence - 1))
+            assert not wrong.success
+            done = ear.call("quadid/approve", Approve, Approve.Request(sequence=waiting.sequence))
+            assert done.success, done.message
             assert ear.until(lambda: sets, 5.0)
+            assert sets[0].sequence == done.in_force
+            assert list(sets[0].values) == list(waiting.values), "that set and no other"
             assert sets[0].approved_by == "ros service"
-            again = ear.call("quadid/approve", Trigger)
+            again = ear.call("quadid/approve", Approve, Approve.Request(sequence=waiting.sequence))
+            assert not again.success
             back = ear.call("quadid/rollback", Trigger)
         assert not back.success
         assert "no earlier set" in back.message
         assert ear.call("quadid/fit_now", Trigger).success
         assert identify.end()[0] == 0
     stored = read_history(tmp_path / "h.sqlite", "pelican")["sets"]
-    assert [s["approved_by"] for s in stored][: 1 + again.success] == ["ros service"] * (1 + again.success)
+    assert [s["approved_by"] for s in stored if s["state"] == "accepted"] == ["ros service"]
 
 
 def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: Ear) -> None:

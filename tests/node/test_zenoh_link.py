@@ -58,20 +58,22 @@ def test_three_vehicles_are_seen_and_who_comes_late_gets_the_latest(net: Net) ->
 def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
     owned = service()
     owned.session.active_set.approval = "manual"
-    owned.session.active_set.hold(online_set(TRUE), 30.0)
+    held = [owned.session.active_set.hold(online_set(TRUE), 30.0).sequence for _ in range(2)]
     link, fleet = ZenohLink(net.client("quad1"), "quad1", owned), Fleet(net.client("watch"))
     try:
         time.sleep(0.5)
         answers = []
-        asker = threading.Thread(target=lambda: answers.extend([fleet.command("quad1", "approve") for _ in range(2)]))
+        asked = (None, held[0], held[1])
+        asker = threading.Thread(target=lambda: answers.extend([fleet.command("quad1", "approve", n) for n in asked]))
         asker.start()
         deadline = time.monotonic() + 15.0
-        while len(answers) < 2 and time.monotonic() < deadline:
+        while len(answers) < 3 and time.monotonic() < deadline:
             link.attend()
             time.sleep(0.01)
         asker.join()
-        assert answers[0][0]
-        assert answers[1] == (False, "nothing waits for approval")
+        assert "say which" in answers[0][1]
+        assert answers[1][0]
+        assert answers[2] == (False, "nothing waits for approval")
         assert owned.session.active_set.in_force is not None
         assert owned.session.active_set.in_force.approved_by == "zenoh"
     finally:

@@ -18,6 +18,8 @@ def example(sequence: int) -> ParameterSet:
     message.header.frame_id = "base_link_frd"
     message.state = ParameterSet.STATE_ACCEPTED
     message.reason = "interval below 5 % in three windows"
+    message.boot_id, message.mass = "0" * 32, 1.3
+    message.out_of_date, message.out_of_date_reason = True, "mass +15 % since"
     message.names = ["b", "J_xx", "motor_lag.tau"]
     message.units = ["N s^2/rad^2", "kg m^2", "s"]
     message.values = [2.33e-5, 8.1e-3, 0.05]
