@@ -1,0 +1,151 @@
+"""The library is the same program: every command and its call give equal JSON, and refuse with the same words."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from quadid_replay import write_csv
+
+import quadid
+from quadid.errors import QuadidError
+from quadid.jsonable import jsonable
+from tests.cli.conftest import Cli, Flights, one_line
+
+WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "log", "manoeuvre_file")
+"""Paths of files, which only a command writes."""
+
+
+def same(result: dict[str, Any]) -> dict[str, Any]:
+    """A result without written files and wall time, as JSON has it."""
+    return {k: v for k, v in jsonable(result).items() if k not in (*WRITTEN, "seconds")}
+
+
+@pytest.fixture(scope="module")
+def logs(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Paths of good and of spoilt logs by name."""
+    folder = tmp_path_factory.mktemp("spoilt")
+    recording = flights.train_flight.recording
+    spoilt: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+        "degrees": ("gyro", np.degrees),
+        "rpm": ("rotor_speed", lambda speed: speed * 60.0 / (2.0 * np.pi)),
+        "swapped": ("rotor_speed", lambda speed: speed[:, [1, 0, 3, 2]]),
+    }
+    paths = {"good": str(flights.train), "other": str(flights.unseen), "absent": str(folder / "no.csv")}
+    for name, (key, change) in spoilt.items():
+        channel = recording.channels[key]
+        channels = {**recording.channels, key: replace(channel, values=change(channel.values))}
+        paths[name] = str(folder / f"{name}.csv")
+        write_csv(paths[name], replace(recording, channels=channels))
+    return paths
+
+
+def load(path: str, vehicle: str = "pelican") -> Any:
+    """A log of the library."""
+    return quadid.load(path, vehicle=vehicle)
+
+
+CALLS: dict[str, tuple[list[str], Callable[[str, str], Any]]] = {
+    "identify": (["--validate", "{other}", "--vehicle", "pelican"],
+                 lambda a, b: quadid.identify(load(a), validate=load(b))),
+    "identify by least squares": (["--optimizer", "least_squares", "--seed", "3", "--vehicle", "pelican"],
+                                  lambda a, b: quadid.identify(load(a), optimizer="least_squares", seed=3)),
+    "diagnose": (["--vehicle", "pelican"], lambda a, b: quadid.diagnose(load(a))),
+    "score": (["--vehicle", "pelican", "--horizons", "1,5"],
+              lambda a, b: quadid.score(load(a), horizons=(1, 5))),
+    "inspect": (["--vehicle", "pelican"], lambda a, b: quadid.inspect(a, "pelican")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_command_and_call_agree_on_good_flights(name: str, inside: Cli, logs: dict[str, str], tmp_path: Path) -> None:
+    options, call = CALLS[name]
+    arguments = [o.format(**logs) for o in options]
+    run = inside(name.split()[0], logs["good"], *arguments, "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+    made = call(logs["good"], logs["other"])
+    assert same(run.data) == same(made.result)
+    warned = [line.removeprefix("warning: ") for line in run.err.splitlines() if line.startswith("warning: ")]
+    if name != "inspect":
+        assert warned == made.warnings
+    printed = inside(name.split()[0], logs["good"], *arguments, "--out", tmp_path).out
+    table = made.tables()[0].text(160).splitlines() if made.tables() else []
+    assert all(line in printed.splitlines() for line in table)
+
+
+@pytest.mark.parametrize("name", ["identify", "diagnose", "score"])
+@pytest.mark.parametrize("wrong", ["degrees", "rpm", "swapped", "absent"])
+def test_command_and_call_refuse_alike(
+    name: str, wrong: str, inside: Cli, logs: dict[str, str], tmp_path: Path
+) -> None:
+    line = one_line(inside(name, logs[wrong], "--vehicle", "pelican", "--out", tmp_path), 2)
+    with pytest.raises(QuadidError) as caught:
+        CALLS[name][1](logs[wrong], logs["other"])
+    assert line == f"quadid: {' '.join(str(caught.value).split())}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "call"),
+    [
+        (["identify", "{good}", "--vehicle", "pelicn"], lambda log: load(log, "pelicn")),
+        (["identify", "{good}", "--vehicle", "pelican", "--optimizer", "psso"],
+         lambda log: quadid.identify(load(log), optimizer="psso")),
+        (["score", "{good}", "--vehicle", "pelican", "--horizons", "0"],
+         lambda log: quadid.score(load(log), horizons=(0,))),
+        (["simulate", "{folder}/x.csv", "--effect", "rotor_drg"], lambda log: quadid.simulate(effects=["rotor_drg"])),
+        (["simulate", "{folder}/x.csv", "--seconds", "0"], lambda log: quadid.simulate(seconds=0.0)),
+        (["export", "--vehicle", "pelican", "--format", "px5"], lambda log: quadid.export("pelican", "px5")),
+    ],
+)  # fmt: skip
+def test_wrong_arguments_are_refused_alike(
+    arguments: list[str], call: Callable[[str], Any], inside: Cli, logs: dict[str, str], tmp_path: Path
+) -> None:
+    line = one_line(inside(*(a.format(folder=tmp_path, **logs) for a in arguments)), 2)
+    with pytest.raises(QuadidError) as caught:
+        call(logs["good"])
+    assert line == f"quadid: {caught.value}"
+
+
+def test_simulate_and_export_agree(inside: Cli, tmp_path: Path) -> None:
+    effect = "rotor_drag:k_x=0.3,k_y=0.3"
+    run = inside("simulate", tmp_path / "a.csv", "--seconds", "10", "--effect", effect, "--json", "-")
+    made = quadid.simulate(seconds=10.0, effects=[effect])
+    assert same(run.data) == same(made.result)
+    assert (tmp_path / "a.csv").read_bytes() == made.save(tmp_path / "b.csv").read_bytes()
+    run = inside("export", "--vehicle", "pelican", "--format", "rotorpy", "--out", tmp_path, "--json", "-")
+    exported = quadid.export("pelican", "rotorpy")
+    assert same(run.data) == same(exported.result)
+    for file in run.data["files"]:
+        assert Path(file).read_text(encoding="utf-8") == exported.texts[Path(file).name]
+
+
+def test_what_a_notebook_needs(logs: dict[str, str], tmp_path: Path) -> None:
+    fit = quadid.identify(load(logs["good"]), validate=load(logs["other"]))
+    assert "Thrust coefficient b" in repr(fit)
+    assert "<table>" in fit._repr_html_()
+    frame = fit.to_frame()
+    assert list(frame["name"]) == ["b", "d", "J_xx", "J_yy", "J_zz", "J_r"]
+    assert fit.plot().data[0].name == "measured"
+    assert fit.to_json(tmp_path / "fit.json") == (tmp_path / "fit.json").read_text(encoding="utf-8")
+    path = fit.vehicle.save(tmp_path / "mine.yaml")
+    assert quadid.load(logs["other"], vehicle=path).vehicle.parameters["b"].initial == pytest.approx(
+        fit.parameters["b"].value, rel=1e-6
+    )
+
+
+def test_the_import_is_cheap_and_reads_no_logs() -> None:
+    text = (
+        "import sys, quadid\n"
+        "heavy = [m for m in ('numpy', 'numba', 'quadid_replay', 'plotly', 'pydantic') if m in sys.modules]\n"
+        "assert not heavy, heavy\n"
+        "for name in quadid.__all__: assert callable(getattr(quadid, name)), name\n"
+        "import quadid.identify.fit, quadid.diagnose.pipeline\n"
+        "assert quadid.identify.fit.fit and callable(quadid.identify) and callable(quadid.diagnose)\n"
+    )
+    subprocess.run([sys.executable, "-c", text], check=True, timeout=120)
