@@ -124,6 +124,7 @@ class Recording:
         sha256: hash of the bytes read.
         grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
+        epoch: UNIX time of its time 0 [s]; None where its clock has no date.
     """
 
     name: str
@@ -134,6 +135,7 @@ class Recording:
     sha256: str = ""
     grid: float | None = None
     autopilot: Mapping[str, float] = field(default_factory=dict)
+    epoch: float | None = None
 
 
 @dataclass(frozen=True)

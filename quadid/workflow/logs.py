@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from quadid.errors import LogError
 from quadid.workflow.loading import Log, as_vehicle
+from quadid.workflow.overlap import check_unseen
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,10 +27,11 @@ def settled(logs: Given, validate: Given, vehicle: str | Path | Vehicle | None) 
     """The vehicle, and the logs to fit and to score, all read with its description.
 
     Raises:
-        LogError: no log.
+        LogError: no log, or a log to score that is fitted too.
     """
     train, held = listed(logs), listed(validate)
     if not train:
         raise LogError("no log", "at least one, from quadid.load", "give a log")
+    check_unseen(train, held)
     described = train[0].vehicle if vehicle is None else as_vehicle(vehicle)
     return described, [log.of(described) for log in train], [log.of(described) for log in held]
