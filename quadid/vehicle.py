@@ -142,6 +142,27 @@ class Stabiliser(_Strict):
     rate: PositiveFloat | None = None
 
 
+class Proof(_Strict):
+    """What shows that the values of this file predict.
+
+    Attributes:
+        verdict: on the result that the file was written by: good (green), fair (amber), poor (red).
+        unseen: flights that were predicted and not fitted.
+        error: largest of their errors over one second, in noise variances (1 is the noise floor).
+    """
+
+    verdict: Literal["good", "fair", "poor"]
+    unseen: tuple[str, ...] = ()
+    error: PositiveFloat | None = None
+
+    @property
+    def lacking(self) -> str:
+        """Why the values are not proven; empty when they are."""
+        if self.verdict == "poor":
+            return "the fit was red" + (f", error {self.error:.3g} (noise floor 1)" if self.error else "")
+        return "" if self.unseen else "no flight was predicted that was not fitted"
+
+
 class ThrustPoint(_Strict):
     """One reading of a thrust stand, one rotor: speed [rad/s], thrust [N]."""
 
@@ -165,6 +186,7 @@ class Vehicle(_Strict):
         residual: forces and moments beyond the catalogue, of a file that predicts.
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
         arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
+        proof: what shows that the values predict; None for values that nobody fitted.
         thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
     """
 
@@ -181,6 +203,7 @@ class Vehicle(_Strict):
     stabiliser: Stabiliser | None = None
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
     residual: tuple[ResidualTerm, ...] = Field(default=(), max_length=MOST_TERMS)
+    proof: Proof | None = None
     _remark: str = PrivateAttr("")
 
     @field_validator("parameters", mode="before")
@@ -364,7 +387,7 @@ def _first_problem(error: ValidationError) -> str:
 def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
     models: dict[str, type[BaseModel]] = {
         "rotors": Rotor, "thrust_stand": ThrustPoint,
-        "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser,
+        "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser, "proof": Proof,
     }  # fmt: skip
     model = models.get(str(path[0]), Vehicle) if path else Vehicle
     return list(model.model_fields)

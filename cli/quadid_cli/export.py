@@ -27,6 +27,7 @@ def export(
     name: Annotated[
         str | None, typer.Option("--id", metavar="NAME", help="Whose sets of the history; default the vehicle's.")
     ] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Export values of a fit that nothing proves, too.")] = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -41,7 +42,7 @@ def export(
         described, source = _accepted(described, history, name or described.name)
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
-    done = exported(described, form, source=source)
+    done = exported(described, form, source=source, anyway=anyway)
     folder = output.out_folder(out)
     for path in (folder / file for file in done.texts):
         if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
@@ -67,4 +68,5 @@ def _accepted(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]
         names = ", ".join(entry["name"] for entry in found["vehicles"]) or "none"
         raise StoreError(f"no set of '{name}' was ever in force in {history}", f"one of: {names}", "give --id")
     last = set_from_dict(accepted[-1])
-    return with_values(vehicle, last.parameters), f"{history.name}, set {last.sequence} of {name}"
+    fitted = with_values(vehicle, last.parameters).model_copy(update={"proof": None})
+    return fitted, f"{history.name}, set {last.sequence} of {name}"

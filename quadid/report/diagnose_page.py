@@ -17,6 +17,8 @@ from quadid.report.verdict import Level, Verdict, percent
 
 JsonDict = Mapping[str, Any]
 
+HELD_OUT = "held-out blocks"
+"""What a diagnosis without validation logs measures its gain on."""
 _LEVELS: dict[str, Level] = {
     "nothing_found": "good",
     "explained": "good",
@@ -25,8 +27,8 @@ _LEVELS: dict[str, Level] = {
 }
 _SENTENCES = {
     "nothing_found": "The simulation agrees with the flight: nothing was found that it gets wrong.",
-    "explained": "What the simulation gets wrong is explained by what is named here.",
-    "partly_explained": "What is named here explains most of what the simulation gets wrong; some remains.",
+    "explained": "These causes explain all of the model error.",
+    "partly_explained": "These causes explain most of the model error; some remains.",
     "unknown": "The simulation gets something wrong that no known cause explains.",
 }
 
@@ -41,14 +43,22 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
         found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []
         headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
-    error = f"Error on data the fit did not see, in noise variances (1 is the noise floor): {_short(v['mse_nominal'])}"
-    gained = f" without and {_short(v['mse_extended'])} with what was found" if result["findings"] else ""
-    return Verdict(_LEVELS[verdict], headline, (f"{error}{gained}.",), _next_steps(result))
+    where = "held-out blocks of the same flight" if v.get("on") == HELD_OUT else "unseen flights"
+    before, after = _short(v["mse_nominal"]), _short(v["mse_extended"])
+    change = f"falls from {before} to {after}" if result["findings"] else f"is {before}"
+    details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
+    level = _LEVELS[verdict]
+    steps = _next_steps(result)
+    if v.get("on") == HELD_OUT:
+        level = "fair" if level == "good" else level
+        details = (*details, "Not proven: no flight was given that the diagnosis has not seen.")
+        steps = ("To prove it, give another flight with --validate.", *steps)
+    return Verdict(level, headline, details, steps)
 
 
 def chance(p_value: float) -> str:
-    """A p-value in words that claim no more than its distribution holds: below a billionth only that it is."""
-    return number(p_value, 2) if p_value >= 1e-9 else "less than one in a billion"
+    """A p-value that claims no more than its distribution holds: below a billionth only that it is."""
+    return f"p = {number(p_value, 2)}" if p_value >= 1e-9 else "p < 1e-9"
 
 
 def _short(value: float | None) -> str:
@@ -134,7 +144,7 @@ def _advice(finding: JsonDict) -> str:
 
 
 def finding_part(finding: JsonDict, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
-    """One cause: its picture, its worth with interval, the look-alikes that lost.
+    """One cause: its picture, its gain with interval, the rejected alternatives.
 
     Args:
         finding: of the form ``quadid.diagnose/1``.
@@ -144,21 +154,21 @@ def finding_part(finding: JsonDict, floor: float, identifier: str, seen: Residua
     """
     name, gain = finding["effect"].replace("_", " "), finding["gain"]
     low, high = gain.get("ci95", (None, None))
-    worth = [
+    gained = [
         f"The error on unseen data falls by {_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
     ]
     if low is not None and high is not None:
-        worth.append(f" (95 % interval {low:.3g} to {high:.3g})")
+        gained.append(f" (95 % interval {low:.3g} to {high:.3g})")
     if finding["p_value"] is not None:
-        worth.append(f"; chance of that without {name}: {chance(finding['p_value'])}")
+        gained.append(f"; {chance(finding['p_value'])}")
     rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
     return {
         **finding,
         "title": name,
         "advice": _advice(finding),
-        "worth": "".join(worth) + ".",
+        "gained": "".join(gained) + ".",
         "noise": _noise_sentence(gain, floor, name),
-        "rivals": f"Look-alikes in its place, which lost, with the error they leave: {', '.join(rivals)}."
+        "rivals": f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
         if rivals else "No other cause of the catalogue came near it.",
         "figures": [
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),

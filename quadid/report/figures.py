@@ -231,7 +231,7 @@ def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str
 
 
 def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> JsonDict:
-    """Error on unseen data with the finding, with each look-alike in its place, and without either.
+    """Error on unseen data with the finding, with each alternative in its place, and without either.
 
     Args:
         finding: of the form ``quadid.diagnose/1``.
@@ -254,4 +254,9 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
         "shapes": [edge],
     }
     views = [{"label": "", "data": data, "layout": layout}]
-    return {"id": identifier, "title": "What it is worth", "views": views, "height": 90 + 32 * len(rows)}
+    return {
+        "id": identifier,
+        "title": "Validation error with and without it",
+        "views": views,
+        "height": 90 + 32 * len(rows),
+    }

@@ -70,7 +70,7 @@ class TextTable:
     def _fitting(self, width: int) -> list[int]:
         """Indices of the columns that fit `width`, those of rank 0 in any case."""
         kept = list(range(len(self.columns)))
-        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: -self.columns[i].rank)
+        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
         while going and sum(self._width(i) for i in kept) + len(SPACE) * (len(kept) - 1) > width:
             kept.remove(going.pop(0))
         return kept

@@ -14,6 +14,11 @@ NOISE_LEVEL = 1.3
 """Below this ratio to the noise floor nothing that a flight could show is missing."""
 ROUGH = 5.0
 """Above this ratio the simulation misses more than it explains."""
+NEAR_FLOOR = 2.0
+"""Up to this multiple of the floor a prediction error may be sensor noise: the floor is that of white noise alone."""
+LEAST_SECONDS = 10.0
+"""Flight that it takes to prove anything [s]: ten runs of one second."""
+_DIAGNOSE = "`quadid diagnose` names what the simulation gets wrong and measures what the better model gains."
 MOTION = {
     "b": "climbs and descents",
     "d": "yaw turns",
@@ -49,6 +54,8 @@ class Verdict:
 def identify_verdict(result: JsonDict) -> Verdict:
     """Judges the result of ``quadid identify``.
 
+    Green needs all parameters identified, errors at the noise floor, and `LEAST_SECONDS` of flight that was not fitted.
+
     Args:
         result: a dictionary of the form ``quadid.identify/1``.
     """
@@ -56,21 +63,63 @@ def identify_verdict(result: JsonDict) -> Verdict:
     stuck = at_bounds(result)
     known = [p for p in parameters if p["status"] == "identified" and p["name"] not in stuck]
     open_ones = [p for p in parameters if p["status"] != "identified"]
-    judged = [s for s in sets if s["role"] == "validate"] or sets
+    unseen = [s for s in sets if s["role"] == "validate"]
+    judged = unseen or sets
     ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
-    where = "a flight it has not seen" if judged and judged[0]["role"] == "validate" else "the fitted flight"
-    level, match = _match(ratio, where)
+    level, match = _match(ratio, "a flight it has not seen" if unseen else "the fitted flight")
+    lacking = _lacking(sets)
     if not known:
         level = "poor"
-    elif (open_ones or stuck) and level == "good":
+    elif (open_ones or stuck or lacking) and level == "good":
         level = "fair"
     headline = f"{_count(len(known), len(parameters))} identified; {match}."
-    details = _details(known, judged)
+    details = (*lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
-        found = f"{_count(len(known), len(parameters))} came out sharply, but they carry what the model lacks."
-        details = (found, *details[1:]) if known else details
+        found = "The intervals are narrow but wrong: the parameters absorb what the model lacks."
+        details = (found, *_details(known, judged)[1:]) if known else details
     return Verdict(level, headline, details, _next_steps(result, open_ones, stuck, ratio))
+
+
+def _lacking(sets: Sequence[JsonDict]) -> tuple[str, ...]:
+    """What keeps a result from being proven."""
+    unseen, seen = (
+        [_number(s.get("seconds", LEAST_SECONDS)) for s in sets if s["role"] == role] for role in ("validate", "train")
+    )
+    if not unseen:
+        return ("Not proven: no flight was given that the fit has not seen.",)
+    out = []
+    for which, seconds in (("fitted", sum(seen)), ("unseen", sum(unseen))):
+        if seconds < LEAST_SECONDS:
+            out.append(f"Not proven: only {seconds:.1f} s of {which} flight, {LEAST_SECONDS:g} s are needed.")
+    return tuple(out)
+
+
+def score_verdict(result: JsonDict) -> Verdict:
+    """Judges the result of ``quadid score`` by its longest horizon.
+
+    Args:
+        result: a dictionary of the form ``quadid.score/1`` with ``noise_floor`` and ``no_change``.
+    """
+    last = list(result["horizons"])[-1]
+    errors, floor, still = result["horizons"][last], result["noise_floor"][last], result["no_change"][last]
+    known = [n for n, v in errors.items() if math.isfinite(_number(v)) and _number(still.get(n)) > 0.0]
+    runaway = any(_number(v) == math.inf for v in errors.values())
+    above = {n: _number(errors[n]) / _number(floor[n]) for n in known if _number(floor[n]) > 0.0}
+    share = {n: _number(errors[n]) / _number(still[n]) for n in known}
+    if runaway or not known or max(share.values()) >= 1.0:
+        worse = [n for n in known if share[n] >= 1.0]
+        what = f"worse than predicting no change: {', '.join(worse)}" if worse else "the simulation runs away"
+        return Verdict("poor", f"Not to be used: after {last} samples {what}.", (), (_DIAGNOSE,))
+    mean = ", ".join(f"{n} {percent(s)}" for n, s in share.items())
+    detail = f"Error after {last} samples as a share of that of predicting no change: {mean}."
+    worst = max(above, key=lambda n: above[n], default=None)
+    if worst is None or above[worst] <= NEAR_FLOOR:
+        return Verdict(
+            "good", f"After {last} samples the errors are near what sensor noise alone makes.", (detail,), ()
+        )
+    headline = f"After {last} samples the {worst} error is {above[worst]:.3g} times what sensor noise alone makes."
+    return Verdict("fair", headline, (detail,), (_DIAGNOSE,))
 
 
 def _match(ratio: float, where: str) -> tuple[Level, str]:
@@ -118,10 +167,11 @@ def at_bounds(result: JsonDict) -> list[str]:
 
 def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
     out = []
-    diagnose = "`quadid diagnose` names what the simulation gets wrong and measures what the better model gains."
     if not ratio <= ROUGH:
         # First things first: with the wrong model a parameter seems hidden, or runs into a bound.
-        out.append(diagnose)
+        out.append(_DIAGNOSE)
+    if _lacking(result["sets"]):
+        out.append(f"To prove it, give another flight of {LEAST_SECONDS:g} s or more with --validate.")
     if stuck:
         out.append(
             f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(stuck)} "
@@ -133,9 +183,7 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
     if any(p["name"] not in stuck for p in open_ones):
         out.append("`quadid excite` proposes a manoeuvre and says what it would gain.")
     if ratio > NOISE_LEVEL:
-        out.append(diagnose)
-    if all(s["role"] != "validate" for s in result["sets"]):
-        out.append("Give another flight with --validate: only data that were not fitted prove a model.")
+        out.append(_DIAGNOSE)
     if not out:
         out.append(
             "Nothing is applied by itself: `quadid export` writes the values for PX4, ArduPilot, Gazebo or RotorPy."
@@ -150,7 +198,9 @@ def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
         return "Rests on a bound of the vehicle file: the data want a value outside, or the model lacks something."
     if status == "prior_dominated":
         needs = MOTION.get(name)
-        return "The data say nothing about it; the value is the guess." + (f" It needs {needs}." if needs else "")
+        return "Not observable in these data; the value is the guess." + (f" It needs {needs}." if needs else "")
+    if status == "unreliable":
+        return "Not to be used: the model misses this flight, or parts of it give different values."
     if status == "ratio_only":
         return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan

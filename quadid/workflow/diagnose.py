@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from quadid.workflow.files import file_name, write_text
-from quadid.workflow.identify import origin_remark
+from quadid.workflow.identify import origin_remark, proven
 from quadid.workflow.logs import Given, settled
 from quadid.workflow.outcome import Outcome
 from quadid.workflow.progress import Advance, silent
@@ -54,7 +54,13 @@ class Diagnosed(Outcome):
         from quadid.vehicle import Vehicle
 
         train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
-        return Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name).with_remark(origin_remark(train))
+        vehicle = Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name)
+        unseen = self.result["validation"]
+        sets = [
+            {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
+            for log, s in zip(self.logs, self.sets, strict=True)
+        ]
+        return proven(vehicle, self.verdict, sets).with_remark(origin_remark(train))
 
     @property
     def file_name(self) -> str:

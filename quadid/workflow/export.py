@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from quadid.errors import QuadidError
 from quadid.workflow.files import file_name, write_text
 from quadid.workflow.loading import as_vehicle
 
@@ -33,22 +34,35 @@ class Exported:
         return [write_text(Path(folder) / name, text) for name, text in self.texts.items()]
 
 
-def export(vehicle: str | Path | Vehicle, form: str = "yaml", *, source: str | None = None) -> Exported:
+class UnprovenError(QuadidError):
+    """Values of a fit that predicted nothing, or predicted badly."""
+
+
+def export(
+    vehicle: str | Path | Vehicle, form: str = "yaml", *, source: str | None = None, anyway: bool = False
+) -> Exported:
     """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
         form: yaml, px4, ardupilot, gazebo, rotorpy or agilicious.
         source: where the values come from, for the file; default the vehicle's file or name.
+        anyway: write the values of a fit that is not proven; the file says so at its top.
 
     Raises:
         ParameterError: an unknown form.
+        UnprovenError: the values are those of a fit that nothing proves.
         VehicleError: no such vehicle.
     """
     from quadid.report.programs import export as written_as
 
     described = as_vehicle(vehicle)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
+    if described.proof is not None and described.proof.lacking and not anyway:
+        raise UnprovenError(
+            f"{origin} is not proven: {described.proof.lacking}", "values that predict an unseen flight",
+            "`quadid identify LOG --validate OTHER`, or `quadid diagnose`; insist with --anyway",
+        )  # fmt: skip
     texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, form, origin).items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
     warnings = [f"not from data but the guess of the vehicle file: {', '.join(guessed)}"] if guessed else []

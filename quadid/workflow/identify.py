@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -55,7 +56,8 @@ class Identified(Outcome):
         from quadid.identify.result import fitted_vehicle
 
         train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
-        return fitted_vehicle(self.fit).with_remark(origin_remark(train))
+        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"])
+        return vehicle.with_remark(origin_remark(train))
 
     @property
     def file_name(self) -> str:
@@ -146,7 +148,10 @@ def identify(
     sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
     warnings = [text for log in (*train, *held) for text in log.warnings]
     result = identify_result(fit, optimizer, seed, seconds, sets, None, warnings)
+    for entry, log in zip(result["sets"], (*train, *held), strict=True):
+        entry["seconds"] = log.grid.seconds_used
     done = Identified(result, fit, sets, [*train, *held])
+    result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)
     return done
@@ -183,3 +188,25 @@ def origin_remark(logs: Sequence[Log]) -> str:
     lines = [f"Fitted by quadid {__version__}; `initial` is the fitted value, `sigma` its standard deviation. From:"]
     lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
     return "\n".join(plain(line, LONGEST_LINE) for line in lines)
+
+
+def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]]) -> Vehicle:
+    """The vehicle with the proof of its values; values of a red fit become guesses without `sigma`.
+
+    Args:
+        vehicle: with what was found.
+        verdict: on the result.
+        sets: its scored logs, as in ``quadid.identify/1``.
+    """
+    from quadid.vehicle import Proof
+
+    unseen = [s for s in sets if s["role"] == "validate"]
+    errors = [s["mse"]["fitted"] for s in unseen]
+    proof = Proof(
+        verdict=verdict.level, unseen=tuple(s["log"] for s in unseen),
+        error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
+    )  # fmt: skip
+    values = dict(vehicle.parameters)
+    if verdict.level == "poor":
+        values = {n: p.model_copy(update={"sigma": None}) for n, p in values.items()}
+    return vehicle.model_copy(update={"proof": proof, "parameters": values})

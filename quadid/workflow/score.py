@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from quadid.report.text_table import TextTable
+    from quadid.report.verdict import Verdict
     from quadid.vehicle import Vehicle
 
 HORIZONS = (1, 10, 50)
@@ -29,6 +30,13 @@ class Scored(Outcome):
     def warnings(self) -> list[str]:
         """What was wrong with the logs."""
         return list(self.notes)
+
+    @property
+    def verdict(self) -> Verdict:
+        """How the errors stand beside sensor noise, and beside predicting no change."""
+        from quadid.report.verdict import score_verdict
+
+        return score_verdict(self.result)
 
     def tables(self) -> list[TextTable]:
         """Errors after every horizon, pooled and a log."""
@@ -58,14 +66,23 @@ def score(
         LogError: a log that does not fit the vehicle.
         ParameterError: horizons that are no positive numbers.
     """
+    from quadid.identify.open_loop import no_change
     from quadid.identify.prediction import horizon_scores
-    from quadid.identify.result import score_result
+    from quadid.identify.prediction_floor import prediction_floor
+    from quadid.identify.result import score_result, units
     from quadid.model.layout import Layout
+    from quadid.report.verdict import score_verdict
 
     described, given, _ = settled(logs, (), vehicle)
     opened = [log.at(rate) for log in given]
     theta = Layout(described).initial(described)
+    windows = [w for log in opened for w in log.windows]
     pooled, each = horizon_scores([log.windows for log in opened], described, theta, list(horizons))
     files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]
-    notes = tuple(text for log in opened for text in log.warnings)
-    return Scored(score_result(described.name, pooled, files), notes)
+    result = score_result(described.name, pooled, files)
+    wanted = [int(h) for h in result["horizons"]]
+    result["noise_floor"] = {str(h): prediction_floor(windows, h) for h in wanted}
+    result["no_change"] = {str(h): no_change(windows, described, h) for h in wanted}
+    result["units"] = units()
+    result["verdict"] = score_verdict(result).level
+    return Scored(result, tuple(text for log in opened for text in log.warnings))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from quadid.report.programs import FORMATS, export
-from quadid.vehicle import GRAVITY, Command, ParameterPrior, Vehicle
+from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, Vehicle
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0
@@ -142,3 +142,23 @@ def test_awkward_names_break_nothing(vehicle: Vehicle) -> None:
                 ET.fromstring(text)
             if ending == "_params.py":
                 compile(text, "x", "exec")
+
+
+def test_what_nothing_proves_is_asked_about_and_says_so_at_its_top(
+    vehicle: Vehicle, inside: Cli, tmp_path: Path
+) -> None:
+    red = Proof(verdict="poor", unseen=("other.mcap",), error=48.8)
+    for proof, why in ((red, "the fit was red, error 48.8"), (Proof(verdict="fair"), "no flight was predicted")):
+        file = vehicle.model_copy(update={"proof": proof}).save(tmp_path / "fitted.yaml")
+        line = one_line(inside("export", "--vehicle", file, "--format", "px4", "--out", tmp_path), 2)
+        assert why in line
+        assert "--anyway" in line
+        for form in set(FORMATS) - {"agilicious"}:  # which takes crosses alone
+            run = inside("export", "--vehicle", file, "--format", form, "--out", tmp_path, "--anyway", "--json", "-")
+            assert run.code == 0, run.err
+            top = Path(run.data["files"][0]).read_text(encoding="utf-8")[:300]
+            assert f"NOT PROVEN: {why}" in top, (form, top)
+    green = vehicle.model_copy(update={"proof": Proof(verdict="good", unseen=("other.mcap",), error=1.0)})
+    run = inside("export", "--vehicle", green.save(tmp_path / "good.yaml"), "--format", "px4", "--out", tmp_path)
+    assert run.code == 0
+    assert "NOT PROVEN" not in next(tmp_path.glob("*.params")).read_text(encoding="utf-8")

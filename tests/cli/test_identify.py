@@ -31,7 +31,7 @@ def test_json_has_exactly_the_keys_of_the_contract(done: tuple[Run, dict[str, An
     run, result, out = done
     assert run.code == 0, run.err
     keys = ["schema", "vehicle", "optimizer", "seed", "seconds", "parameters", "sets", "vehicle_file", "warnings"]
-    assert list(result) == [*keys, "report"]
+    assert list(result) == [*keys, "verdict", "report"]
     assert (result["schema"], result["vehicle"], result["optimizer"]) == ("quadid.identify/1", "pelican", "pso_polish")
     assert 0.0 < result["seconds"] < 300.0
     for p in result["parameters"]:
@@ -40,7 +40,7 @@ def test_json_has_exactly_the_keys_of_the_contract(done: tuple[Run, dict[str, An
     assert [s["role"] for s in result["sets"]] == ["train", "validate"]
     assert [s["log"] for s in result["sets"]] == ["train.mcap", "unseen.csv"]
     for s in result["sets"]:
-        assert list(s) == ["log", "role", "mse", "mse_paper", "fit_percent", "rmse"]
+        assert list(s) == ["log", "role", "mse", "mse_paper", "fit_percent", "rmse", "seconds"]
         assert list(s["mse"]) == ["initial", "fitted", "noise_floor"]
         # the log holds references, so the stabiliser's gains are found and the paper's simulation can be run
         assert 0.0 < s["mse_paper"]["fitted"] < s["mse_paper"]["initial"]

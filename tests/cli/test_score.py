@@ -16,7 +16,8 @@ QUANTITIES = ["position", "velocity", "rotation", "rate"]
 
 def test_json_has_exactly_the_keys_of_the_contract(inside: Cli, flights: Flights) -> None:
     result = inside("score", flights.train, flights.unseen, "--vehicle", "pelican", "--json", "-").data
-    assert list(result) == ["schema", "vehicle", "samples", "gaps", "horizons", "sum", "files"]
+    keys = ["schema", "vehicle", "samples", "gaps", "horizons", "sum", "files"]
+    assert list(result) == [*keys, "noise_floor", "no_change", "units", "verdict"]
     assert result["schema"] == "quadid.score/1"
     assert list(result["horizons"]) == ["1", "10", "50"]
     assert all(list(h) == QUANTITIES for h in result["horizons"].values())

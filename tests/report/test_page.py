@@ -212,7 +212,7 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
         "Found: motor lag",
         "0.05",
         "a controller that knows it",
-        "What it is worth",
+        "Validation error with and without it",
         "2 %",
         "95 % interval 1.9 to 2.2",
         "32 % without motor lag",
@@ -252,5 +252,5 @@ def test_code_between_backticks() -> None:
 
 
 def test_a_chance_claims_no_more_than_its_distribution_holds() -> None:
-    assert chance(0.012) == "0.012"
-    assert chance(1e-300) == chance(0.0) == "less than one in a billion"
+    assert chance(0.012) == "p = 0.012"
+    assert chance(1e-300) == chance(0.0) == "p < 1e-9"

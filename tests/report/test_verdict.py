@@ -8,15 +8,22 @@ import pytest
 
 from quadid.effects import EFFECTS
 from quadid.report.diagnose_page import diagnose_verdict
-from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason
+from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason, score_verdict
 
 
 def _result(fitted: float | None = 1.0, status: str = "identified", role: str = "validate") -> dict[str, Any]:
     parameters = [
         {"name": n, "unit": "", "value": 1.1, "ci95": [1.09, 1.11], "initial": 1.0, "status": status} for n in MOTION
     ]
-    entry = {"log": "a", "role": role, "mse": {"initial": 9.0, "fitted": fitted}, "fit_percent": {"p": 95.0, "q": None}}
-    return {"parameters": parameters, "sets": [entry], "warnings": []}
+    entry = {
+        "log": "a",
+        "role": role,
+        "seconds": 30.0,
+        "mse": {"initial": 9.0, "fitted": fitted},
+        "fit_percent": {"p": 95.0, "q": None},
+    }
+    train = {**entry, "role": "train"}
+    return {"parameters": parameters, "sets": [train, entry] if role == "validate" else [train], "warnings": []}
 
 
 def test_good_fair_and_poor() -> None:
@@ -40,7 +47,27 @@ def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
 
 
 def test_no_validation_asks_for_one() -> None:
-    assert any("--validate" in step for step in identify_verdict(_result(role="train")).next_steps)
+    verdict = identify_verdict(_result(role="train"))
+    assert "--validate" in verdict.next_steps[0]
+    assert verdict.level == "fair"
+    assert any("has not seen" in line for line in verdict.details)
+
+
+def test_seconds_of_data_prove_nothing() -> None:
+    result = _result()
+    result["sets"][1]["seconds"] = 4.0
+    verdict = identify_verdict(result)
+    assert verdict.level == "fair"
+    assert "only 4.0 s of unseen flight" in verdict.details[0]
+
+
+@pytest.mark.parametrize(
+    ("error", "level"), [(0.1, "good"), (0.5, "fair"), (1.0, "poor"), (float("inf"), "poor"), (None, "poor")]
+)
+def test_scores_are_judged_between_noise_and_no_change(error: float | None, level: str) -> None:
+    rows = {"horizons": error, "noise_floor": 0.08, "no_change": 0.9}
+    verdict = score_verdict({key: {"50": {"rate": value}} for key, value in rows.items()})
+    assert verdict.level == level
 
 
 def test_a_parameter_on_its_bound_is_not_called_identified() -> None:

@@ -94,6 +94,15 @@ class Facts:
             return None
         return self.vehicle.mass * GRAVITY / (float(self.thrust.sum()) * self.max_speed**2)
 
+    @property
+    def unproven(self) -> str:
+        """Why nothing shows that the values predict; empty where something does."""
+        proof = self.vehicle.proof
+        if proof is not None:
+            return proof.lacking
+        guessed = any(p.sigma is None for p in self.vehicle.parameters.values())
+        return "the values are guesses of the vehicle file" if guessed else ""
+
     def header(self, used: tuple[str, ...]) -> list[str]:
         """Lines that say what this is, what came from data, and which effects the other program cannot hold.
 
@@ -101,7 +110,8 @@ class Facts:
             used: effects that the form carries.
         """
         left = [name for name in self.vehicle.effects if name not in used]
-        lines = [
+        lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
+        lines += [
             f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",
             "Where the values come from:",
         ]
