@@ -20,6 +20,14 @@ PAUSE = 1.0
 """Recording time [s] put between the last sample before a reboot and the first one after it."""
 
 
+def _alone(raw: FloatArray) -> bool:
+    """Tells whether the first stamp is far from the second and the next ones follow that: it is wild, no time base."""
+    if len(raw) <= 1 + CONFIRMATIONS:
+        return False
+    steps = np.diff(raw[: 2 + CONFIRMATIONS])
+    return not -STEP_BACK < steps[0] < STEP_AHEAD and bool(np.all(np.abs(steps[1:]) < STEP_BACK))
+
+
 class WrapCounter:
     """Unwraps a counter of limited width, such as 32-bit microseconds (71.6 minutes).
 
@@ -89,7 +97,9 @@ class LogClock:
             if len(raw) < 2 or (steps.min() > -STEP_BACK and steps.max() < STEP_AHEAD):
                 self._newest = float(newest[-1])
                 return raw, np.ones(len(raw), dtype=np.bool_)
-        mapped = [self.time(float(stamp)) for stamp in raw]
+        first = 1 if self._newest is None and _alone(raw) else 0
+        self.wild += first
+        mapped = [None] * first + [self.time(float(stamp)) for stamp in raw[first:]]
         out = np.array([np.nan if t is None else t for t in mapped], dtype=np.float64)
         return out, np.isfinite(out)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +49,7 @@ def read_csv(path: Path) -> Recording:
     layout, ignored = _layout(names, path.name)
     table, notes = _table(path, len(names), delimiter)
     if len(table) == 0:
-        raise LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
+        raise _no_rows(path, len(names), delimiter)
     if ignored:
         notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
     clock = LogClock()
@@ -67,6 +68,15 @@ def read_csv(path: Path) -> Recording:
     return replace(recording, grid=_uniform_step(recording.channels))
 
 
+def _no_rows(path: Path, width: int, delimiter: str) -> LogError:
+    _, lines, _ = next(_blocks(path))
+    commas = lines[0].count(",") if lines else 0
+    if (delimiter != "," and commas) or (delimiter == "," and width < commas + 1 <= 2 * width):
+        found = f"{path.name}: decimal commas ({plain(lines[0], 40)})"
+        return LogError(found, "decimal points: 0.02", "export with decimal points, or in an English locale")
+    return LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
+
+
 def _suspect_degrees(angles: FloatArray) -> list[str]:
     """Pitch in radians never leaves +-pi/2, and roll seldom two turns."""
     roll, pitch = np.nanmax(np.abs(angles[:, :2]), axis=0, initial=0.0)
@@ -82,7 +92,7 @@ def _header(path: Path) -> tuple[list[str], str]:
         raise LogError(f"{path.name}: no header row", "t, then column names such as p,q,r,ax,ay,az,w1")
     delimiter = max(",;\t", key=line.count)
     names = [cell.strip().strip('"') for cell in line.split(delimiter)]
-    doubles = sorted({n for n in names if names.count(n) > 1})
+    doubles = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubles:
         raise LogError(f"{path.name}: column {plain(', '.join(doubles))} appears twice", "each column once")
     if "t" not in names:
@@ -180,7 +190,7 @@ def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad:
     for number, line in enumerate(lines, first):
         cells = line.rstrip("\r\n").split(delimiter)
         try:
-            values = [float(cell) if cell.strip().strip('"') else float("nan") for cell in cells]
+            values = [_number(cell) for cell in cells]
         except ValueError:
             values = []
         if len(values) == width:
@@ -188,6 +198,16 @@ def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad:
         else:
             bad.append(number)
     return np.array(good, dtype=np.float64).reshape(-1, width)
+
+
+def _number(cell: str) -> float:
+    """A number as CSV files have it; NaN for an empty cell.  Raises ValueError, also for what only Python reads."""
+    text = cell.strip().strip('"')
+    if not text:
+        return float("nan")
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)
 
 
 def _uniform_step(channels: Mapping[str, Channel]) -> float | None:

@@ -35,7 +35,8 @@ class DataflashIndex:
         formats: description by message name.
         offsets: byte offsets of the records, by message name.
         skipped: bytes that belong to no record (padding at the end not counted).
-        damaged: names of messages whose description is damaged or contradicts itself.
+        damaged: names of messages whose description is damaged.
+        redefined: names of messages that are described anew within the log; what follows the change is not used.
         cut: whether the file ends inside a record.
     """
 
@@ -44,6 +45,7 @@ class DataflashIndex:
     offsets: dict[str, array[int]] = field(default_factory=dict)
     skipped: int = 0
     damaged: list[str] = field(default_factory=list)
+    redefined: list[str] = field(default_factory=list)
     cut: bool = False
 
     def count(self, name: str) -> int:
@@ -125,7 +127,7 @@ def index_dataflash(path: Path) -> DataflashIndex:
         in_step = True
         if kind == _FMT_TYPE:
             _note_format(index, data[offset + 3 : end], names, lengths)
-        else:
+        elif names[kind]:
             index.offsets[names[kind]].append(offset)
         offset = end
     return index
@@ -148,13 +150,22 @@ def _note_format(index: DataflashIndex, body: bytes, names: dict[int, str], leng
     except Exception as error:  # noqa: BLE001 - pymavlink raises bare Exception and more on damaged text; it is reported
         index.damaged.append(f"type {kind} ({type(error).__name__})")
         return
-    known = index.formats.get(names.get(kind, ""))
-    if not fits or (known is not None and (known.name, known.format) != (name, description.format)):
-        index.damaged.append(name if fits else f"type {kind}")
+    if not fits:
+        index.damaged.append(f"type {kind}")
         return
-    if known is None and name in index.formats:
-        index.damaged.append(name)
+    closed = names.get(kind) == ""
+    known = None if closed else index.formats.get(names.get(kind, name))
+    same = known is not None and _meaning(known) == _meaning(description)
+    if same and kind in names:
+        return
+    if closed or known is not None:  # rows of two meanings make no column: what follows is left out
+        index.redefined += [] if known is None else [known.name]
+        names[kind], lengths[kind] = "", length
         return
     names[kind], lengths[kind] = name, length
     index.formats[name] = description
     index.offsets.setdefault(name, array("Q"))
+
+
+def _meaning(description: DFFormat) -> tuple[str, str, list[str]]:
+    return description.name, description.format, list(description.columns)

@@ -78,6 +78,9 @@ def _damage(index: DataflashIndex) -> list[str]:
         notes.append(f"{index.skipped} of {len(index.data)} bytes are damaged and were skipped")
     if index.damaged:
         notes.append(f"damaged message descriptions: {', '.join(sorted(set(index.damaged))[:8])}")
+    if index.redefined:
+        names = ", ".join(sorted(set(index.redefined))[:8])
+        notes.append(f"{names} described anew within the log: what follows the change is not used")
     if index.cut:
         notes.append("the file ends inside a record: it was cut; everything before is used")
     return notes

@@ -7,6 +7,7 @@ followed by another.
 from __future__ import annotations
 
 import mmap
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,10 @@ _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2
 _STAMP = 8
 _SIGNED = 1
 _SIGNATURE = 13
+_MARK = re.compile(rb"\x00[\x03-\x0e].{6}[\xfd\xfe]", re.DOTALL)
+"""What a frame begins with: the high bytes of a receive time between the years 2000 and 2100, and its mark."""
+_MOST_FAILURES = 1_000_000
+"""So many places in a row that look like a frame and are none: this is no telemetry."""
 
 
 class Frame(NamedTuple):
@@ -42,7 +47,7 @@ def iterate_frames(path: Path, count: FrameCount) -> Iterator[Frame]:
     with path.open("rb") as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     data = memoryview(mapped)
-    offset, size, in_step = 0, len(data), True
+    offset, size, in_step, failures = 0, len(data), True, 0
     while offset + _STAMP < size:
         length = frame_length(data, offset)
         if length is not None and offset + length > size:
@@ -52,11 +57,12 @@ def iterate_frames(path: Path, count: FrameCount) -> Iterator[Frame]:
             length = None
         if length is None or not (in_step or _follows(data, offset + length)):
             in_step = False
-            following = _next_candidate(mapped, offset + 1)
+            failures += 1
+            following = _next_candidate(mapped, offset + 1) if failures < _MOST_FAILURES else size
             count.skipped += following - offset
             offset = following
             continue
-        in_step = True
+        in_step, failures = True, 0
         count.frames += 1
         yield _frame(data, offset, length)
         offset += length
@@ -80,9 +86,9 @@ def _follows(data: memoryview, offset: int) -> bool:
 
 
 def _next_candidate(mapped: mmap.mmap, offset: int) -> int:
-    """Returns the next offset whose ninth byte starts a frame, or the end of the file."""
-    places = [p for p in (mapped.find(mark, offset + _STAMP) for mark in (b"\xfe", b"\xfd")) if p >= 0]
-    return min(places) - _STAMP if places else len(mapped)
+    """Returns the next offset where receive time and mark of a frame may stand, or the end of the file."""
+    found = _MARK.search(mapped, offset)
+    return found.start() if found else len(mapped)
 
 
 def _frame(data: memoryview, offset: int, length: int) -> Frame:

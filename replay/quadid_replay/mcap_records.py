@@ -23,11 +23,14 @@ from mcap.records import Channel, ChunkIndex, Schema
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid_replay.mcap_order import Message, Part, in_log_time
 
 MAGIC = b"\x89MCAP0\r\n"
-RATIO, FLOOR, CEILING = 200, 64 << 20, 4 << 30
-"""A file may inflate to 200 times its size, at least to 64 MiB, and beyond 4 GiB only to 3 times its size."""
-LARGEST_CHUNK = 1 << 30
+RATIO, FLOOR, CEILING = 50, 64 << 20, 4 << 30
+"""A file may inflate to 50 times its size, at least to 64 MiB, and beyond 4 GiB only to 3 times its size."""
+LARGEST_CHUNK = 128 << 20
+MOST_DEFINITIONS = 5000
+"""Channels, and schemas, of one file; a large robot has hundreds."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -85,15 +88,18 @@ class McapFile:
             out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding))
         return out
 
-    def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Yields channel id, log time [ns] and payload of the messages on the wanted channels, in file order."""
+    def messages(self, wanted: Set[int]) -> Iterator[Message]:
+        """Yields channel id, log time [ns] and payload of the messages on the wanted channels, in order of log time.
+
+        Chunks are read in the order of their first message; what is later than the first message of the next chunk
+        waits.  A recorder writes nearly in order, so little waits; a file in any order is held as a whole, within the
+        limit of what it may inflate to.
+        """
         self.bad_chunks, self.lost_seconds, self.lost_bytes = 0, 0.0, 0
         self._budget = max(FLOOR, min(RATIO * self._size, max(CEILING, 3 * self._size)))
         with self._path.open("rb") as file:
-            if self.has_summary and self._chunks:
-                yield from self._indexed(file, wanted)
-            else:
-                yield from self._walk(file, wanted)
+            parts = self._indexed(file, wanted) if self.has_summary and self._chunks else self._walk(file, wanted)
+            yield from in_log_time(parts)
 
     def damage(self) -> list[str]:
         """Says in sentences what could not be read."""
@@ -131,8 +137,8 @@ class McapFile:
             return False
         return bool(self._channels)
 
-    def _indexed(self, file: BinaryIO, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
-        for index in sorted(self._chunks, key=lambda c: c.chunk_start_offset):
+    def _indexed(self, file: BinaryIO, wanted: Set[int]) -> Iterator[Part]:
+        for index in sorted(self._chunks, key=lambda c: (c.message_start_time, c.chunk_start_offset)):
             if index.message_index_offsets and wanted.isdisjoint(index.message_index_offsets):
                 continue
             head = b""
@@ -150,30 +156,44 @@ class McapFile:
                 self.bad_chunks += 1
                 self.lost_seconds += max(0, index.message_end_time - index.message_start_time) * 1e-9
                 continue
-            yield from self._chunk_messages(data, wanted)
+            yield index.message_start_time, self._chunk_messages(data, wanted)
 
-    def _walk(self, file: BinaryIO, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
+    def _walk(self, file: BinaryIO, wanted: Set[int]) -> Iterator[Part]:
+        for start, offset, opcode, length in sorted(self._located(file)):
+            file.seek(offset)
+            body = file.read(length)
+            try:
+                if opcode == Opcode.CHUNK:
+                    yield start, self._chunk_messages(self._inflate(body), wanted)
+                elif opcode == Opcode.MESSAGE:
+                    yield start, _one_message(body, wanted)
+                else:
+                    self._note_safely(opcode, body)
+            except _DamagedError:
+                self.bad_chunks += 1
+
+    def _located(self, file: BinaryIO) -> Iterator[tuple[int, int, int, int]]:
+        """Yields log time [ns], place of the body, opcode and length of the records that matter, up to the damage."""
         offset = len(MAGIC)
         while offset + _RECORD.size <= self._size:
             file.seek(offset)
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-            end = offset + _RECORD.size + length
-            if end > self._size or not (0 < opcode <= Opcode.DATA_END or opcode >= 0x80):
-                self.lost_bytes = self._size - offset
+            begin = offset + _RECORD.size
+            offset = begin + length
+            if offset > self._size or not (0 < opcode <= Opcode.DATA_END or opcode >= 0x80):
+                self.lost_bytes = self._size - begin + _RECORD.size
                 return
-            try:
-                if opcode == Opcode.CHUNK:
-                    yield from self._chunk_messages(self._inflate(file.read(length)), wanted)
-                elif opcode == Opcode.MESSAGE:
-                    yield from _one_message(file.read(length), wanted)
-                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._note_safely(opcode, file.read(length))
-            except _DamagedError:
+            if opcode == Opcode.CHUNK and length >= 8:
+                yield int.from_bytes(file.read(8), "little"), begin, opcode, length
+            elif opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
+                yield _MESSAGE.unpack(file.read(_MESSAGE.size))[2], begin, opcode, length
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                yield 0, begin, opcode, length
+            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
                 self.bad_chunks += 1
-            if opcode == Opcode.FOOTER:
-                self.lost_bytes = max(self._size - end - len(MAGIC), 0)
+            elif opcode == Opcode.FOOTER:
+                self.lost_bytes = max(self._size - offset - len(MAGIC), 0)
                 return
-            offset = end
         self.lost_bytes = self._size - offset
 
     def _inflate(self, body: bytes) -> bytes:
@@ -195,12 +215,14 @@ class McapFile:
             raise _DamagedError("content does not match its checksum")
         return inflated
 
-    def _chunk_messages(self, data: bytes, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
+    def _chunk_messages(self, data: bytes, wanted: Set[int]) -> Iterator[Message]:
         try:
             for kind, begin, end in _split_records(data):
                 if kind == Opcode.MESSAGE:
+                    if end - begin < _MESSAGE.size:
+                        raise _DamagedError("message without a header")
                     channel = data[begin] | data[begin + 1] << 8
-                    if channel in wanted and end - begin >= _MESSAGE.size:
+                    if channel in wanted:
                         yield channel, _MESSAGE.unpack_from(data, begin)[2], data[begin + _MESSAGE.size : end]
                 elif kind in (Opcode.SCHEMA, Opcode.CHANNEL):
                     self._note_safely(kind, data[begin:end])
@@ -220,9 +242,14 @@ class McapFile:
         elif kind == Opcode.CHANNEL:
             channel = Channel.read(_stream(body))
             self._channels.setdefault(channel.id, channel)
+        if max(len(self._schemas), len(self._channels)) > MOST_DEFINITIONS:
+            raise LogError(
+                f"{self._path.name}: more than {MOST_DEFINITIONS} channels or message definitions",
+                "those of one robot", "record fewer topics; or this file was made to harm: do not trust it",
+            )  # fmt: skip
 
 
-def _one_message(body: bytes, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
+def _one_message(body: bytes, wanted: Set[int]) -> Iterator[Message]:
     if len(body) >= _MESSAGE.size:
         channel, _, log_time, _ = _MESSAGE.unpack_from(body)
         if channel in wanted:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 from quadid.errors import LogError
 from quadid.window import Recording
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
-LARGE: Mapping[Format, int] = MappingProxyType(
-    {"mcap": 4 << 20, "tlog": 64 << 20, "dataflash": 64 << 20, "ulog": 64 << 20, "usdlog": 64 << 20, "csv": 64 << 20}
-)
-"""Files of this size [bytes] are read in a child process with limits; MCAP earlier, because it may inflate."""
+LARGE = 4 << 20
+"""Files of this size [bytes] are read in a child process with limits."""
+_STORED = 0.02
+"""A large file of which less than this share is stored holds nothing but zeros: its copy was not finished."""
 
 
 def open_log(path: str | Path, preset: str = AUTO) -> Recording:
@@ -34,8 +33,15 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    kind = recognise(_head(file), file.name)
-    if file.stat().st_size >= LARGE[kind]:
+    recognise(_head(file), file.name)
+    status = file.stat()
+    if status.st_size >= LARGE:
+        stored = 512 * status.st_blocks
+        if stored < _STORED * status.st_size:
+            raise LogError(
+                f"{file.name}: {status.st_size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
+                "copy it again: the copy or the logger stopped before the end",
+            )  # fmt: skip
         from quadid_replay.reading import read_in_child
 
         return read_in_child(file, preset)

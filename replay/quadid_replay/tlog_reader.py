@@ -23,6 +23,8 @@ _DIALECT = extend_dialect(ardupilotmega)
 _WANTED = {n for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS or m.msgname in STATE_MESSAGES}
 _INVALID, _ARDUPILOT = 8, 3
 _ROTORCRAFT = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
+_BACKWARDS, _MOST_BACKWARDS = 0.5, 10
+"""Boot time that falls by more than the first [s] more often than the second: no vehicle boots that often."""
 _WIDTH = {"esc": 12, "servo": 16, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
 
 
@@ -38,6 +40,8 @@ class _VehicleLog:
         self.rotors = 0
         self._boot_clock: BootClock[list[Reading]] = BootClock()
         self._unix_offset: float | None = None
+        self._last_stamp = 0.0
+        self.backwards = 0
         self._esc_rows: dict[str, tuple[float | None, int, list[float]]] = {}
 
     def take(self, m: Any, received: float) -> None:
@@ -64,6 +68,9 @@ class _VehicleLog:
     def _stamp(self, m: Any) -> float | None:
         """Returns the message's own stamp on the boot clock [s]; None where it has none."""
         boot = boot_stamp(m, self._boot_clock.newest)
+        if boot is not None and m.get_type() != "SERVO_OUTPUT_RAW":
+            self.backwards += boot < self._last_stamp - _BACKWARDS
+            self._last_stamp = boot
         unix = unix_seconds(m)
         return unix - self._unix_offset if unix is not None and self._unix_offset is not None else boot
 
@@ -130,6 +137,12 @@ def read_tlog(path: Path) -> Recording:
         vehicle.finish()
     who = max(vehicles, key=lambda key: sum(len(c) for c in vehicles[key].signals.values()))
     notes = _notes(count, bad, path.stat().st_size)
+    if vehicles[who].backwards > _MOST_BACKWARDS:
+        raise LogError(
+            f"{path.name}: boot time under system {who[0]} component {who[1]} falls back {vehicles[who].backwards} "
+            "times: two vehicles under one system id", "one vehicle an id",
+            "give each vehicle its own SYSID_THISMAV (MAV_SYS_ID) and record again, or record each link by itself",
+        )  # fmt: skip
     others = [key for key, v in vehicles.items() if key != who and v.signals]
     if others:
         notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")

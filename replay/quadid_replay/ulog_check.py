@@ -48,6 +48,8 @@ class UlogRecords:
     wanted: set[int] = field(default_factory=set)
     lengths: dict[int, int] = field(default_factory=dict)
     boundaries: list[int] = field(default_factory=list)
+    sync: int = 0
+    """Where the next sync mark begins, as far as it was looked for; the end of the file when there is none."""
 
 
 def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
@@ -112,8 +114,10 @@ def unversioned(topic: str) -> str:
 
 def _next_record(data: mmap.mmap, offset: int, found: UlogRecords) -> int:
     """Returns where records go on: after the next sync mark, or nearby where several plausible ones follow."""
-    sync = data.find(_SYNC, offset)
-    after = len(data) if sync < 0 else sync + len(_SYNC)
+    if found.sync < offset:
+        sync = data.find(_SYNC, offset)
+        found.sync = len(data) if sync < 0 else sync
+    after = min(found.sync + len(_SYNC), len(data))
     for place in range(offset, min(offset + _NEAR, after)):
         if data[place + 2 : place + 3] == b"D" and _plausible(data, place, found):
             return place

@@ -1,0 +1,181 @@
+"""Files made to harm, or damaged badly: read in time that grows with their size, or refused; never silently wrong.
+
+A file of 4 MiB and more is read in a child that may take 10 s and 2 s a MiB of processor time; what takes longer than
+linear time is refused there, which fails these tests.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, Writer
+from quadid_replay import open_log
+from quadid_replay.mcap_order import in_log_time
+from quadid_replay.mcap_records import MOST_DEFINITIONS, McapFile
+from quadid_replay.schemas import schema_text
+
+from quadid.errors import LogError
+from tests.fuzz.seeds import seeds
+from tests.replay.test_dataflash import Dataflash
+from tests.replay.test_tlog import Tlog, attitude, heartbeat, servo
+
+
+def opened(tmp_path: Path, data: bytes) -> str:
+    """Warnings of a log, or the reason why it is refused."""
+    path = tmp_path / "log"
+    path.write_bytes(data)
+    try:
+        return "; ".join(open_log(path).warnings)
+    except LogError as error:
+        return str(error)
+
+
+def tlog() -> bytes:
+    log = Tlog()
+    log.add(0.0, heartbeat())
+    for k in range(100):
+        log.add(0.02 * k, attitude(5.0 + 0.02 * k))
+        log.add(0.02 * k, servo(5.0 + 0.02 * k))
+    return bytes(log.data)
+
+
+@pytest.mark.parametrize(
+    "filler", [b"\xfe", b"\xfd", b"\xfd\xfe", struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\xff"]
+)
+def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: bytes) -> None:
+    said = opened(tmp_path, tlog() + filler * ((12 << 20) // len(filler)))
+    assert "bytes are damaged and were skipped" in said
+
+
+def test_a_ulog_without_sync_takes_linear_time(tmp_path: Path) -> None:
+    bad = struct.pack("<HB", 1, 0xFF)  # records of no known kind, one after the other
+    said = opened(tmp_path, seeds("ulog")[0] + bad * (4 << 20))
+    assert "longer than" not in said
+    assert "damaged" in said
+
+
+def test_an_mcap_that_inflates_a_hundredfold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD, chunk_size=8 << 20)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "ros2msg", schema_text("sensor_msgs/msg/Imu").encode())
+        channel = writer.register_channel("imu", "cdr", schema)
+        for k in range(80):
+            writer.add_message(channel, k, bytes(8 << 20), k)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(LogError, match="would inflate to more than 50 times"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("where", ["inside a chunk", "in the file"])
+def test_an_mcap_record_without_content_is_damage(tmp_path: Path, where: str) -> None:
+    empty = bytes([5]) + struct.pack("<Q", 0)
+    body = struct.pack("<QQQIIQ", 0, 0, len(empty), 0, 0, len(empty)) + empty
+    record = empty if where == "in the file" else bytes([6]) + struct.pack("<Q", len(body)) + body
+    said = opened(tmp_path, b"\x89MCAP0\r\n" + record + record)
+    assert "damaged chunks" in said
+
+
+def test_channels_and_schemas_without_end_are_refused(tmp_path: Path) -> None:
+    def record(kind: int, body: bytes) -> bytes:
+        return bytes([kind]) + struct.pack("<Q", len(body)) + body
+
+    def text(value: bytes) -> bytes:
+        return struct.pack("<I", len(value)) + value
+
+    many = range(MOST_DEFINITIONS + 2)
+    channels = [record(4, struct.pack("<HH", k, 1) + text(b"imu") + text(b"cdr") + struct.pack("<I", 0)) for k in many]
+    schemas = [record(3, struct.pack("<H", k + 1) + text(b"a/b") + text(b"ros2msg") + text(b"x")) for k in many]
+    for records in (channels, schemas):
+        assert f"more than {MOST_DEFINITIONS} channels" in opened(tmp_path, b"\x89MCAP0\r\n" + b"".join(records))
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_an_mcap_is_read_in_log_time_whatever_its_order(tmp_path: Path, summary: bool) -> None:
+    path = tmp_path / "shuffled.mcap"
+    order = np.random.default_rng(3).permutation(5000)
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, chunk_size=1 << 12, use_chunking=True)
+        writer.start()
+        schema = writer.register_schema("a/B", "ros2msg", b"int8 x")
+        channel = writer.register_channel("x", "cdr", schema)
+        for k in order:
+            writer.add_message(channel, int(k), bytes(8), int(k))
+        writer.finish()  # type: ignore[no-untyped-call]
+    if not summary:
+        path.write_bytes(path.read_bytes()[:-40])
+    times = [t for _, t, _ in McapFile(path).messages({channel})]
+    np.testing.assert_array_equal(times, np.arange(5000))
+
+
+def test_ordering_keeps_little_waiting() -> None:
+    taken = 0
+
+    def part(start: int) -> list[tuple[int, int, bytes]]:
+        nonlocal taken
+        taken += 10
+        return [(1, start + k, b"") for k in range(10)]
+
+    for n, (_, t, _) in enumerate(in_log_time((10 * k, iter(part(10 * k))) for k in range(10_000))):
+        assert t == n
+        assert taken - n <= 1020
+
+
+def test_two_vehicles_under_one_system_id_are_refused(tmp_path: Path) -> None:
+    one, two = Tlog(), Tlog()
+    for k in range(200):
+        for log, boot in ((one, 100.0), (two, 300.0)):
+            log.add(0.02 * k, attitude(boot + 0.02 * k))
+            log.add(0.02 * k, servo(boot + 0.02 * k))
+    frames = [bytes(log.data) for log in (one, two)]
+    length = len(frames[0]) // 200
+    mixed = b"".join(f[k * length : (k + 1) * length] for k in range(200) for f in frames)
+    assert "two vehicles under one system id" in opened(tmp_path, mixed)
+
+
+def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path) -> None:
+    log = Dataflash()
+    columns = ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
+    log.describe(140, "IMU", "QBffffff", ",".join(columns))
+    for k in range(50):
+        log.add("IMU", k * 20_000, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8)
+    log.describe(140, "IMU", "QBffffff", ",".join((*columns[:2], *columns[5:], *columns[2:5])))
+    for k in range(50, 100):
+        log.add("IMU", k * 20_000, 0, 0.0, 0.0, -9.8, 0.1, 0.2, 0.3)
+    path = tmp_path / "log.bin"
+    path.write_bytes(bytes(log.data))
+    recording = open_log(path)
+    np.testing.assert_allclose(recording.channels["gyro"].values, np.tile([0.1, 0.2, 0.3], (50, 1)), rtol=1e-6)
+    assert any("IMU described anew" in w for w in recording.warnings)
+
+
+def test_numbers_that_only_python_reads_are_dropped(tmp_path: Path) -> None:
+    rows = "".join(f"{0.02 * k:.2f},0.1,0.2,0.3\n" for k in range(50))
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "t,p,q,r\n" + rows + "1.00,1_0,0.2,0.3\n1.02,\uff11,0.2,0.3\n" + "1.04,0.1,0.2,0.3\n", encoding="utf-8"
+    )
+    recording = open_log(path)
+    np.testing.assert_allclose(recording.channels["gyro"].values[:, 0], 0.1)
+    assert any("2 lines with missing or unreadable cells" in w for w in recording.warnings)
+
+
+def test_a_wild_first_stamp_moves_nothing(tmp_path: Path) -> None:
+    rows = "".join(f"{0.02 * k:.2f},0.1,0.2,0.3\n" for k in range(50))
+    for wild in ("1e9", "-5000", "99999"):
+        path = tmp_path / "a.csv"
+        path.write_text(f"t,p,q,r\n{wild},0.1,0.2,0.3\n" + rows)
+        recording = open_log(path)
+        np.testing.assert_allclose(recording.channels["gyro"].t, 0.02 * np.arange(50), atol=1e-9)
+        assert recording.breaks == ()
+        assert any("1 stamps that no neighbour confirms" in w for w in recording.warnings)
+
+
+def test_decimal_commas_are_named(tmp_path: Path) -> None:
+    for row in ("0,02;0,1;0,2;0,3", "0,02,0,1,0,2,0,3"):
+        header = "t;p;q;r" if ";" in row else "t,p,q,r"
+        assert "decimal commas (0,02" in opened(tmp_path, f"{header}\n{row}\n{row}\n".encode())
