@@ -1,40 +1,35 @@
-"""Start one identification node a vehicle, each in its own namespace.
+"""Start one identification node a vehicle, each in its own namespace, with its own vehicle file and configuration.
 
-ros2 launch quadid_node fleet.launch.py namespaces:=quad1,quad2 vehicle:=pelican source:=mavros
+ros2 launch quadid_node fleet.launch.py namespaces:=quad1,quad2 vehicle:=a.yaml,b.yaml config:=a_node.yaml,b_node.yaml
 """
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
+from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet
 
-PASSED_ON = ("vehicle", "source", "approval", "use_sim_time")
+EACH = {**ARGUMENTS, "config": "parameter file", **{name: text for name, (_, text) in NODE_ARGUMENTS.items()}}
 
 
-def _nodes(context: LaunchContext) -> list[IncludeLaunchDescription]:
+def _nodes(context: LaunchContext) -> list[GroupAction]:
     one = PathJoinSubstitution([FindPackageShare("quadid_node"), "launch", "identify.launch.py"])
-    names = [n.strip() for n in LaunchConfiguration("namespaces").perform(context).split(",") if n.strip()]
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"namespaces:={','.join(names)}: give each vehicle its own, as namespaces:=quad1,quad2")
-    common = {key: LaunchConfiguration(key) for key in PASSED_ON}
+    given = {name: LaunchConfiguration(name).perform(context) for name in EACH}
+    said = {name: text for name, text in given.items() if text}
+    # Without forwarding, or the empty arguments of this file would stand where the other has defaults.
     return [
-        IncludeLaunchDescription(
-            PythonLaunchDescriptionSource(one), launch_arguments={"namespace": n, **common}.items()
+        GroupAction(
+            [IncludeLaunchDescription(PythonLaunchDescriptionSource(one), launch_arguments=arguments.items())],
+            forwarding=False,
         )
-        for n in names
+        for arguments in fleet(LaunchConfiguration("namespaces").perform(context), said)
     ]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """As many nodes as there are namespaces; the other arguments hold for all of them."""
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("namespaces", description="comma-separated, one a vehicle"),
-            DeclareLaunchArgument("vehicle", default_value="pelican", description="shipped name or vehicle file"),
-            DeclareLaunchArgument("source", default_value="canonical", description="preset of topic names and types"),
-            DeclareLaunchArgument("approval", default_value="auto", description="auto or manual"),
-            DeclareLaunchArgument("use_sim_time", default_value="false", description="take the time from /clock"),
-            OpaqueFunction(function=_nodes),
-        ]
-    )
+    """As many nodes as there are namespaces; every other argument once for all, or one a vehicle."""
+    declared = [DeclareLaunchArgument("namespaces", description="comma-separated, one a vehicle")]
+    for name, text in EACH.items():
+        declared.append(DeclareLaunchArgument(name, default_value="", description=f"{text}; one for all, or one each"))
+    return LaunchDescription([*declared, OpaqueFunction(function=_nodes)])
