@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
-from quadid.effects import EFFECTS, known_keys, rotor_losses
+from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.residual import MOST_TERMS, ResidualTerm
@@ -180,6 +180,7 @@ class Vehicle(_Strict):
         command: meaning of the rotor columns.
         parameters: initial guess of b, d, J_xx, J_yy, J_zz, J_r.
         effects: effects that are part of the model, name -> parameter -> value.
+        reference_voltage: supply voltage that effects count from [V]; the mean of the training flights.
         noise: known sensor noise, or None.
         stabiliser: known stabiliser gains, or None.
         mixer: from logged mixer inputs to rotors, a name of `MIXERS` or a matrix with a row a rotor; or None.
@@ -199,6 +200,7 @@ class Vehicle(_Strict):
     command: Command = Command()
     parameters: dict[str, ParameterPrior]
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
+    reference_voltage: float | None = Field(default=None, gt=0.0)
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
@@ -240,7 +242,7 @@ class Vehicle(_Strict):
     @model_validator(mode="after")
     def _physical(self) -> Vehicle:
         try:
-            rotor_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
+            rotor_drag_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
         except ParameterError as error:
             raise ValueError(str(error)) from error
         diagonal = [self.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Acts = Literal["command", "rotor", "air", "body", "flight", "sensor"]
-Scale = Literal["", "arm", "inertia", "rotor_inertia", "hover_speed"]
+Scale = Literal["", "arm", "inertia", "rotor_inertia", "hover_speed", "rotor_weight"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,8 @@ class EffectParameter:
         factor: to the unit of the sentence.
         optional: stays at neutral until data ask for it beside the effect's other numbers.
         entry: its name in the parameter vector, where that holds another form of it.
+        beside: parameter of the same effect which it replaces in part; it is that one's value plus its vector entry,
+            and that one's value where a vehicle file leaves it out.
     """
 
     name: str
@@ -40,6 +42,7 @@ class EffectParameter:
     factor: float = 1.0
     optional: bool = False
     entry: str = ""
+    beside: str = ""
 
 
 @dataclass(frozen=True)

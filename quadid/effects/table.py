@@ -27,7 +27,10 @@ _DRAGS = ("a_x: v_x", "a_y: v_y", "a_x: time", "a_y: time")
 
 TABLE: tuple[Effect, ...] = (
     Effect(
-        "motor_lag", "command", (P("tau", "s", 0.0, 0.0, 0.3, 0.03, start=0.02, factor=1e3),),
+        "motor_lag", "command", (
+            P("tau", "s", 0.0, 0.0, 0.3, 0.03, start=0.02, factor=1e3),
+            P("tau_down", "s", 0.0, -0.1, 0.3, 0.02, optional=True, entry="slower", beside="tau", factor=1e3),
+        ),
         summary="The rotors follow their command with a lag.",
         sentence="the rotors need {tau:.0f} ms to follow a command (first-order lag), seen as late rotation and thrust",
         advice="Usual for real motors; a controller that knows it can lead it.",
@@ -78,11 +81,12 @@ TABLE: tuple[Effect, ...] = (
         requires="rotor_drag", stand_in=True, shows=("q': v_x", "p': v_y", "p': time", "q': time"),
     ),
     Effect(
-        "rate_damping", "body", _axes("l_p m_q", "1/s", 30.0, 1.0, sign=1),
-        summary="Rotation is damped by the air.",
-        sentence="the air damps roll and pitch rotation by {l_p:.2f} and {m_q:.2f} 1/s",
-        advice="Usual for large propellers.",
-        stand_in=True, shows=("p': p", "q': q"),
+        "rate_damping", "body", _axes("l_p m_q n_r", "1/s", 30.0, 1.0, sign=1),
+        summary="Rotation is damped, by more than the air at each hub.",
+        sentence="roll, pitch and yaw rotation is damped by {l_p:.2f}, {m_q:.2f} and {n_r:.2f} 1/s beyond what the "
+        "rotors give",
+        advice="Usual for a large frame; beyond that look for an unmodelled lag.",
+        stand_in=True, shows=("p': p", "q': q", "r': r"),
     ),
     Effect(
         "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1),),
@@ -101,7 +105,11 @@ TABLE: tuple[Effect, ...] = (
     ),
     Effect(
         "weak_rotor", "rotor",
-        (P("rotor", "", 0.0, 1.0, 12.0, 1.0), P("loss", "", 0.0, -0.6, 0.6, 0.05, factor=1e2)),
+        (
+            P("rotor", "", 0.0, 1.0, 12.0, 1.0),
+            P("loss", "", 0.0, -0.6, 0.6, 0.05, factor=1e2),
+            P("drag_loss", "", 0.0, -1.0, 1.0, 0.1, optional=True, entry="extra", beside="loss", factor=1e2),
+        ),
         summary="One rotor gives less thrust than the others.",
         sentence="rotor {rotor:.0f} gives {loss:.1f} % less thrust and drag torque than the others",
         advice="Check that rotor: propeller, motor, speed controller, arm.",
@@ -115,7 +123,11 @@ TABLE: tuple[Effect, ...] = (
         family="corner", stand_in=True, shows=_CORNER,
     ),
     Effect(
-        "mass_change", "flight", _change(P("fraction", "", 0.0, -0.6, 1.0, 0.1, factor=1e2)),
+        "mass_change", "flight", _change(
+            P("fraction", "", 0.0, -0.6, 1.0, 0.1, factor=1e2),
+            *(P(f"J_{a}", "", 0.0, -0.6, 2.0, 0.1, optional=True, factor=1e2) for a in ("xx", "yy", "zz")),
+            *(P(a, "m", 0.0, -0.1, 0.1, 0.005, optional=True, scale="arm", factor=1e3) for a in ("x", "y")),
+        ),
         summary="Mass was taken up or dropped in flight.",
         sentence="at {time:.1f} s the mass changed by {fraction:.1f} %",
         advice="Check the payload and its release.",
@@ -136,11 +148,42 @@ TABLE: tuple[Effect, ...] = (
         family="step", per_log=True, shows=_STEPS,
     ),
     Effect(
-        "thrust_curve", "rotor", (P("dead_speed", "rad/s", 0.0, -1000.0, 1000.0, 40.0, scale="hover_speed"),),
+        "thrust_curve", "rotor", (
+            P("dead_speed", "rad/s", 0.0, -1000.0, 1000.0, 40.0, scale="hover_speed"),
+            P("offset", "N", 0.0, -1.0, 1.0, 0.1, optional=True, scale="rotor_weight"),
+        ),
         summary="Thrust is not purely quadratic.",
         sentence="thrust follows (speed - {dead_speed:.0f} rad/s)^2 rather than speed^2",
         advice="Measure thrust against command on a stand, or log measured rotor speeds.",
         shows=("a_z: rotor_speed", "p': rotor_speed"),
+    ),
+    Effect(
+        "supply_voltage", "command", (P("exponent", "", 0.0, -1.0, 3.0, 0.5, start=1.0),),
+        summary="The rotors turn slower as the battery empties.",
+        sentence="rotor speed goes with the supply voltage to the power of {exponent:.2f}",
+        advice="Compensate commands for voltage, or log measured rotor speeds.",
+        family="step", needs=("battery",), flexible="never", shows=("a_z: time",),
+    ),
+    Effect(
+        "rotor_telemetry_delay", "command", (P("delay", "s", 0.0, 0.0, 0.06, 0.01, start=0.005, factor=1e3),),
+        summary="Measured rotor speeds are reported late.",
+        sentence="measured rotor speeds are reported {delay:.0f} ms late",
+        advice="Look for buffering between the speed controllers and the log.",
+        family="late", flexible="never", shows=_TURNS,
+    ),
+    Effect(
+        "drag_torque_curve", "rotor", (P("growth", "", 0.0, -2.0, 3.0, 0.5),),
+        summary="The rotors' drag torque is not purely quadratic.",
+        sentence="the rotors' drag torque grows with speed to the power of {growth:.2f} beyond the square, about hover",
+        advice="Measure torque against speed on a stand; some simulators take it in proportion to thrust and command.",
+        flexible="never", shows=("r': rotor_speed", "r': thrust"),
+    ),
+    Effect(
+        "no_gyroscopic_coupling", "body", (P("share", "", 0.0, -0.5, 1.5, 0.3, factor=1e2),),
+        summary="Rotation about one axis does not couple into the others.",
+        sentence="{share:.0f} % of the gyroscopic coupling of the body's rotation is missing",
+        advice="No vehicle does this: the data come from a simulator that leaves the term out.",
+        flexible="never", shows=("p': q", "q': r", "r': p"),
     ),
     Effect(
         "product_of_inertia", "body", _axes("J_xy J_xz J_yz", "kg m^2", 1e-2, 1e-3, scale="inertia"),

@@ -39,12 +39,14 @@ class Body(NamedTuple):
         inertia, inverse: tensor and its inverse, shape (2, 3, 3): before and after `mass_change` [kg m^2].
         rotor_inertia: J_r of the gyroscopic torque [kg m^2].
         spin_up: J of tau_z += J dOmega_r/dt [kg m^2]; the paper's nominal model has none.
-        arms: rotor positions from the CG, shape (n, 3) [m].
+        arms: rotor positions from the CG, shape (2, n, 3): before and after `mass_change` [m].
         spins: shape (n,), +1 or -1.
         b, d: thrust and drag torque coefficient.
-        dead_speed: f = b (omega - dead_speed)^2 [rad/s].
-        centre: geometric centre from the CG [m].
-        imu: IMU from the CG [m].
+        dead_speed, offset: f = b (omega - dead_speed)^2 + offset [rad/s], [N].
+        growth: drag torque d omega^2 (1 + growth (omega / omega_hover - 1)).
+        imu: IMU from the CG, shape (2, 3) [m].
+        coupling: factor on nu x J nu; 1 in nature.
+        hover_speed: of a rotor [rad/s].
     """
 
     mass: float
@@ -57,8 +59,11 @@ class Body(NamedTuple):
     b: float
     d: float
     dead_speed: float
-    centre: FloatArray
+    offset: float
+    growth: float
     imu: FloatArray
+    coupling: float
+    hover_speed: float
 
 
 class Air(NamedTuple):
@@ -67,8 +72,8 @@ class Air(NamedTuple):
     Attributes:
         drag_x, drag_y: k_x, k_y of rotor_drag [1/s].
         parasitic: c [1/m].
-        moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the CG.
-        damping_p, damping_q: l_p, m_q [1/s].
+        moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the hubs.
+        damping_p, damping_q, damping_r: l_p, m_q, n_r [1/s].
         axial: k_z [1/s].
         wind_north, wind_east: velocity of the air [m/s].
         ground_radius: effective rotor radius of the Cheeseman-Bennett ground effect [m].
@@ -82,6 +87,7 @@ class Air(NamedTuple):
     moment_y: float
     damping_p: float
     damping_q: float
+    damping_r: float
     axial: float
     wind_north: float
     wind_east: float
@@ -119,12 +125,13 @@ class Oddity(NamedTuple):
 
 
 @kernel
-def rotor_wrench(omega: FloatArray, efficiency: FloatArray, body: Body, out: FloatArray) -> None:
+def rotor_wrench(omega: FloatArray, efficiency: FloatArray, changed: int, body: Body, out: FloatArray) -> None:
     """Sums what the rotors do, each at its own arm.
 
     Args:
         omega: rotor speeds, shape (n,) [rad/s].
         efficiency: factor on thrust (column 0) and drag torque (column 1) of each rotor, shape (n, 2).
+        changed: 0 before, 1 after `mass_change`.
         body: geometry.
         out: sum of speeds [rad/s], thrust along -z [N], roll, pitch, yaw torque about the CG [N m], Omega_r [rad/s].
     """
@@ -132,13 +139,14 @@ def rotor_wrench(omega: FloatArray, efficiency: FloatArray, body: Body, out: Flo
     for i in range(omega.shape[0]):
         speed = omega[i]
         working = max(speed - body.dead_speed, 0.0)
-        force = efficiency[i, 0] * body.b * working * working
+        force = efficiency[i, 0] * (body.b * working * working + body.offset)
         total += speed
         thrust += force
         # arm x (0, 0, -force)
-        roll -= body.arms[i, 1] * force
-        pitch += body.arms[i, 0] * force
-        yaw += body.spins[i] * efficiency[i, 1] * body.d * speed * speed
+        roll -= body.arms[changed, i, 1] * force
+        pitch += body.arms[changed, i, 0] * force
+        grown = 1.0 + body.growth * (speed / body.hover_speed - 1.0)
+        yaw += body.spins[i] * efficiency[i, 1] * body.d * speed * speed * grown
         spin_sum += body.spins[i] * speed
     out[0] = total
     out[1] = thrust
@@ -149,8 +157,41 @@ def rotor_wrench(omega: FloatArray, efficiency: FloatArray, body: Body, out: Flo
 
 
 @kernel
+def hub_forces(
+    omega: FloatArray, velocity: tuple[float, float, float], rates: tuple[float, float, float], changed: int,
+    body: Body, air: Air,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    """Drag in the rotor planes and thrust lost to inflow, summed rotor by rotor: force [N], torque about the CG [N m].
+
+    Args:
+        omega: rotor speeds [rad/s].
+        velocity: of the CG relative to the air, body axes [m/s].
+        rates: of the body [rad/s].
+        changed: 0 before, 1 after `mass_change`.
+        body: mass and geometry.
+        air: aerodynamics.
+    """
+    fx = fy = fz = roll = pitch = yaw = 0.0
+    for i in range(omega.shape[0]):
+        x, y, z = body.arms[changed, i, 0], body.arms[changed, i, 1], body.arms[changed, i, 2]
+        weight = body.mass * omega[i] / air.hover_sum
+        along = -weight * air.drag_x * (velocity[0] + rates[1] * z - rates[2] * y)
+        across = -weight * air.drag_y * (velocity[1] + rates[2] * x - rates[0] * z)
+        lost = -weight * air.axial * (velocity[2] + rates[0] * y - rates[1] * x)
+        fx += along
+        fy += across
+        fz += lost
+        # arm x force, the force in the rotor plane acting higher by the height of `rotor_drag_moment`
+        roll += y * lost - (z - air.moment_y) * across
+        pitch += (z - air.moment_x) * along - x * lost
+        yaw += x * across - y * along
+    return fx, fy, fz, roll, pitch, yaw
+
+
+@kernel
 def derivative(
     y: FloatArray,
+    omega: FloatArray,
     wrench: FloatArray,
     power: float,
     mass_factor: float,
@@ -165,6 +206,7 @@ def derivative(
 
     Args:
         y: state, shape (33,).
+        omega: rotor speeds [rad/s].
         wrench: output of `rotor_wrench`, and the spin-up torque about z [N m] as seventh entry.
         power: factor on thrust and drag torque of all rotors (battery, thrust drop).
         mass_factor: present mass / original mass.
@@ -201,17 +243,12 @@ def derivative(
         dy[26] = stiff * (straight_roll - y[25]) - 2.0 * odd.flex_damping * odd.flex_speed * y[26]
         dy[28] = stiff * (straight_pitch - y[27]) - 2.0 * odd.flex_damping * odd.flex_speed * y[28]
 
-    activity = wrench[0] / air.hover_sum
-    force_x = -body.mass * air.drag_x * u * activity
-    force_y = -body.mass * air.drag_y * v * activity
-    # in-plane rotor force at height h above the CG: (0, 0, -h) x F
-    roll += air.moment_y * force_y
-    pitch -= air.moment_x * force_x
-    # thrust lost in climb acts at the geometric centre
-    lost = -body.mass * air.axial * w * activity
-    roll += body.centre[1] * lost
-    pitch -= body.centre[0] * lost
-    force_z = -thrust + lost
+    force_x = force_y = 0.0
+    force_z = -thrust
+    if air.drag_x != 0.0 or air.drag_y != 0.0 or air.axial != 0.0:
+        at_hubs = hub_forces(omega, (u, v, w), (p, q, r), changed, body, air)
+        force_x, force_y, force_z = at_hubs[0], at_hubs[1], at_hubs[2] - thrust
+        roll, pitch, yaw = roll + at_hubs[3], pitch + at_hubs[4], yaw + at_hubs[5]
     if air.parasitic != 0.0:
         flat_plate = body.mass * air.parasitic * np.sqrt(u * u + v * v + w * w)
         force_x -= flat_plate * u
@@ -252,12 +289,12 @@ def derivative(
     h_y = inertia[1, 0] * p + inertia[1, 1] * q + inertia[1, 2] * r
     h_z = inertia[2, 0] * p + inertia[2, 1] * q + inertia[2, 2] * r
     gyroscopic = body.rotor_inertia * wrench[5]
-    m_x = roll + gyroscopic * q - (q * h_z - r * h_y)
-    m_y = pitch - gyroscopic * p - (r * h_x - p * h_z)
-    m_z = yaw - (p * h_y - q * h_x)
+    m_x = roll + gyroscopic * q - body.coupling * (q * h_z - r * h_y)
+    m_y = pitch - gyroscopic * p - body.coupling * (r * h_x - p * h_z)
+    m_z = yaw - body.coupling * (p * h_y - q * h_x)
     p_dot = inverse[0, 0] * m_x + inverse[0, 1] * m_y + inverse[0, 2] * m_z - air.damping_p * p + push[3]
     q_dot = inverse[1, 0] * m_x + inverse[1, 1] * m_y + inverse[1, 2] * m_z - air.damping_q * q + push[4]
-    r_dot = inverse[2, 0] * m_x + inverse[2, 1] * m_y + inverse[2, 2] * m_z + push[5]
+    r_dot = inverse[2, 0] * m_x + inverse[2, 1] * m_y + inverse[2, 2] * m_z - air.damping_r * r + push[5]
     if odd.lift_roll != 0.0:
         p_dot += odd.lift_roll * u * v
     if odd.slosh_share != 0.0:
@@ -277,7 +314,7 @@ def derivative(
         dy[row + 2] = a * q - b * p
     dy[15], dy[16], dy[17] = p_dot, q_dot, r_dot
     # specific force at the IMU: f + nu' x l + nu x (nu x l)
-    l_x, l_y, l_z = body.imu[0], body.imu[1], body.imu[2]
+    l_x, l_y, l_z = body.imu[changed, 0], body.imu[changed, 1], body.imu[changed, 2]
     along = p * l_x + q * l_y + r * l_z
     spin2 = p * p + q * q + r * r
     dy[18] = f_x + q_dot * l_z - r_dot * l_y + p * along - spin2 * l_x

@@ -18,7 +18,7 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "rotor_drag": {"k_x": (0.12, 0.45), "k_y": (0.12, 0.45)},
     "parasitic_drag": {"c": (0.01, 0.06)},
     "rotor_drag_moment": {"h_x": (0.01, 0.05), "h_y": (0.01, 0.05)},
-    "rate_damping": {"l_p": (0.3, 2.0), "m_q": (0.3, 2.0)},
+    "rate_damping": {"l_p": (0.3, 2.0), "m_q": (0.3, 2.0), "n_r": (0.1, 0.6)},
     "axial_inflow": {"k_z": (0.1, 0.5)},
     "wind": {"north": (1.0, 5.0), "east": (1.0, 5.0)},
     "weak_rotor": {"loss": (0.03, 0.15)},
@@ -26,6 +26,10 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "mass_change": {"fraction": (0.05, 0.25)},
     "thrust_drop": {"fraction": (0.04, 0.15)},
     "battery_sag": {"fraction": (0.05, 0.15)},
+    "supply_voltage": {"exponent": (0.7, 1.3)},
+    "rotor_telemetry_delay": {"delay": (0.005, 0.015)},
+    "drag_torque_curve": {"growth": (0.5, 1.2)},
+    "no_gyroscopic_coupling": {"share": (0.9, 1.0)},
     "thrust_curve": {"dead_speed": (18.0, 70.0)},
     "product_of_inertia": {"J_xy": (5e-4, 2e-3), "J_xz": (5e-4, 2e-3), "J_yz": (5e-4, 2e-3)},
     "rotor_spin_up": {"J": (2e-5, 8e-5)},
@@ -95,7 +99,7 @@ def _one(
         values["time"] = float(rng.uniform(0.3, 0.7)) * seconds
     if name == "weak_rotor":
         values["rotor"] = float(rng.integers(1, (4 if vehicle is None else len(vehicle.rotors)) + 1))
-    return {p.name: values[p.name] for p in EFFECTS[name].parameters}
+    return {p.name: values[p.name] for p in EFFECTS[name].parameters if p.name in values}
 
 
 def draw_effect(

@@ -16,6 +16,8 @@ from quadid.flight.jit import kernel
 from quadid.flight.rotors import Drive, load_input, spin_up_kick
 
 FloatArray = NDArray[np.float64]
+SUPPLY_FALL = 0.15
+"""How much of its mean the supply voltage loses over a flight in which it matters."""
 NO_TIME = 1e300
 EPSILON = 1e-11
 
@@ -66,6 +68,7 @@ class Events(NamedTuple):
         mass_time, mass_fraction: mass grows by the fraction.
         drop_time, drop_fraction: all rotors lose thrust and drag torque.
         sag_fraction, sag_start, sag_end: linear loss from start to end.
+        supply_exponent: commands act times (voltage / its mean) to this.
         faint_rotor: rotor that fails now and then (-1: none); faint_share: thrust lost meanwhile;
             faint_times: shape (k, 2), start and end [s].
     """
@@ -77,6 +80,7 @@ class Events(NamedTuple):
     sag_fraction: float
     sag_start: float
     sag_end: float
+    supply_exponent: float
     faint_rotor: int
     faint_share: float
     faint_times: FloatArray
@@ -202,6 +206,13 @@ def power_at(t: float, after_drop: bool, events: Events) -> float:
 
 
 @kernel
+def supply(t: float, events: Events) -> float:
+    """Supply voltage over its mean of the flight at time t [s]: it falls in a straight line."""
+    part = (t - events.sag_start) / (events.sag_end - events.sag_start)
+    return 1.0 + SUPPLY_FALL * (0.5 - min(max(part, 0.0), 1.0))
+
+
+@kernel
 def apply_due(
     now: float,
     head: int,
@@ -217,6 +228,7 @@ def apply_due(
     track: Track,
     body: Body,
     drive: Drive,
+    boost: float,
 ) -> tuple[int, float]:
     """Lets every command that has reached the rotors take effect; returns the queue's head and the ramp's end."""
     if ramp_end <= now + EPSILON:
@@ -226,7 +238,7 @@ def apply_due(
         before = 0.0
         for i in range(omega.shape[0]):
             before += body.spins[i] * omega[i]
-        load_input(drive, track.command[head], level, slope, memory)
+        load_input(drive, track.command[head], boost, level, slope, memory)
         if drive.ramp > 0.0:
             ramp_end = arrival[head] + drive.ramp
         elif drive.tau == 0.0 and drive.slew == 0.0:

@@ -20,6 +20,7 @@ from quadid.flight.loop import (
     pull_attitude,
     quaternion_of,
     shake,
+    supply,
     turned,
 )
 from quadid.flight.pilot import Pilot, fly_by_hand
@@ -155,9 +156,11 @@ def march(
         left, end = now, now + dt
         push = pushes[min(n, pushes.shape[0] - 1)]
         while end - left > EPSILON:
+            boost = supply(left, events) ** events.supply_exponent if events.supply_exponent != 0.0 else 1.0
             head, ramp_end = apply_due(
-                left, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive
-            )
+                left, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive,
+                boost,
+            )  # fmt: skip
             if changed == 0 and events.mass_time <= left + EPSILON:
                 changed, mass_factor = 1, 1.0 + events.mass_fraction
             if events.drop_time <= left + EPSILON:

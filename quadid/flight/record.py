@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
 from quadid.flight import sensors
-from quadid.flight.loop import Plan, Track, quaternion_of
+from quadid.flight.loop import Plan, Track, quaternion_of, supply
 from quadid.flight.outside import distort_log
 from quadid.flight.outside_log import LogRows
 from quadid.flight.sensors import SensorNoise
@@ -110,18 +110,25 @@ class Flown:
         return np.asarray(sigma * self.streams[name].standard_normal((self.plan.rows, columns)))
 
 
-def logged_rotors(track: Track, plan: Plan, sampling: str) -> FloatArray:
+def logged_rotors(track: Track, plan: Plan, sampling: str, late: float) -> FloatArray:
     """Rotor columns of the log [rad/s], shape (rows, n).
 
     Held: the command that acts from this row to the next (its mean where it changes faster).  Instant: the input of
-    the rotors at the row, which has just reached the command before.
+    the rotors at the row, which has just reached the command before.  Either as it was `late` seconds before.
     """
-    share = plan.log_every // plan.control_every
-    first = plan.first_log // plan.control_every
+    share, step = plan.log_every // plan.control_every, plan.control_every * plan.dt
+    first, rows = plan.first_log // plan.control_every - late / step, np.arange(plan.rows + 1, dtype=np.float64)
     if sampling == "instant":
-        return track.command[first - 1 + share * np.arange(plan.rows)]
-    held = track.command[first : first + share * plan.rows]
-    return np.asarray(held.reshape(plan.rows, share, -1).mean(axis=1))
+        return _between(track.command, first - 1 + share * rows[:-1])
+    summed = np.concatenate([np.zeros((1, track.command.shape[1])), np.cumsum(track.command, axis=0)])
+    return np.asarray(np.diff(_between(summed, first + share * rows), axis=0) / share)
+
+
+def _between(rows: FloatArray, at: FloatArray) -> FloatArray:
+    """Rows at fractional places, linear in between, shape (len(at), columns)."""
+    low = np.clip(np.floor(at + 1e-9).astype(np.int64), 0, len(rows) - 1)
+    part = np.clip(at - low, 0.0, 1.0)[:, None] * (np.abs(at - np.rint(at)) > 1e-9)[:, None]
+    return np.asarray((1.0 - part) * rows[low] + part * rows[np.minimum(low + 1, len(rows) - 1)])
 
 
 def _sensor_rows(flown: Flown, rotor: FloatArray) -> LogRows:
@@ -152,7 +159,10 @@ def _extras(flown: Flown, wanted: Sequence[str]) -> dict[str, FloatArray]:
         if name not in EXTRAS:
             raise ParameterError(f"unknown optional channel '{name}'", ", ".join(EXTRAS))
     progress = np.arange(flown.plan.rows) / (flown.plan.rows - 1)
-    volts = FULL_BATTERY * np.sqrt(np.maximum(0.1, 1.0 - flown.setup.events.sag_fraction * progress))
+    events, t = flown.setup.events, flown.plan.dt * flown.plan.log_every * np.arange(flown.plan.rows)
+    volts = FULL_BATTERY * np.sqrt(np.maximum(0.1, 1.0 - events.sag_fraction * progress))
+    if events.supply_exponent != 0.0:
+        volts = FULL_BATTERY * np.array([supply(float(x), events) for x in t])
     clean = {"velocity": flown.track.state[:, 3:6], "position": flown.track.state[:, 0:3], "battery": volts[:, None]}
     sigma = {"velocity": flown.sensor.velocity, "position": flown.sensor.position, "battery": flown.sensor.battery}
     return {name: clean[name] + flown.noise(name, sigma[name], clean[name].shape[1]) for name in wanted}
@@ -161,7 +171,7 @@ def _extras(flown: Flown, wanted: Sequence[str]) -> dict[str, FloatArray]:
 def write_window(flown: Flown, extras: Sequence[str]) -> Window:
     """Logs the flight: sensors with all their errors, commands, references, and the optional channels asked for."""
     sampling = flown.setup.vehicle.command.sampling
-    rotor = logged_rotors(flown.track, flown.plan, sampling)
+    rotor = logged_rotors(flown.track, flown.plan, sampling, flown.setup.reading_delay)
     rows = _sensor_rows(flown, rotor)
     optional = _extras(flown, extras)
     return Window(

@@ -22,6 +22,7 @@ class Drive(NamedTuple):
 
     Attributes:
         tau: first-order lag [s]; 0 for none.
+        tau_down: the same while slowing [s].
         ramp: time in which the input moves to a new command [s]; 0 steps (held commands).
         slew: largest rate of rotor speed [rad/s^2]; 0 for no limit.
         knee: speed above which the rotors only follow a share of the command [rad/s]; 0 for none.
@@ -31,6 +32,7 @@ class Drive(NamedTuple):
     """
 
     tau: float
+    tau_down: float
     ramp: float
     slew: float = 0.0
     knee: float = 0.0
@@ -39,27 +41,34 @@ class Drive(NamedTuple):
     hysteresis: float = 0.0
 
 
+WITHOUT_LAG = Drive(0.0, 0.0, 0.0)
+
+
 @kernel
-def rotor_speed(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: float, s: float, out: FloatArray) -> None:
+def rotor_speed(
+    omega: FloatArray, level: FloatArray, slope: FloatArray, drive: Drive, s: float, out: FloatArray
+) -> None:
     """Evaluates rotor speeds after time s of one piece of input.
 
     Solves tau omega' = u - omega with u(s) = level + slope s:
-    omega(s) = u(s) - slope tau + (omega(0) - level + slope tau) exp(-s / tau).
+    omega(s) = u(s) - slope tau + (omega(0) - level + slope tau) exp(-s / tau).  The lag is that of the way in which
+    the rotor turns at the start of the piece; a command that ramps past it within the piece is not cut there.
 
     Args:
         omega: speeds at s = 0 [rad/s], shape (n,).
         level: input at s = 0 [rad/s].
         slope: its rate [rad/s^2].
-        tau: lag [s]; 0 makes the speed equal to the input.
+        drive: lags; 0 makes the speed equal to the input.
         s: time since the start of the piece [s].
         out: speeds, written.
     """
     if s == 0.0:
         for i in range(omega.shape[0]):
             out[i] = omega[i]
-    elif tau > 0.0:
-        fade = np.exp(-s / tau)
+    elif drive.tau > 0.0:
         for i in range(omega.shape[0]):
+            tau = drive.tau if level[i] >= omega[i] else drive.tau_down
+            fade = np.exp(-s / tau)
             lag = slope[i] * tau
             out[i] = level[i] + slope[i] * s - lag + (omega[i] - level[i] + lag) * fade
     else:
@@ -68,18 +77,21 @@ def rotor_speed(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: fl
 
 
 @kernel
-def load_input(drive: Drive, goal: FloatArray, level: FloatArray, slope: FloatArray, memory: FloatArray) -> None:
+def load_input(
+    drive: Drive, goal: FloatArray, boost: float, level: FloatArray, slope: FloatArray, memory: FloatArray
+) -> None:
     """Starts a new piece of input towards a command that has just reached the rotors.
 
     Args:
         drive: lag, ramp, limits.
         goal: the command [rad/s], shape (n,).
+        boost: factor of the supply voltage on it.
         level: present input on entry, input at the start of the piece on return [rad/s].
         slope: rate of the input [rad/s^2]; written.
         memory: +1 or -1, direction of the last change, shape (n,); written.
     """
     for i in range(goal.shape[0]):
-        target = goal[i]
+        target = boost * goal[i]
         if drive.grain > 0.0:
             target = np.rint(target / drive.grain) * drive.grain
         if drive.knee > 0.0 and target > drive.knee:
@@ -104,15 +116,18 @@ def limit_slew(drive: Drive, omega: FloatArray, level: FloatArray, slope: FloatA
 
 
 @kernel
-def spin_up_torque(omega: FloatArray, level: FloatArray, slope: FloatArray, tau: float, s: float, body: Body) -> float:
+def spin_up_torque(
+    omega: FloatArray, level: FloatArray, slope: FloatArray, drive: Drive, s: float, body: Body
+) -> float:
     """Torque J dOmega_r/dt [N m] at time s of a piece, where the speeds are `omega`; zero when J is zero."""
     if body.spin_up == 0.0:
         return 0.0
     rate = 0.0
     for i in range(omega.shape[0]):
         change = slope[i]
-        if tau > 0.0:
-            change = (level[i] + slope[i] * s - omega[i]) / tau
+        if drive.tau > 0.0:
+            behind = level[i] + slope[i] * s - omega[i]
+            change = behind / (drive.tau if behind >= 0.0 else drive.tau_down)
         rate += body.spins[i] * change
     return body.spin_up * rate
 
@@ -158,11 +173,11 @@ def advance(
     states = STATES if odd.dynamic else RIGID_STATES
     total, k, probe, wrench = work[0], work[1], work[2], work[3]
     speed = work[4, :rotors]
-    tau = drive.tau
+    lags = drive
     if drive.slew > 0.0:
         limit_slew(drive, omega, level, slope, h)
-        tau = 0.0
-    steady = tau == 0.0 and drive.ramp == 0.0 and drive.slew == 0.0
+        lags = WITHOUT_LAG
+    steady = lags.tau == 0.0 and drive.ramp == 0.0 and drive.slew == 0.0
     for i in range(states):
         total[i] = 0.0
         probe[i] = y[i]
@@ -170,10 +185,10 @@ def advance(
     for stage in range(4):
         s = 0.5 * h * ((stage + 1) // 2)
         if stage == 0 or (stage != 2 and not steady):
-            rotor_speed(omega, level, slope, tau, s, speed)
-            rotor_wrench(speed, efficiency, body, wrench)
-            wrench[6] = spin_up_torque(speed, level, slope, tau, s, body)
-        derivative(probe, wrench, powers[(stage + 1) // 2], mass_factor, changed, push, body, air, odd, k)
+            rotor_speed(omega, level, slope, lags, s, speed)
+            rotor_wrench(speed, efficiency, changed, body, wrench)
+            wrench[6] = spin_up_torque(speed, level, slope, lags, s, body)
+        derivative(probe, speed, wrench, powers[(stage + 1) // 2], mass_factor, changed, push, body, air, odd, k)
         weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
         reach = h if stage == 2 else 0.5 * h
         for i in range(states):
@@ -205,6 +220,7 @@ def spin_up_kick(y: FloatArray, jump: float, changed: int, body: Body) -> None:
     y[15] += d_p
     y[16] += d_q
     y[17] += d_r
-    y[18] += d_q * body.imu[2] - d_r * body.imu[1]
-    y[19] += d_r * body.imu[0] - d_p * body.imu[2]
-    y[20] += d_p * body.imu[1] - d_q * body.imu[0]
+    x, z = body.imu[changed, 0], body.imu[changed, 2]
+    y[18] += d_q * z - d_r * body.imu[changed, 1]
+    y[19] += d_r * x - d_p * z
+    y[20] += d_p * body.imu[changed, 1] - d_q * x

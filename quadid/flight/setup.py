@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS, known_keys, rotor_losses
+from quadid.effects import EFFECTS, known_keys, rotor_drag_losses, rotor_losses
 from quadid.errors import ParameterError, nearest
 from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.loop import NO_TIME, Events, OnBoard
 from quadid.flight.rotors import Drive
 from quadid.flight.truth import TruthParameters
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]
 Effects = Mapping[str, Mapping[str, float]]
@@ -46,9 +46,10 @@ def check_effects(effects: Effects, rotors: int) -> dict[str, dict[str, float]]:
                 raise ParameterError(f"effect '{name}' has no parameter '{key}'", ", ".join(known), nearest(key, known))
             if np.isnan(value):
                 raise ParameterError(f"{name}.{key} is not a number", "a number")
-        values = {p.name: p.neutral for p in EFFECTS[name].parameters} | {k: float(v) for k, v in given.items()}
+        values = {p.name: p.neutral for p in EFFECTS[name].parameters if not p.beside}
+        values |= {k: float(v) for k, v in given.items()}
         for key, value in values.items():
-            p = EFFECTS[name].parameter("loss" if key.startswith("loss_") else key)
+            p = EFFECTS[name].parameter(key.rstrip("0123456789").rstrip("_"))
             if value != p.neutral and not p.lower <= value <= p.upper:
                 raise ParameterError(f"{name}.{key} = {value:g} {p.unit}", f"{p.lower:g} to {p.upper:g}")
         complete[name] = values
@@ -66,6 +67,7 @@ class Setup:
         body, air, odd, drive, events, on_board: constants of the kernel.
         efficiency: factors on thrust and drag torque of each rotor, shape (rotors, 2).
         delay: delay from command to rotor [s].
+        reading_delay: by which logged rotor speeds come late [s].
         imu_cutoff: Butterworth cut-off in the IMU's telemetry path [Hz]; infinite for none.
         attitude_delay: of the attitude's telemetry path [s].
     """
@@ -80,6 +82,7 @@ class Setup:
     on_board: OnBoard
     efficiency: FloatArray
     delay: float
+    reading_delay: float
     imu_cutoff: float
     attitude_delay: float
     odd: Oddity = field(default_factory=Oddity)
@@ -117,9 +120,9 @@ class _Lookup:
         return np.array([self(effect, name) for name in names.split()])
 
 
-def _tensor(truth: TruthParameters, value: _Lookup, extra: float) -> FloatArray:
+def _tensor(truth: TruthParameters, value: _Lookup, extra: FloatArray) -> FloatArray:
     j_xy, j_xz, j_yz = value.vector("product_of_inertia", "J_xy J_xz J_yz")
-    tensor = np.diag([truth.J_xx + extra, truth.J_yy + extra, truth.J_zz])
+    tensor = np.diag(np.array([truth.J_xx, truth.J_yy, truth.J_zz]) + extra)
     tensor[0, 1] = tensor[1, 0] = -j_xy
     tensor[0, 2] = tensor[2, 0] = -j_xz
     tensor[1, 2] = tensor[2, 1] = -j_yz
@@ -128,28 +131,42 @@ def _tensor(truth: TruthParameters, value: _Lookup, extra: float) -> FloatArray:
     return tensor
 
 
+def _hover_speed(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> float:
+    """Rotor speed [rad/s] at which the thrust curve carries the weight."""
+    each = truth.mass * GRAVITY / len(vehicle.rotors) - value("thrust_curve", "offset")
+    speed = float(np.sqrt(max(each, 0.0) / truth.b)) + value("thrust_curve", "dead_speed")
+    if speed <= 0.0:
+        raise ParameterError(f"thrust_curve: hovers at {speed:.3g} rad/s", "a positive speed", "a smaller dead_speed")
+    return speed
+
+
 def _body(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Body:
     cg = np.array([value("cg_offset", "x"), value("cg_offset", "y"), 0.0])
+    later = cg + np.array([value("mass_change", "x"), value("mass_change", "y"), 0.0])
     payload = truth.mass * value("mass_change", "fraction") * truth.payload_arm**2
-    inertia = np.stack([_tensor(truth, value, 0.0), _tensor(truth, value, payload)])
+    grown = np.array([getattr(truth, key) * value("mass_change", key) for key in ("J_xx", "J_yy", "J_zz")])
+    inertia = np.stack([_tensor(truth, value, np.zeros(3)), _tensor(truth, value, grown + [payload, payload, 0.0])])
+    at, imu = vehicle.rotor_positions, value.vector("imu_lever_arm", "x y z")
     return Body(
         mass=truth.mass,
         inertia=inertia,
         inverse=np.ascontiguousarray(np.linalg.inv(inertia)),
         rotor_inertia=truth.J_r,
         spin_up=value("rotor_spin_up", "J"),
-        arms=np.ascontiguousarray(vehicle.rotor_positions - cg),
+        arms=np.stack([at - cg, at - later]),
         spins=vehicle.spins,
         b=truth.b,
         d=truth.d,
         dead_speed=value("thrust_curve", "dead_speed"),
-        centre=-cg,
-        imu=value.vector("imu_lever_arm", "x y z") - cg,
+        offset=value("thrust_curve", "offset"),
+        growth=value("drag_torque_curve", "growth"),
+        imu=np.stack([imu - cg, imu - later]),
+        coupling=1.0 - value("no_gyroscopic_coupling", "share"),
+        hover_speed=_hover_speed(vehicle, truth, value),
     )
 
 
 def _air(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Air:
-    n = len(vehicle.rotors)
     return Air(
         drag_x=value("rotor_drag", "k_x"),
         drag_y=value("rotor_drag", "k_y"),
@@ -158,11 +175,12 @@ def _air(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Air:
         moment_y=value("rotor_drag_moment", "h_y"),
         damping_p=value("rate_damping", "l_p"),
         damping_q=value("rate_damping", "m_q"),
+        damping_r=value("rate_damping", "n_r"),
         axial=value("axial_inflow", "k_z"),
         wind_north=value("wind", "north"),
         wind_east=value("wind", "east"),
         ground_radius=value("ground_effect", "radius_scale") * propeller_radius(vehicle),
-        hover_sum=n * truth.hover_speed(n),
+        hover_sum=len(vehicle.rotors) * _hover_speed(vehicle, truth, value),
     )
 
 
@@ -179,6 +197,7 @@ def _events(value: _Lookup, last: float) -> Events:
         sag_fraction=value("battery_sag", "fraction"),
         sag_start=0.0,
         sag_end=max(last, 1e-9),
+        supply_exponent=value("supply_voltage", "exponent"),
         faint_rotor=-1,
         faint_share=0.0,
         faint_times=np.zeros((0, 2)),
@@ -208,8 +227,9 @@ def prepare(
     n = len(vehicle.rotors)
     complete = check_effects(effects, n)
     value = _Lookup(complete)
-    losses = rotor_losses(complete.get("weak_rotor", {}), n)
-    efficiency = np.repeat(1.0 - np.array(losses)[:, None], 2, axis=1)
+    lag = complete.get("motor_lag", {})
+    weak = complete.get("weak_rotor", {})
+    efficiency = 1.0 - np.column_stack([rotor_losses(weak, n), rotor_drag_losses(weak, n)])
     mounting = small_rotation(value.vector("imu_misalignment", "x y z"))
     on_board = OnBoard(
         gyro_matrix=np.ascontiguousarray(np.diag(1.0 + value.vector("gyro_scale", "x y z")) @ mounting),
@@ -227,11 +247,12 @@ def prepare(
         effects=complete,
         body=_body(vehicle, truth, value),
         air=_air(vehicle, truth, value),
-        drive=Drive(tau=value("motor_lag", "tau"), ramp=ramp),
+        drive=Drive(tau=lag.get("tau", 0.0), tau_down=lag.get("tau_down", lag.get("tau", 0.0)), ramp=ramp),
         events=_events(value, last),
         on_board=on_board,
         efficiency=efficiency,
         delay=value("command_delay", "delay"),
+        reading_delay=value("rotor_telemetry_delay", "delay"),
         imu_cutoff=value("imu_lag", "cutoff"),
         attitude_delay=value("attitude_delay", "delay"),
     )

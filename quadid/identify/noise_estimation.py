@@ -13,7 +13,7 @@ from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
-from quadid.model.layout import LOSS, Layout
+from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.window import Window
 
@@ -76,7 +76,7 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
     effects = [e for e in EFFECTS.values() if e.flexible in kinds]
     out = [*NOMINAL_NAMES, *(n for e in effects for n in e.entries)]
-    losses = [n for n, e in layout.entries.items() if e.index >= LOSS]
+    losses = [n for n in layout.entries if n.startswith("weak_rotor.loss_")]
     return out + losses[1:]
 
 

@@ -17,11 +17,11 @@ from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_GROUND, C_HOVER, C_HX, C_HY,
-    C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX,
-    C_KY, C_KZ, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY, C_RZ, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY,
-    L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY,
-    X_QZ, X_R, X_VD, X_VE, X_VN,
+    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
+    C_CGX, C_CGY, C_CPAR, C_D, C_GROUND, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR,
+    C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY,
+    C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E,
+    X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -30,19 +30,26 @@ from quadid.model.simd import LANES, inlined, jit, lane_kernel
 FloatArray = NDArray[np.float64]
 
 
-def _body_of(air: bool, solid: bool, rare: bool) -> Any:
+@nb.njit(**inlined)
+def _at(row, wa, wb, lane, s):  # type: ignore[no-untyped-def]
+    """A moment at one stage of a step, linear in time through its means over both halves."""
+    return wa * s[row + lane] + wb * s[row + HALF + lane]
+
+
+def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
     """Right-hand side of `_step_of`: angular acceleration, specific force at the IMU, acceleration in NED."""
 
     @nb.njit(**inlined)
-    def body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, s1, o1, do, g, im, lift, lane, s):  # type: ignore[no-untyped-def]
-        b, m = s[C_B + lane], s[C_MASS + lane]
+    def body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, o1, do, g, im, lift, wa, wb, lane, s):  # type: ignore[no-untyped-def]
+        b = s[C_B + lane]
         if solid:
             b *= g
         if rare:
             b *= lift
         # Specific force of the unloaded mass; im scales all of it when mass is taken up.
         thrust = b * s2
-        sx, sy, hx, hy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        sx, sy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0
+        fx, fy, fz, mx, my, mz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if air:
             # Velocity relative to the air, in body axes.  This form of the rotation matrix keeps the heading of the
             # world's axes out of the motion even at the inner stages, where the quaternion is not of unit length.
@@ -54,11 +61,25 @@ def _body_of(air: bool, solid: bool, rare: bool) -> Any:
             u = r00 * rn + r10 * re + r20 * rd
             v = r01 * rn + r11 * re + r21 * rd
             w = r02 * rn + r12 * re + r22 * rd
-            share = s1 * s[C_HOVER + lane]
-            thrust += m * s[C_KZ + lane] * w * share
-            hx, hy = -s[C_KX + lane] * u * share, -s[C_KY + lane] * v * share
-            sx, sy = hx, hy
-        sz = -thrust * s[C_INVM + lane]
+        if hub:
+            # Air at each hub, v + nu x r_i: sums over rotors of omega_i times products of their places, about the
+            # middle of the hubs at (cx, cy, cz) from the CG.
+            cx, cy, cz = 0.0, 0.0, s[C_HUB + lane]
+            if solid:
+                cx, cy = -s[C_CGX + lane], -s[C_CGY + lane]
+            u1, v1, w1 = u + q * cz - r * cy, v + r * cx - p * cz, w + p * cy - q * cx
+            kx, ky, kz = s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane]
+            o, ox = _at(A_S1, wa, wb, lane, s), _at(A_X1, wa, wb, lane, s)
+            oy, oz = _at(A_Y1, wa, wb, lane, s), _at(A_Z1, wa, wb, lane, s)
+            xx, yy, zz = _at(A_XX, wa, wb, lane, s), _at(A_YY, wa, wb, lane, s), _at(A_ZZ, wa, wb, lane, s)
+            xy, xz, yz = _at(A_XY, wa, wb, lane, s), _at(A_XZ, wa, wb, lane, s), _at(A_YZ, wa, wb, lane, s)
+            fx, fy = -kx * (u1 * o + q * oz - r * oy), -ky * (v1 * o + r * ox - p * oz)
+            fz = -kz * (w1 * o + p * oy - q * ox)
+            mx = ky * (v1 * oz + r * xz - p * zz) - kz * (w1 * oy + p * yy - q * xy) + cy * fz - cz * fy
+            my = kz * (w1 * ox + p * xy - q * xx) - kx * (u1 * oz + q * zz - r * yz) + cz * fx - cx * fz
+            mz = kx * (u1 * oy + q * yz - r * yy) - ky * (v1 * ox + r * xx - p * xz) + cx * fy - cy * fx
+            sx, sy = fx * s[C_INVM + lane], fy * s[C_INVM + lane]
+        sz = (fz - thrust) * s[C_INVM + lane]
         if rare:
             speed = s[C_CPAR + lane] * math.sqrt(u * u + v * v + w * w)
             sx, sy, sz = (
@@ -75,45 +96,47 @@ def _body_of(air: bool, solid: bool, rare: bool) -> Any:
         jr, d = s[C_JR + lane] * o1, s[C_D + lane]
         jxx, jyy, jzz = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane]
         if not solid:
-            ap = s[C_IXX + lane] * (jr * q - b * y2 - (jzz - jyy) * q * r)
-            aq = s[C_IYY + lane] * (b * x2 - jr * p - (jxx - jzz) * p * r)
-            ar = s[C_IZZ + lane] * (d * z2 - (jyy - jxx) * p * q)
+            ap = s[C_IXX + lane] * (jr * q - b * y2 + mx - (jzz - jyy) * q * r)
+            aq = s[C_IYY + lane] * (b * x2 + my - jr * p - (jxx - jzz) * p * r)
+            ar = s[C_IZZ + lane] * (d * z2 + mz - (jyy - jxx) * p * q)
             return ap, aq, ar, an, ae, ad, sx, sy, sz
-        tx = -b * y2 + s[C_CGY + lane] * thrust + m * s[C_HY + lane] * hy + jr * q
-        ty = b * x2 - s[C_CGX + lane] * thrust - m * s[C_HX + lane] * hx - jr * p
-        tz = d * g * z2 + s[C_JSPIN + lane] * do
+        tx = -b * y2 + s[C_CGY + lane] * thrust + mx + s[C_HY + lane] * fy + jr * q
+        ty = b * x2 - s[C_CGX + lane] * thrust + my - s[C_HX + lane] * fx - jr * p
+        tz = d * g * z2 + mz + s[C_JSPIN + lane] * do
         if rare:
             tx, ty, tz = tx + s[L_MX + lane], ty + s[L_MY + lane], tz + s[L_MZ + lane]
         jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
         lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
-        tx -= q * lz - r * ly
-        ty -= r * lx - p * lz
-        tz -= p * ly - q * lx
+        turning = s[C_TURNING + lane]
+        tx -= turning * (q * lz - r * ly)
+        ty -= turning * (r * lx - p * lz)
+        tz -= turning * (p * ly - q * lx)
         ap = s[C_IXX + lane] * tx + s[C_IXY + lane] * ty + s[C_IXZ + lane] * tz - s[C_LP + lane] * p
         aq = s[C_IXY + lane] * tx + s[C_IYY + lane] * ty + s[C_IYZ + lane] * tz - s[C_MQ + lane] * q
-        ar = s[C_IXZ + lane] * tx + s[C_IYZ + lane] * ty + s[C_IZZ + lane] * tz
+        ar = s[C_IXZ + lane] * tx + s[C_IYZ + lane] * ty + s[C_IZZ + lane] * tz - s[C_NR + lane] * r
         # Specific force where the IMU sits: rigid-body acceleration of a point at (rx, ry, rz) from the CG.
         rx, ry, rz = s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane]
         dot = p * rx + q * ry + r * rz
         sq = p * p + q * q + r * r
-        fx = sx + aq * rz - ar * ry + p * dot - rx * sq
-        fy = sy + ar * rx - ap * rz + q * dot - ry * sq
-        fz = sz + ap * ry - aq * rx + r * dot - rz * sq
-        return ap, aq, ar, an, ae, ad, fx, fy, fz
+        sx += aq * rz - ar * ry + p * dot - rx * sq
+        sy += ar * rx - ap * rz + q * dot - ry * sq
+        sz += ap * ry - aq * rx + r * dot - rz * sq
+        return ap, aq, ar, an, ae, ad, sx, sy, sz
 
     return body
 
 
-def _step_of(air: bool, solid: bool, rare: bool) -> Any:
+def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
     """Compiles a step for a group of effects: a branch on these constants leaves nothing behind.
 
     Args:
-        air: velocity, position, and what moving air does: rotor drag, axial inflow.
+        air: velocity and position.
+        hub: what moving air does at each rotor: drag in its plane, axial inflow; needs `air`.
         solid: products of inertia, centre of gravity, lever arm, damping, spin-up, moment of drag, thrust and mass that
             change in flight.
         rare: parasitic drag and ground effect, for their roots and divisions; needs `air`.
     """
-    body = _body_of(air, solid, rare)
+    body = _body_of(air, hub, solid, rare)
 
     @nb.njit(**jit)
     def step(dt: float, s: FloatArray) -> None:
@@ -124,7 +147,6 @@ def _step_of(air: bool, solid: bool, rare: bool) -> Any:
             x2a, x2b = s[A_X2 + lane], s[A_X2 + HALF + lane]
             y2a, y2b = s[A_Y2 + lane], s[A_Y2 + HALF + lane]
             z2a, z2b = s[A_Z2 + lane], s[A_Z2 + HALF + lane]
-            s1a, s1b = s[A_S1 + lane], s[A_S1 + HALF + lane]
             o1a, o1b = s[A_O1 + lane], s[A_O1 + HALF + lane]
             doa, dob = s[A_DO + lane], s[A_DO + HALF + lane]
             ga, gb = s[A_G + lane], s[A_G + HALF + lane]
@@ -143,27 +165,27 @@ def _step_of(air: bool, solid: bool, rare: bool) -> Any:
             a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = body(
                 qw, qx, qy, qz, p, q, r, vn, ve, vd,
                 1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b, 1.5 * z2a - 0.5 * z2b,
-                1.5 * s1a - 0.5 * s1b, 1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, 1.5 * ga - 0.5 * gb,
-                1.5 * ma - 0.5 * mb, lift, lane, s,
+                1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, 1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift,
+                1.5, -0.5, lane, s,
             )  # fmt: skip
             k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
             # stage 2
             s2, x2, y2, z2 = 0.5 * (s2a + s2b), 0.5 * (x2a + x2b), 0.5 * (y2a + y2b), 0.5 * (z2a + z2b)
-            s1, o1, do = 0.5 * (s1a + s1b), 0.5 * (o1a + o1b), 0.5 * (doa + dob)
+            o1, do = 0.5 * (o1a + o1b), 0.5 * (doa + dob)
             g, im = 0.5 * (ga + gb), 0.5 * (ma + mb)
             p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
             a, b, c, d = qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z
             a2x, a2y, a2z, n2, e2, d2, f2x, f2y, f2z = body(
-                a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1, s2, x2, y2, z2, s1, o1, do, g, im,
-                lift, lane, s,
+                a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1, s2, x2, y2, z2, o1, do, g, im, lift,
+                0.5, 0.5, lane, s,
             )  # fmt: skip
             k2w, k2x, k2y, k2z = rotation_rate(a, b, c, d, p2, q2, r2)
             # stage 3
             p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
             a, b, c, d = qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z
             a3x, a3y, a3z, n3, e3, d3, f3x, f3y, f3z = body(
-                a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2, s2, x2, y2, z2, s1, o1, do, g, im,
-                lift, lane, s,
+                a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2, s2, x2, y2, z2, o1, do, g, im, lift,
+                0.5, 0.5, lane, s,
             )  # fmt: skip
             k3w, k3x, k3y, k3z = rotation_rate(a, b, c, d, p3, q3, r3)
             # stage 4
@@ -172,8 +194,8 @@ def _step_of(air: bool, solid: bool, rare: bool) -> Any:
             a4x, a4y, a4z, n4, e4, d4, f4x, f4y, f4z = body(
                 a, b, c, d, p4, q4, r4, vn + dt * n3, ve + dt * e3, vd + dt * d3,
                 1.5 * s2b - 0.5 * s2a, 1.5 * x2b - 0.5 * x2a, 1.5 * y2b - 0.5 * y2a, 1.5 * z2b - 0.5 * z2a,
-                1.5 * s1b - 0.5 * s1a, 1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga,
-                1.5 * mb - 0.5 * ma, lift, lane, s,
+                1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga, 1.5 * mb - 0.5 * ma, lift,
+                -0.5, 1.5, lane, s,
             )  # fmt: skip
             k4w, k4x, k4y, k4z = rotation_rate(a, b, c, d, p4, q4, r4)
             sixth = dt / 6.0
@@ -207,13 +229,17 @@ def _step_of(air: bool, solid: bool, rare: bool) -> Any:
     return step
 
 
-step_solid = _step_of(False, True, False)
+step_solid = _step_of(False, False, True, False)
 """One step of attitude and rate with what acts on the body without regard to velocity; arguments as `step_core`."""
-step_air = _step_of(True, False, False)
-"""One step of attitude, rate, velocity and position with rotor drag, axial inflow, wind."""
-step_air_rare = _step_of(True, False, True)
-"""... and with parasitic drag and ground effect."""
-step_air_solid = _step_of(True, True, False)
+step_air = _step_of(True, False, False, False)
+"""One step of attitude, rate, velocity and position."""
+step_air_solid = _step_of(True, False, True, False)
+"""Both together."""
+step_hub = _step_of(True, True, False, False)
+"""... of velocity too, with rotor drag, axial inflow, wind."""
+step_hub_solid = _step_of(True, True, True, False)
 """One step with all effects but parasitic drag and ground effect."""
-step_full = _step_of(True, True, True)
+step_rare = _step_of(True, True, False, True)
+"""One step of velocity with all that moving air does."""
+step_full = _step_of(True, True, True, True)
 """One step with every effect."""

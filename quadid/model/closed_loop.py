@@ -16,7 +16,6 @@ from quadid.model.layout import residual_terms
 from quadid.model.needs_kernel import needs_of
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
-from quadid.model.rollout_kernel import Flight
 from quadid.model.simd import LANES, aligned
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -67,7 +66,7 @@ class ClosedLoop:
         self._geometry, self._terms, self._gains = rollout.geometry, residual_terms(vehicle), pack_gains(gains)
         self._mixer = mixer_matrix(vehicle, gains)
         self._references = np.ascontiguousarray(window.attitude_reference)
-        self._flight = Flight(rollout.mass, rollout.reach, window.t0, window.dt, *window.log_span)
+        self._flight = rollout.flight
         self._x0 = rollout.initial_states(Segments(1, 1, np.array([1], dtype=np.int64)), 1)[0]
 
     def fly(self, theta: FloatArray) -> Flown:

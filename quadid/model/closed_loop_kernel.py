@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model.body_kernel import step_full
-from quadid.model.kernel import body_constants, flight_factors, step_core
+from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core
+from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
-from quadid.model.rollout_kernel import Flight
-from quadid.model.rotor_kernel import rotor_constants, turn_delayed
+from quadid.model.rotor_kernel import input_constants, turn_rotor
 
 # isort: off
 from quadid.model.rows import (
-    A_G, A_S2, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NOW, R_PAST, R_SPEED, ROTOR,
+    A_G, A_S2, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NEXT, R_NOW, R_PAST, R_SPEED, ROTOR,
     S_FX, S_P, S_QW, X_P, X_QW,
 )  # fmt: skip
 from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
@@ -58,16 +58,17 @@ def _see(lane: int, tilted: bool, s: FloatArray, attitude: FloatArray, rate: Flo
 
 
 @nb.njit(**jit)
-def _rotors(step: int, geometry: FloatArray, dt: float, sent: FloatArray, rot: FloatArray, s: FloatArray) -> None:
+def _rotors(
+    step: int, need: Needs, geometry: FloatArray, dt: float, sent: FloatArray, rot: FloatArray, s: FloatArray
+) -> None:
     """Advances all rotors over one step of the stabiliser, from the commands each lane has sent."""
-    inv = 2.0 / dt
     for r in range(len(geometry)):
         for lane in range(LANES):
             shift = min(int(s[C_SHIFT + lane]), HISTORY - 2)
             rot[r, R_NOW + lane] = sent[(step - shift) % HISTORY, r, lane]
             rot[r, R_PAST + lane] = sent[(step - shift - 1) % HISTORY, r, lane]
-        keep = 0.0 if r == 0 else 1.0
-        turn_delayed(geometry[r, 0], geometry[r, 1], geometry[r, 2], r, inv, keep, rot, s)
+            rot[r, R_NEXT + lane] = rot[r, R_NOW + lane]
+        turn_rotor(False, 0.0, r, True, False, geometry, dt, need, rot, s)
 
 
 @nb.njit(**jit)
@@ -82,8 +83,8 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
 @nb.njit(**allocating)
 def _fly(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-    flight: Flight, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray, terms: NDArray[np.int64],
-    coefficients: FloatArray, signals: FloatArray,
+    flight: Flight, theta: FloatArray, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray,
+    terms: NDArray[np.int64], coefficients: FloatArray, signals: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over rows and steps of `fly_closed_loop`, with its work space."""
     rotors, dt = len(geometry), flight.dt / substeps
@@ -108,12 +109,14 @@ def _fly(
             if step == 0:  # as if the first command had acted for ever
                 sent[1:] = sent[0]
                 rot[:, R_SPEED : R_SPEED + LANES] = sent[0]
-            _rotors(step, geometry, dt, sent, rot, s)
+            _rotors(step, need, geometry, dt, sent, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
             if need.learned:
                 residual_signals(s, signals)
                 residual_forces(terms, coefficients, signals, step == 0, s)
+            if need.payload:
+                load_payload(flight.t0 + dt * step, dt, theta, s)
             if need.full:
                 step_full(dt, s)
             else:
@@ -153,7 +156,7 @@ def _fly_closed_loop(
         mixer: see `quadid.attitude_controller.mixer_matrix`.
         substeps: runs of the stabiliser a row.
         lanes: how many of the block's lanes are wanted.
-        geometry: (rotors, 3): x, y [m], spin.
+        geometry: (rotors, 4), see `rotor_kernel.Drive`.
         terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
         flight: numbers of the window.
         theta: parameter vectors (LANES, size).
@@ -169,16 +172,20 @@ def _fly_closed_loop(
     s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
     rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
     rot[:] = 0.0
-    body_constants(theta, flight.mass, rotors, flight.reach, s)
+    body_constants(theta, flight, rotors, s)
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
+    input_constants(theta, s)
     for i in range(N_STATE):
         s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
     s[E_QW : E_QW + LANES] = 1.0
     coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
     signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
     residual_coefficients(theta, rotors, coefficients)
-    _fly(references, gains, mixer, substeps, lanes, geometry, flight, need, out, s, rot, terms, coefficients, signals)
+    _fly(
+        references, gains, mixer, substeps, lanes, geometry, flight, theta, need, out, s, rot, terms, coefficients,
+        signals,
+    )  # fmt: skip
 
 
 def _on_disk(sources: int) -> Any:

@@ -18,20 +18,29 @@ Nominal
     ======================================================================================  ========================
 
 Rotors
-    motor_lag           tau omega' = u - omega: first-order response to the input.  Bouabdallah 2007, thesis EPFL 3727.
+    motor_lag           tau omega' = u - omega: first-order response to the input; tau_down where omega > u.
+                        Bouabdallah 2007, thesis EPFL 3727.
     command_delay       u(t) = command(t - delay): held commands switch, measured speeds bend, within a sample.
-    thrust_curve        f_i = b (omega_i - dead_speed)^2; the drag torque keeps omega_i^2.
-    weak_rotor          f_i and tau_i of that rotor times 1 - loss.
+    rotor_telemetry_delay
+                        u(t) = reading(t + delay).
+    supply_voltage      u = command (V / V_ref)^exponent, V linear between its readings.
+    thrust_curve        f_i = b (omega_i - dead_speed)^2 + offset; the drag torque keeps omega_i^2.
+    drag_torque_curve   tau_i = d omega_i^2 (1 + growth (omega_i / omega_h - 1)).
+    weak_rotor          f_i times 1 - loss, tau_i times 1 - drag_loss, which is loss unless it is given.
     rotor_spin_up       tau_z += J Omega_r': the rotors' angular momentum is -J Omega_r z, its change acts back.
 
-Air
-    rotor_drag          force (-m k_x u, -m k_y v, 0) sum omega_i / sum omega_h.  Martin & Salaun 2010,
+Air at each hub: (u_i, v_i, w_i) = (u, v, w) + nu x r_i, r_i from the CG to the hub, heights included
+    rotor_drag          force -(m / N) (k_x u_i, k_y v_i, 0) omega_i / omega_h at the hub.  Martin & Salaun 2010,
                         doi:10.1109/ROBOT.2010.5509980; Faessler et al. 2018, doi:10.1109/LRA.2017.2776353.
-    rotor_drag_moment   that force acts at height h above the CG: tau_x += h_y F_y, tau_y -= h_x F_x.
+    axial_inflow        force -(m / N) k_z (0, 0, w_i) omega_i / omega_h at the hub: what momentum theory takes from
+                        thrust in climb, to first order.
+                        Both with moment r_i x force; omega_h carries the weight: b (omega_h - dead_speed)^2 + offset.
+    rotor_drag_moment   the force in the rotor plane acts h above the hub: tau_x += h_y F_y, tau_y -= h_x F_x (blade
+                        flapping).  Mahony, Kumar & Corke 2012, doi:10.1109/MRA.2012.2206474.
+
+Air at the CG
     parasitic_drag      force -m c |(u, v, w)| (u, v, w).
-    axial_inflow        thrust -m k_z (climb speed -w) sum omega_i / sum omega_h: what momentum theory takes
-                        from thrust in climb, to first order; acts at the geometric centre.
-    rate_damping        p' -= l_p p,  q' -= m_q q.
+    rate_damping        p' -= l_p p,  q' -= m_q q,  r' -= n_r r, beyond what the hubs give.
     wind                (north, east, 0), subtracted from v wherever the air matters.
     ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z in
                         mid-step, at least half the scaled radius; a negative scale lowers thrust.  Cheeseman &
@@ -40,7 +49,10 @@ Air
 Body
     cg_offset           arms and IMU are measured from the CG at (x, y, 0).
     product_of_inertia  J has -J_xy, -J_xz, -J_yz off its diagonal.
-    mass_change         from its time on specific forces are divided by 1 + fraction; J stays.
+    no_gyroscopic_coupling
+                        nu x J nu times 1 - share: a simulator without it.
+    mass_change         from its time on specific forces are divided by 1 + fraction, J_xx, J_yy, J_zz times 1 + their
+                        fraction, the CG moves by (x, y).
     thrust_drop         from its time on f_i and tau_i times 1 - fraction; within a half step in proportion.
     battery_sag         f_i and tau_i times 1 - fraction (t - t_first) / (t_last - t_first) of the whole log.
 

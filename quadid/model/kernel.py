@@ -12,21 +12,23 @@ Here is the nominal step; effects on the body are in `quadid.model.body_kernel`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
+from quadid.model.layout import places
 
 # isort: off
 from quadid.model.rows import (
-    A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP,
-    C_DROP_TIME, C_GROUND, C_HOVER, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX,
-    C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_RX, C_RY,
-    C_RZ, C_SAG, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY,
-    S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
-    X_R,
+    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_D, C_DROP, C_DROP_TIME,
+    C_GROUND, C_HOVER, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX,
+    C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR,
+    C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF,
+    N_STATE, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW,
+    X_QX, X_QY, X_QZ, X_R,
 )  # fmt: skip
 
 # isort: on
@@ -37,41 +39,83 @@ __all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", 
 FloatArray = NDArray[np.float64]
 
 GRAVITY = 9.80665
+SLOWEST_HOVER = 0.1
+"""Least speed in hover, as a share of what a thrust without dead speed gives: a curve that is nearly straight has none
+of its own."""
+(UNCOUPLED,) = places("no_gyroscopic_coupling")
+OFFSET = places("thrust_curve.offset")[0]
+LOAD_XX, LOAD_YY, LOAD_ZZ, LOAD_X, LOAD_Y = places(*(f"mass_change.{k}" for k in ("J_xx", "J_yy", "J_zz", "x", "y")))
 TWELFTH = 1.0 / 12.0
 
 
+class Flight(NamedTuple):
+    """Numbers of one window.
+
+    Attributes:
+        mass: of the vehicle [kg].
+        reach: half the smallest distance between rotors [m], scales ground effect.
+        hub: mean z of the hubs [m].
+        t0, dt: of the grid [s].
+        span0, span1: first and last time of the log [s].
+    """
+
+    mass: float
+    reach: float
+    hub: float
+    t0: float
+    dt: float
+    span0: float
+    span1: float
+
+
+@nb.njit(**inlined)
+def _inertia(jxx, jyy, jzz, jxy, jxz, jyz, lane, s):  # type: ignore[no-untyped-def]
+    """Writes an inertia tensor and its inverse."""
+    det = jxx * (jyy * jzz - jyz * jyz) - jxy * (jxy * jzz - jyz * jxz) + jxz * (jxy * jyz - jyy * jxz)
+    s[C_IXX + lane] = (jyy * jzz - jyz * jyz) / det
+    s[C_IYY + lane] = (jxx * jzz - jxz * jxz) / det
+    s[C_IZZ + lane] = (jxx * jyy - jxy * jxy) / det
+    s[C_IXY + lane] = (jxz * jyz - jxy * jzz) / det
+    s[C_IXZ + lane] = (jxy * jyz - jxz * jyy) / det
+    s[C_IYZ + lane] = (jxy * jxz - jxx * jyz) / det
+    s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane] = jxx, jyy, jzz
+    s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane] = jxy, jxz, jyz
+
+
+@nb.njit(**inlined)
+def _hover_speed(th, weight):  # type: ignore[no-untyped-def]
+    """Speed at which a rotor carries its share of the weight [N]: b (omega - dead_speed)^2 + offset."""
+    b = abs(th[ix.B])
+    least = SLOWEST_HOVER * math.sqrt(weight / b)
+    return max(math.sqrt(max(weight - th[OFFSET], 0.0) / b) + th[ix.DEAD_SPEED], least)
+
+
 @nb.njit(**exact)
-def body_constants(theta: FloatArray, mass: float, rotors: int, reach: float, s: FloatArray) -> None:
+def body_constants(theta: FloatArray, flight: Flight, rotors: int, s: FloatArray) -> None:
     """Derives the body's constants of all lanes from their parameter vectors.
 
     Args:
         theta: shape (LANES, size), see `quadid.model.layout`.
-        mass: [kg].
+        flight: numbers of the window.
         rotors: number of rotors.
-        reach: half the smallest distance between rotors [m], scales ground effect.
         s: rows, written.
     """
     for lane in range(LANES):
         th = theta[lane]
-        jxx, jyy, jzz, jxy, jxz, jyz = th[ix.JXX], th[ix.JYY], th[ix.JZZ], -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ]
-        det = jxx * (jyy * jzz - jyz * jyz) - jxy * (jxy * jzz - jyz * jxz) + jxz * (jxy * jyz - jyy * jxz)
-        s[C_IXX + lane] = (jyy * jzz - jyz * jyz) / det
-        s[C_IYY + lane] = (jxx * jzz - jxz * jxz) / det
-        s[C_IZZ + lane] = (jxx * jyy - jxy * jxy) / det
-        s[C_IXY + lane] = (jxz * jyz - jxy * jzz) / det
-        s[C_IXZ + lane] = (jxy * jyz - jxz * jyy) / det
-        s[C_IYZ + lane] = (jxy * jxz - jxx * jyz) / det
-        s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane] = jxx, jyy, jzz
-        s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane] = jxy, jxz, jyz
+        _inertia(th[ix.JXX], th[ix.JYY], th[ix.JZZ], -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ], lane, s)
         s[C_B + lane], s[C_D + lane], s[C_JR + lane], s[C_JSPIN + lane] = th[ix.B], th[ix.D], th[ix.JR], th[ix.JSPIN]
-        s[C_INVM + lane], s[C_MASS + lane] = 1.0 / mass, mass
-        s[C_HOVER + lane] = 1.0 / (rotors * math.sqrt(mass * GRAVITY / (abs(th[ix.B]) * rotors)))
-        s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane], s[C_CPAR + lane] = th[ix.KX], th[ix.KY], th[ix.KZ], th[ix.CPAR]
-        s[C_HX + lane], s[C_HY + lane], s[C_LP + lane], s[C_MQ + lane] = th[ix.HX], th[ix.HY], th[ix.LP], th[ix.MQ]
+        s[C_INVM + lane], s[C_MASS + lane] = 1.0 / flight.mass, flight.mass
+        hover = 1.0 / (rotors * _hover_speed(th, flight.mass * GRAVITY / rotors))
+        s[C_HOVER + lane], s[C_HUB + lane] = hover, flight.hub
+        each = flight.mass * hover
+        s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane] = each * th[ix.KX], each * th[ix.KY], each * th[ix.KZ]
+        s[C_CPAR + lane], s[C_HX + lane], s[C_HY + lane] = th[ix.CPAR], th[ix.HX], th[ix.HY]
+        s[C_LP + lane], s[C_MQ + lane], s[C_NR + lane] = th[ix.LP], th[ix.MQ], th[ix.NR]
+        s[C_TURNING + lane] = 1.0 - th[UNCOUPLED]
         s[C_WN + lane], s[C_WE + lane] = th[ix.WN], th[ix.WE]
         s[C_CGX + lane], s[C_CGY + lane] = th[ix.CGX], th[ix.CGY]
         s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane] = th[ix.LAX] - th[ix.CGX], th[ix.LAY] - th[ix.CGY], th[ix.LAZ]
-        ground = th[ix.GROUND] * reach / 4.0
+        ground = th[ix.GROUND] * flight.reach / 4.0
         s[C_GROUND + lane], s[C_LOWEST + lane], s[C_SAG + lane] = ground * abs(ground), 2.0 * abs(ground), th[ix.SAG]
         s[C_DROP_TIME + lane], s[C_DROP + lane] = th[ix.DROP_TIME], th[ix.DROP_FRACTION]
         s[C_LOAD_TIME + lane], s[C_LOAD + lane] = th[ix.MASS_TIME], th[ix.MASS_FRACTION] / (1.0 + th[ix.MASS_FRACTION])
@@ -92,6 +136,20 @@ def flight_factors(t: float, span0: float, span1: float, dt: float, s: FloatArra
             loaded = min(max((ts + half - s[C_LOAD_TIME + lane]) * inv_half, 0.0), 1.0)
             s[A_G + h * HALF + lane] = (1.0 - s[C_SAG + lane] * mid) * (1.0 - s[C_DROP + lane] * dropped)
             s[A_M + h * HALF + lane] = 1.0 - loaded * s[C_LOAD + lane]
+
+
+@nb.njit(**exact)
+def load_payload(t: float, dt: float, theta: FloatArray, s: FloatArray) -> None:
+    """Writes inertia, centre of gravity and lever arm with the share of a payload that is there in the step from t."""
+    for lane in range(LANES):
+        th = theta[lane]
+        part = min(max((t + dt - s[C_LOAD_TIME + lane]) / dt, 0.0), 1.0)
+        _inertia(
+            th[ix.JXX] * (1.0 + part * th[LOAD_XX]), th[ix.JYY] * (1.0 + part * th[LOAD_YY]),
+            th[ix.JZZ] * (1.0 + part * th[LOAD_ZZ]), -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ], lane, s,
+        )  # fmt: skip
+        x, y = th[ix.CGX] + part * th[LOAD_X], th[ix.CGY] + part * th[LOAD_Y]
+        s[C_CGX + lane], s[C_CGY + lane], s[C_RX + lane], s[C_RY + lane] = x, y, th[ix.LAX] - x, th[ix.LAY] - y
 
 
 @nb.njit(**inlined)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, rotor_losses
+from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, parameter_of, rotor_drag_losses, rotor_losses
 from quadid.effects.kinds import Scale
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
@@ -28,7 +28,7 @@ _ENTRIES: tuple[tuple[str, Effect, EffectParameter], ...] = tuple(
 )
 _INDEX = {dotted: len(NOMINAL_NAMES) + i for i, (dotted, _, _) in enumerate(_ENTRIES)}
 LOSS = len(NOMINAL_NAMES) + len(_ENTRIES)
-"""Rotor i (from 0) has its loss at LOSS + i."""
+"""Rotor i (from 0) has its loss at LOSS + i, and at LOSS + rotors + i what its drag torque loses beyond."""
 
 
 def places(*effects: str) -> tuple[int, ...]:
@@ -36,21 +36,21 @@ def places(*effects: str) -> tuple[int, ...]:
     return tuple(i for e in effects for name, i in _INDEX.items() if e in (name, name.split(".")[0]))
 
 
-(TAU,) = places("motor_lag")
+(TAU,) = places("motor_lag.tau")
 (DELAY,) = places("command_delay")
 (IMU_PERIOD,) = places("imu_lag")
 (ATT_DELAY,) = places("attitude_delay")
 KX, KY = places("rotor_drag")
 (CPAR,) = places("parasitic_drag")
 HX, HY = places("rotor_drag_moment")
-LP, MQ = places("rate_damping")
+LP, MQ, NR = places("rate_damping")
 (KZ,) = places("axial_inflow")
 WN, WE = places("wind")
 CGX, CGY = places("cg_offset")
-MASS_TIME, MASS_FRACTION = places("mass_change")
+MASS_TIME, MASS_FRACTION, *_ = places("mass_change")
 DROP_TIME, DROP_FRACTION = places("thrust_drop")
 (SAG,) = places("battery_sag")
-(DEAD_SPEED,) = places("thrust_curve")
+(DEAD_SPEED,) = places("thrust_curve.dead_speed")
 JXY, JXZ, JYZ = places("product_of_inertia")
 (JSPIN,) = places("rotor_spin_up")
 GBX, GBY, GBZ = places("gyro_bias")
@@ -87,7 +87,7 @@ class Layout:
     def __init__(self, vehicle: Vehicle) -> None:
         """Lays out the vector for `vehicle`; its scale (arm, weight, inertia) sets bounds and typical sizes."""
         self.rotors = len(vehicle.rotors)
-        self.size = LOSS + self.rotors + len(vehicle.residual)
+        self.size = LOSS + 2 * self.rotors + len(vehicle.residual)
         scale = _scales(vehicle)
         entries: list[Entry] = []
         for index, name in enumerate(NOMINAL_NAMES):
@@ -97,23 +97,16 @@ class Layout:
             )
         for dotted, _, parameter in _ENTRIES:
             entries.append(_effect_entry(dotted, parameter, scale))
-        loss = EFFECTS["weak_rotor"].parameter("loss")
+        for k, key in enumerate(("loss", "drag_loss")):
+            p = EFFECTS["weak_rotor"].parameter(key)
+            entries.extend(
+                Entry(f"weak_rotor.{p.entry or key}_{i + 1}", LOSS + k * self.rotors + i, "", 0.0, p.lower, p.upper,
+                      p.typical) for i in range(self.rotors)
+            )  # fmt: skip
         entries.extend(
-            Entry(f"weak_rotor.loss_{i + 1}", LOSS + i, "", 0.0, loss.lower, loss.upper, loss.typical)
-            for i in range(self.rotors)
-        )
-        entries.extend(
-            Entry(
-                f"residual.{i + 1}",
-                LOSS + self.rotors + i,
-                term.unit,
-                0.0,
-                -math.inf,
-                math.inf,
-                term.typical(vehicle.mass * GRAVITY, vehicle.arm),
-            )
-            for i, term in enumerate(vehicle.residual)
-        )
+            Entry(f"residual.{i + 1}", LOSS + 2 * self.rotors + i, term.unit, 0.0, -math.inf, math.inf,
+                  term.typical(vehicle.mass * GRAVITY, vehicle.arm)) for i, term in enumerate(vehicle.residual)
+        )  # fmt: skip
         self.entries = {e.name: e for e in entries}
 
     def entry(self, name: str) -> Entry:
@@ -138,14 +131,18 @@ class Layout:
         theta = self.neutral()
         theta[: len(NOMINAL_NAMES)] = vehicle.initial
         self.write_effects(theta, vehicle.effects)
-        theta[LOSS + self.rotors :] = [term.value for term in vehicle.residual]
+        theta[LOSS + 2 * self.rotors :] = [term.value for term in vehicle.residual]
         return theta
 
     def write_effects(self, theta: FloatArray, effects: Mapping[str, Mapping[str, float]]) -> None:
         """Writes effects, as in a vehicle file, into `theta` in place; missing numbers stay neutral."""
         for name, numbers in effects.items():
             if name == "weak_rotor":
-                theta[LOSS : LOSS + self.rotors] = rotor_losses(numbers, self.rotors)
+                losses = np.array(rotor_losses(numbers, self.rotors))
+                theta[LOSS : LOSS + self.rotors] = losses
+                theta[LOSS + self.rotors : LOSS + 2 * self.rotors] = (
+                    np.array(rotor_drag_losses(numbers, self.rotors)) - losses
+                )
             elif name == "imu_lag":
                 cutoff = numbers.get("cutoff", math.inf)
                 if not cutoff > 0.0:
@@ -153,20 +150,36 @@ class Layout:
                 theta[IMU_PERIOD] = 1.0 / cutoff
             else:
                 for key, value in numbers.items():
-                    theta[self.entry(f"{name}.{key}").index] = min(value, NEVER)
+                    p = parameter_of(name, key)
+                    base = numbers.get(p.beside, 0.0)
+                    theta[self.entry(f"{name}.{p.entry or key}").index] = min(value - base, NEVER)
 
     def read_effect(self, theta: FloatArray, name: str) -> dict[str, float]:
-        """Reads one effect back in the vehicle file's form (cutoff in Hz, rotors numbered from 1)."""
+        """Reads one effect back in the vehicle file's form (cutoff in Hz, rotors numbered from 1).
+
+        Optional numbers are there where they are not neutral.
+        """
         if name == "weak_rotor":
-            losses = theta[LOSS : LOSS + self.rotors]
-            if np.count_nonzero(losses) > 1:
-                return {f"loss_{i + 1}": float(losses[i]) for i in np.flatnonzero(losses)}
-            rotor = int(np.argmax(np.abs(losses)))
-            return {"rotor": rotor + 1, "loss": float(losses[rotor])}
+            return self._read_rotors(theta)
         if name == "imu_lag":
             period = float(theta[IMU_PERIOD])
             return {"cutoff": 1.0 / period if period > 0.0 else math.inf}
-        return {p.name: float(theta[_INDEX[f"{name}.{p.name}"]]) for p in EFFECTS[name].parameters}
+        out: dict[str, float] = {}
+        for p in EFFECTS[name].parameters:
+            value = float(theta[_INDEX[f"{name}.{p.entry or p.name}"]])
+            if not p.optional or value != p.neutral:
+                out[p.name] = out.get(p.beside, 0.0) + value
+        return out
+
+    def _read_rotors(self, theta: FloatArray) -> dict[str, float]:
+        losses, extra = theta[LOSS : LOSS + self.rotors], theta[LOSS + self.rotors : LOSS + 2 * self.rotors]
+        weak = np.flatnonzero((losses != 0.0) | (extra != 0.0))
+        if len(weak) > 1:
+            out = {f"loss_{i + 1}": float(losses[i]) for i in weak}
+            return out | {f"drag_loss_{i + 1}": float(losses[i] + extra[i]) for i in np.flatnonzero(extra)}
+        rotor = int(weak[0]) if len(weak) else 0
+        out = {"rotor": float(rotor + 1), "loss": float(losses[rotor])}
+        return out | ({"drag_loss": float(losses[rotor] + extra[rotor])} if extra[rotor] else {})
 
 
 def residual_terms(vehicle: Vehicle) -> NDArray[np.int64]:
@@ -189,6 +202,7 @@ def _scales(vehicle: Vehicle) -> dict[Scale, float]:
         "inertia": p["J_xx"].initial / 8e-3,
         "rotor_inertia": p["J_r"].initial / 3e-5,
         "hover_speed": vehicle.hover_speed() / 400.0,
+        "rotor_weight": vehicle.mass * GRAVITY / len(vehicle.rotors) / 3.2,
     }
 
 

@@ -20,20 +20,31 @@ class Needs(NamedTuple):
 
     Attributes:
         full: more than the nominal step: one of the groups of `quadid.model.body_kernel`.
-        air, solid, rare: these groups.
-        shared: lag, delay, dead speed and losses are the same in all lanes, and their moments are tabled.
-        delayed: commands are delayed.
+        air, hub, solid, rare: these groups.
+        shared: all that acts on rotors is the same in all lanes, and their moments are tabled.
+        delayed: commands, or readings of speed, come late.
+        uneven: speeding up and slowing down lag differently.
+        voltage: the supply voltage scales commands.
+        growth: drag torque is not quadratic.
+        means: means of each rotor's speed are kept, for `hub` or `growth`.
         factors: thrust or mass change in flight.
+        payload: inertia or centre of gravity change with mass.
         imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
     """
 
     full: bool
     air: bool
+    hub: bool
     solid: bool
     rare: bool
     shared: bool
     delayed: bool
+    uneven: bool
+    voltage: bool
+    growth: bool
+    means: bool
     factors: bool
+    payload: bool
     imu_lag: bool
     att_delay: bool
     imu_static: bool
@@ -41,47 +52,60 @@ class Needs(NamedTuple):
     learned: bool
 
 
-AIR_ENTRIES = places("rotor_drag", "axial_inflow")
+HUB_ENTRIES = places("rotor_drag", "axial_inflow")
 RARE_ENTRIES = places("parasitic_drag", "ground_effect")
+PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
+FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
 SOLID_ENTRIES = places(
-    "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm"
-)
-FACTOR_ENTRIES = places("battery_sag", "thrust_drop.fraction", "mass_change.fraction")
+    "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm",
+    "no_gyroscopic_coupling",
+)  # fmt: skip
 IMU_ENTRIES = places("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
-ROTOR_ENTRIES = places("motor_lag", "command_delay", "thrust_curve")
+DELAY_ENTRIES = places("command_delay", "rotor_telemetry_delay")
+ROTOR_ENTRIES = places(
+    "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
+)
+"""What makes rotors of one lane differ from those of another; losses beside them."""
+(SLOWER,), (EXPONENT,), (GROWTH,) = places("motor_lag.slower"), places("supply_voltage"), places("drag_torque_curve")
+(OFFSET,) = places("thrust_curve.offset")
+
+
+@nb.njit(**jit)
+def _any_of(theta: FloatArray, entries: tuple[int, ...]) -> bool:
+    """Whether any of these entries is not neutral in any lane."""
+    found = False
+    for lane in range(len(theta)):
+        for i in entries:
+            found |= theta[lane, i] != 0.0
+    return found
 
 
 @nb.njit(**jit)
 def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
     """Returns what a block of parameter vectors (LANES, size) needs of the model."""
-    air, solid, rare, factors, varied, imu_static = channels > 9, False, False, False, False, False
-    delayed, imu_lag, att_delay, ahrs, learned = False, False, False, False, False
+    rare, factors, payload = (
+        _any_of(theta, RARE_ENTRIES), _any_of(theta, FACTOR_ENTRIES), _any_of(theta, PAYLOAD_ENTRIES)
+    )  # fmt: skip
+    learned = False
     for lane in range(len(theta)):
-        for i in AIR_ENTRIES:
-            air |= theta[lane, i] != 0.0
-        for i in RARE_ENTRIES:
-            rare |= theta[lane, i] != 0.0
-        for i in SOLID_ENTRIES:
-            solid |= theta[lane, i] != 0.0
-        for i in FACTOR_ENTRIES:
-            factors |= theta[lane, i] != 0.0
+        for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
+            learned |= theta[lane, i] != 0.0
+    rare |= learned
+    hub = rare or _any_of(theta, HUB_ENTRIES)
+    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, SOLID_ENTRIES)
+    growth = _any_of(theta, (GROWTH,))
+    varied = growth
+    for lane in range(len(theta)):
         for i in ROTOR_ENTRIES:
             varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS, ix.LOSS + rotors):
+        for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
             varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS + rotors, theta.shape[1]):
-            learned |= theta[lane, i] != 0.0
-        for i in IMU_ENTRIES:
-            imu_static |= theta[lane, i] != 0.0
-        delayed |= theta[lane, ix.DELAY] > 0.0
-        imu_lag |= theta[lane, ix.IMU_PERIOD] > 0.0
-        att_delay |= theta[lane, ix.ATT_DELAY] > 0.0
-        ahrs |= theta[lane, ix.AHRS_K] != 0.0
-    rare, solid = rare or learned, solid or factors or learned
-    air = air or rare
+        varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
     return Needs(
-        air or solid, air, solid, rare, not varied, delayed, factors, imu_lag, att_delay, imu_static, ahrs, learned
-    )
+        air or solid, air, hub, solid, rare, not varied, _any_of(theta, DELAY_ENTRIES), _any_of(theta, (SLOWER,)),
+        _any_of(theta, (EXPONENT,)), growth, hub or growth, factors, payload, _any_of(theta, (ix.IMU_PERIOD,)),
+        _any_of(theta, (ix.ATT_DELAY,)), _any_of(theta, IMU_ENTRIES), _any_of(theta, (ix.AHRS_K,)), learned,
+    )  # fmt: skip
 
 
 def _on_disk(sources: int) -> Any:

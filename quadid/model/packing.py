@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model import layout as ix
-from quadid.model.needs_kernel import AIR_ENTRIES, FACTOR_ENTRIES, RARE_ENTRIES, ROTOR_ENTRIES, SOLID_ENTRIES
+from quadid.model.needs_kernel import FACTOR_ENTRIES, HUB_ENTRIES, RARE_ENTRIES, ROTOR_ENTRIES, SOLID_ENTRIES
 from quadid.model.simd import LANES
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_AIR, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(8)
-_PLAIN, _AIR_COST, _SOLID_COST, _RARE_COST = 10.0, 10.0, 10.0, 7.0
+_AIR, _HUB, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(9)
+_PLAIN, _AIR_COST, _HUB_COST, _SOLID_COST, _RARE_COST = 10.0, 7.0, 6.0, 10.0, 7.0
 _ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7.0, 14.0, 10.0
 """Nanoseconds a particle and step, beside the plain ones; `python -m benchmarks.speed --parts pieces` measures them."""
 
@@ -30,12 +30,12 @@ def packing(thetas: FloatArray, rotors: int, channels: int) -> NDArray[np.intp]:
     """
     if len(thetas) <= LANES:
         return np.arange(len(thetas))
-    features = np.zeros((len(thetas), 8), dtype=bool)
-    groups = ((_AIR, AIR_ENTRIES + RARE_ENTRIES), (_SOLID, SOLID_ENTRIES + FACTOR_ENTRIES), (_RARE, RARE_ENTRIES))
+    features = np.zeros((len(thetas), 9), dtype=bool)
+    groups = ((_HUB, HUB_ENTRIES + RARE_ENTRIES), (_SOLID, SOLID_ENTRIES + FACTOR_ENTRIES), (_RARE, RARE_ENTRIES))
     for feature, entries in groups:
         features[:, feature] = (thetas[:, list(entries)] != 0.0).any(axis=1)
-    features[:, _AIR] |= channels > 9
-    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS : ix.LOSS + rotors]], axis=1)
+    features[:, _AIR] = features[:, _HUB] | (channels > 9)
+    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS : ix.LOSS + 2 * rotors]], axis=1)
     features[:, _ROTORS] = (own != own[0]).any(axis=1)
     for feature, entry in ((_DELAYED, ix.DELAY), (_FILTER, ix.IMU_PERIOD), (_LATE, ix.ATT_DELAY), (_AHRS, ix.AHRS_K)):
         features[:, feature] = thetas[:, entry] != 0.0
@@ -64,7 +64,7 @@ def _orders(needs: BoolArray) -> Iterator[NDArray[np.intp]]:
     """Vectors by lane, -1 for those that repeat the first: sorted by groups of needs, spare lanes early or late."""
     m = len(needs)
     spare = np.full(-(-m // LANES) * LANES - m, -1)
-    groups = ([_ROTORS, _DELAYED], [_FILTER, _LATE, _AHRS], [_AIR, _SOLID, _RARE])
+    groups = ([_ROTORS, _DELAYED], [_FILTER, _LATE, _AHRS], [_AIR, _HUB, _SOLID, _RARE])
     for keys in permutations(groups):
         columns = [needs[1:, f] for group in reversed(keys) for f in group]
         order = 1 + np.lexsort(columns)
@@ -77,7 +77,13 @@ def _cost(needs: BoolArray, order: NDArray[np.intp]) -> float:
     total = 0.0
     for first in range(0, len(order), LANES):
         need: BoolArray = np.any(needs[np.maximum(order[first : first + LANES], 0)], axis=0)
-        total += _PLAIN + need[_AIR] * _AIR_COST + need[_SOLID] * _SOLID_COST + need[_RARE] * _RARE_COST
+        total += (
+            _PLAIN
+            + need[_AIR] * _AIR_COST
+            + need[_HUB] * _HUB_COST
+            + need[_SOLID] * _SOLID_COST
+            + need[_RARE] * _RARE_COST
+        )
         total += (_DELAYED_COST if need[_DELAYED] else _ROTOR_COST) * need[_ROTORS]
         total += need[_FILTER] * _FILTER_COST + need[_LATE] * _LATE_COST + need[_AHRS] * _AHRS_COST
     return total

@@ -33,7 +33,7 @@ def residual_coefficients(theta: FloatArray, rotors: int, coefficients: FloatArr
     """Copies the coefficients of all terms out of the parameter vectors (LANES, size) into (terms, LANES)."""
     for i in range(len(coefficients)):
         for lane in range(LANES):
-            coefficients[i, lane] = theta[lane, ix.LOSS + rotors + i]
+            coefficients[i, lane] = theta[lane, ix.LOSS + 2 * rotors + i]
 
 
 @nb.njit(**jit)

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
-from quadid.model.layout import residual_terms
-from quadid.model.needs_kernel import Needs, needs_of
-from quadid.model.rollout_kernel import N_TANGENT, Flight, roll_segments
-from quadid.model.rotor_kernel import rotor_table
+from quadid.model.kernel import Flight
+from quadid.model.layout import places, residual_terms
+from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
+from quadid.model.rollout_kernel import N_TANGENT, roll_segments
+from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
 from quadid.model.simd import LANES, aligned
 from quadid.vehicle import Vehicle
@@ -33,6 +34,8 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 """Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
+TAU, SLOWER = places("motor_lag")
+(OFFSET,) = places("thrust_curve.offset")
 _TABLES_KEPT = 4
 _PART_ROWS = 800
 """Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
@@ -123,18 +126,23 @@ class Rollout:
         self.window, self.vehicle = window, vehicle
         self.mass = vehicle.mass
         positions = vehicle.rotor_positions
-        self.geometry = np.column_stack([positions[:, :2], vehicle.spins])
+        hub = float(positions[:, 2].mean())
+        self.geometry = np.column_stack([positions[:, :2], vehicle.spins, positions[:, 2] - hub])
         gaps = [float(np.linalg.norm(a - b)) for i, a in enumerate(positions) for b in positions[:i]]
         self.reach = 0.5 * min(gaps)
         self.channels = 9
         if window.velocity is not None or window.position is not None:
             self.channels = 15 if window.position is not None else 12
         self.measured, self.valid = _measured(window, self.channels)
-        self._slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
         self._terms = residual_terms(vehicle)
+        slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
+        self.drive = Drive(
+            window.rotor_speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
+            window.dt,
+        )  # fmt: skip
         self._mask = self.valid.astype(np.float64)
-        self._flight = Flight(self.mass, self.reach, window.t0, window.dt, *window.log_span)
-        self._tables: OrderedDict[tuple[float, float, float, bytes], FloatArray] = OrderedDict()
+        self.flight = Flight(self.mass, self.reach, hub, window.t0, window.dt, *window.log_span)
+        self._tables: OrderedDict[tuple[bytes, float, bool], FloatArray] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.window)
@@ -281,25 +289,20 @@ class Rollout:
     def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
         need = needs_of(theta, len(self.geometry), channels)
         table = self._table(theta, need) if need.shared else _NO_TABLE
-        lag, late = float(theta[:, ix.TAU].max()), float(theta[:, ix.DELAY].max())
+        lag, late = float((theta[:, TAU] + np.maximum(theta[:, SLOWER], 0.0)).max()), float(theta[:, ix.DELAY].max())
         memory = math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
         return _Lanes(theta, np.ascontiguousarray(dx.T), need, table, memory)
 
     def _table(self, theta: FloatArray, need: Needs) -> FloatArray:
         """Rotor moments of every step for lanes with the same rotors; kept for the next calls."""
-        key = (
-            theta[0, ix.TAU],
-            theta[0, ix.DELAY],
-            theta[0, ix.DEAD_SPEED],
-            theta[0, ix.LOSS : ix.LOSS + len(self.geometry)].tobytes(),
-        )
+        own = np.concatenate(
+            [theta[0, list(ROTOR_ENTRIES)], theta[0, ix.LOSS : ix.LOSS + 2 * len(self.geometry)]]
+        ).tobytes()
+        key = own, theta[0, ix.B] if theta[0, OFFSET] else 0.0, need.hub
         table = self._tables.get(key)
         if table is None:
-            w = self.window
-            table = np.empty((len(w), 2 * ALL_MOMENTS))
-            rotor_table(
-                w.rotor_speed, self._slope, w.sampling == "held", need.delayed, self.geometry, w.dt, theta, table
-            )
+            table = np.empty((len(self.window), 2 * ALL_MOMENTS))
+            rotor_table(self.drive, need, theta, table)
             self._tables[key] = table
             while len(self._tables) > _TABLES_KEPT:
                 self._tables.popitem(last=False)
@@ -309,11 +312,10 @@ class Rollout:
         self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, scale: FloatArray,
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
-        w = self.window
         roll_segments(
-            w.rotor_speed, self._slope, w.sampling == "held", self.geometry, self._terms, self._flight, lanes.table,
-            self.measured, scale, lanes.memory, segments.starts, n_pre, x0, lanes.theta, lanes.dx, lanes.need,
-            scale.shape[1], segments.length, basis is not None, _NO_BASIS if basis is None else basis, out, ends, cost,
+            self.drive, self._terms, self.flight, lanes.table, self.measured, scale, lanes.memory, segments.starts, n_pre, x0,
+            lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length, basis is not None,
+            _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 
     def initial_states(self, segments: Segments, n_pre: int = 1) -> FloatArray:
@@ -347,6 +349,25 @@ def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
     if found is None:
         found = _SHARED[key] = Rollout(window, vehicle)
     return found
+
+
+def relative_voltage(window: Window, vehicle: Vehicle) -> FloatArray:
+    """Logarithm of the supply voltage over the vehicle's reference at each row; 0 where either is not known.
+
+    Raises:
+        WindowError: the vehicle's rotors follow the voltage, and it is not known.
+    """
+    volts = np.ravel(window.battery) if window.battery is not None else np.empty(0)
+    good = np.flatnonzero(np.isfinite(volts) & (volts > 0.0))
+    if vehicle.reference_voltage is not None and len(good):
+        return np.asarray(np.log(np.interp(np.arange(len(volts)), good, volts[good]) / vehicle.reference_voltage))
+    if vehicle.effects.get("supply_voltage", {}).get("exponent"):
+        raise WindowError(
+            f"{window.name or 'window'}: no supply voltage, which scales this vehicle's commands (supply_voltage)",
+            "battery voltage in the log and reference_voltage in the vehicle file",
+            "log the battery, or leave supply_voltage out",
+        )  # fmt: skip
+    return np.zeros(len(window))
 
 
 def _measured(window: Window, channels: int) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -6,17 +6,26 @@ Follows the motion through rotors, body, AHRS and IMU, and compares it with what
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.model.body_kernel import step_air, step_air_rare, step_air_solid, step_full, step_solid
-from quadid.model.kernel import body_constants, flight_factors, step_core, step_core_shared
+from quadid.model.body_kernel import (
+    step_air,
+    step_air_solid,
+    step_full,
+    step_hub,
+    step_hub_solid,
+    step_rare,
+    step_solid,
+)
+from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core, step_core_shared
+from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
-from quadid.model.rotor_kernel import rotor_constants, rotors_start, rotors_step, spread_moments
+from quadid.model.rotor_kernel import Drive, input_constants, rotors_start, rotors_step, spread_hub, spread_moments
 
 # isort: off
 from quadid.model.rows import (
@@ -34,17 +43,6 @@ from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached,
 FloatArray = NDArray[np.float64]
 
 N_TANGENT = MAX_TANGENTS
-
-
-class Flight(NamedTuple):
-    """Numbers of one window: vehicle's mass [kg], half the smallest rotor distance [m], grid and log span [s]."""
-
-    mass: float
-    reach: float
-    t0: float
-    dt: float
-    span0: float
-    span1: float
 
 
 @nb.njit(**jit)
@@ -147,7 +145,7 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 
 @nb.njit(**jit)
 def _march(
-    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, flight: Flight, table: FloatArray,
+    drive: Drive, flight: Flight, theta: FloatArray, table: FloatArray,
     measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
     dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
     ends: FloatArray, cost: FloatArray, s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray,
@@ -157,7 +155,7 @@ def _march(
     dt = flight.dt
     steps = n_pre + n_seg
     turned = max(starts[0] - n_pre - memory, 0)  # rotor steps already taken
-    rotors_start(u, turned, rot)
+    rotors_start(drive, turned, need, rot, s)
     for seg in range(len(starts)):
         first = starts[seg] - n_pre
         following = starts[seg + 1] - n_pre if seg + 1 < len(starts) else -1
@@ -166,9 +164,9 @@ def _march(
                 _copy(ahead, rot)
             elif first - turned > memory:  # what they did before is forgotten
                 turned = first - memory
-                rotors_start(u, turned, rot)
+                rotors_start(drive, turned, need, rot, s)
             for k in range(turned, first):  # rows no segment covers: rotors still turn
-                rotors_step(u, slope, k, held, need.delayed, geometry, dt, rot, s)
+                rotors_step(drive, k, need, rot, s)
             turned = first + steps
         _start(seg, x0, dx, s)
         for i in range(steps):
@@ -176,12 +174,16 @@ def _march(
             if need.shared:
                 if need.full:
                     spread_moments(table, k, s)
+                    if need.hub:
+                        spread_hub(table, k, s)
             else:
                 if k == following:
                     _copy(rot, ahead)
-                rotors_step(u, slope, k, held, need.delayed, geometry, dt, rot, s)
+                rotors_step(drive, k, need, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * k, flight.span0, flight.span1, dt, s)
+            if need.payload:
+                load_payload(flight.t0 + dt * k, dt, theta, s)
             if need.att_delay:
                 remember_attitude(i, s, past)
             scored = i >= n_pre
@@ -195,7 +197,11 @@ def _march(
             if need.rare and need.solid:
                 step_full(dt, s)
             elif need.rare:
-                step_air_rare(dt, s)
+                step_rare(dt, s)
+            elif need.hub and need.solid:
+                step_hub_solid(dt, s)
+            elif need.hub:
+                step_hub(dt, s)
             elif need.air and need.solid:
                 step_air_solid(dt, s)
             elif need.air:
@@ -236,10 +242,10 @@ def _march(
 
 @nb.njit(**allocating)
 def _roll_segments(
-    u: FloatArray, slope: FloatArray, held: bool, geometry: FloatArray, terms: NDArray[np.int64], flight: Flight,
-    table: FloatArray, measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int,
-    x0: FloatArray, theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool,
-    basis: FloatArray, out: FloatArray, ends: FloatArray, cost: FloatArray,
+    drive: Drive, terms: NDArray[np.int64], flight: Flight, table: FloatArray,
+    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
+    theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray,
+    out: FloatArray, ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip
     """Rolls one block of lanes through all segments of one window.
 
@@ -248,10 +254,7 @@ def _roll_segments(
     depend on the vehicle's state; they run through, or begin `memory` rows before a segment that comes later than that.
 
     Args:
-        u: rotor input (n, rotors) [rad/s].
-        slope: of a held input within its samples, see `rotors_step`.
-        held: the input acts held, else linear between samples.
-        geometry: (rotors, 3): x, y [m], spin.
+        drive: rotor input of the window.
         terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
         flight: numbers of the window.
         table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
@@ -272,7 +275,7 @@ def _roll_segments(
         ends: states one step after the last scored row (segments, 13, LANES), written unless for sums.
         cost: (LANES,), added to for sums.
     """
-    rotors, dt = len(geometry), flight.dt
+    rotors, dt = len(drive.geometry), flight.dt
     s = cache_aligned(N_ROWS * LANES)
     s[:] = 0.0
     s[A_G : A_G + 2 * LANES] = 1.0  # the factors of thrust and mass stay 1 unless asked for
@@ -285,14 +288,15 @@ def _roll_segments(
     inside = cache_aligned(basis.shape[2] * LANES).reshape(basis.shape[2], LANES)
     total[:] = 0.0
     inside[:] = 0.0
-    body_constants(theta, flight.mass, rotors, flight.reach, s)
+    body_constants(theta, flight, rotors, s)
+    input_constants(theta, s)
     sensor_constants(theta, dt, s)
     rotor_constants(theta, dt, rot, s)
     coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
     signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
     residual_coefficients(theta, rotors, coefficients)
     _march(
-        u, slope, held, geometry, flight, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg,
+        drive, flight, theta, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg,
         sums, basis, out, ends, cost, s, rot, ahead, past, total, inside, terms, coefficients, signals,
     )  # fmt: skip
 

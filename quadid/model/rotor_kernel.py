@@ -1,306 +1,259 @@
-"""Rotors of many parameter vectors at once: lag, delay, and their moments over each half step.
+"""Rotors of many parameter vectors at once: their input, and their moments over each half step.
 
-omega' = (u - omega) / tau.  Over each half step the means of omega and omega^2 are exact for first-order lag and pure
-delay.  The input u, delayed by (j + f) dt, switches (held) or bends (linear) once within a step, f dt after its start;
-each half step is therefore two pieces, one of which may have no length.  A held input may run on at a slope within its
-samples, whose mean it is (`quadid.intersample`).
+Speeds and their means are those of `quadid.model.lag_kernel`; here is what is read for them, and what is summed.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.model import layout as ix
+from quadid.model.lag_kernel import (
+    mean_delayed,
+    mean_held,
+    mean_linear,
+    mean_sloped,
+    mean_uneven,
+    rotor_constants,
+    turn_delayed,
+    turn_held,
+    turn_linear,
+    turn_sloped,
+    turn_uneven,
+    uneven_input,
+)  # fmt: skip
+from quadid.model.layout import places
+from quadid.model.needs_kernel import Needs
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, ALL_MOMENTS, C_PART, C_ROW, C_SHIFT, C_TAU, C_W0, HALF, N_ROWS, P_AT, P_E,
-    P_E1, P_E2, P_E3, P_H, PIECE, R_GAIN, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED,
-    ROTOR,
+    A_DO, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS,
+    C_GROWTH, C_HOVER, C_ROW, C_SHIFT, C_VOLT, HALF, N_ROWS, R_DRAG, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE,
+    R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED, ROTOR, T_VOLT,
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, jit, lane_kernel
 
 FloatArray = NDArray[np.float64]
 
-THIRD = 1.0 / 3.0
-A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
-"""Pieces of a step: its halves, each before and after the input switches."""
+PLAIN_MOMENTS = 7
+"""Moments that every model needs; the others belong to the air at each hub."""
+HUB_ROWS = (A_X1, A_Y1, A_Z1, A_XX, A_YY, A_ZZ, A_XY, A_XZ, A_YZ)
+(EXPONENT,) = places("supply_voltage.exponent")
+(GROWTH,) = places("drag_torque_curve")
 
 
-@nb.njit(**exact)
-def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray) -> None:
-    """Derives the rotors' constants of all lanes.
+class Drive(NamedTuple):
+    """What the rotors of a window get.
 
-    Args:
-        theta: parameter vectors (LANES, size).
+    Attributes:
+        u: shape (n, rotors), input [rad/s].
+        slope: shape (n, rotors), of a held input within each sample [rad/s^2]; no rows: it stays the same.
+        volts: shape (n,), logarithm of supply voltage over its reference.
+        held: the input acts held, else linear between samples.
+        geometry: shape (rotors, 4): x, y [m], spin, z from the mean plane of the hubs [m].
         dt: step [s].
-        rot: rows of the rotors (rotors, ROTOR); gains written.
-        s: rows; written.
     """
-    for lane in range(LANES):
-        for r in range(len(rot)):
-            rot[r, R_GAIN + lane] = 1.0 - theta[lane, ix.LOSS + r]
-        s[C_W0 + lane] = theta[lane, ix.DEAD_SPEED]
-        tau = max(theta[lane, ix.TAU], 0.0)
-        delay = max(theta[lane, ix.DELAY], 0.0) / dt
-        f = delay - math.floor(delay)
-        s[C_TAU + lane], s[C_SHIFT + lane], s[C_PART + lane] = tau, math.floor(delay), f
-        cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
-        begins = (1.0 - f, 0.0, 1.5 - f, max(0.5 - f, 0.0))  # of each piece, in its sample of the input
-        for piece in range(4):
-            s[P_AT + piece * PIECE + lane] = (begins[piece] - 0.5) * dt
-            h = cuts[piece] * dt
-            e = math.exp(-h / max(tau, 1e-12))
-            at = piece * PIECE + lane
-            s[P_E + at] = e
-            s[P_E1 + at] = tau * (1.0 - e)
-            s[P_E2 + at] = tau * (tau - (tau + h) * e)
-            s[P_E3 + at] = 0.5 * tau * (1.0 - e * e)
-            s[P_H + at] = h
+
+    u: FloatArray
+    slope: FloatArray
+    volts: FloatArray
+    held: bool
+    geometry: FloatArray
+    dt: float
 
 
 @nb.njit(**jit)
-def rotors_start(u: FloatArray, k: int, rot: FloatArray) -> None:
+def rotors_start(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArray) -> None:
     """Sets all rotors to the input of row k, as if it had acted for ever."""
     for r in range(len(rot)):
         for lane in range(LANES):
-            for row in (R_SPEED, R_PAST, R_NOW, R_NEXT):
-                rot[r, row + lane] = u[k, r]
+            factor = math.exp(s[C_VOLT + lane] * drive.volts[k]) if need.voltage else 1.0
+            # A reading that comes late shows what the rotors did before: their input lies ahead in the log.
+            now = min(k + max(int(-s[C_SHIFT + lane]), 0), len(drive.u) - 1)
+            for row in (R_SPEED, R_PAST, R_NEXT):
+                rot[r, row + lane] = factor * drive.u[max(now - 1, k), r]
+            rot[r, R_NOW + lane] = factor * drive.u[now, r]
+            rot[r, R_SPEED + lane] = factor * drive.u[k, r]
             for row in (R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE):
                 rot[r, row + lane] = 0.0
 
 
-@nb.njit(**inlined)
-def _piece(w0, a, slope, tau, e, e1, e2, e3, h):  # type: ignore[no-untyped-def]
-    """Integrals of omega and omega^2 over a piece of length h for input a + slope t, and omega at its end."""
-    base = a - slope * tau
-    c = w0 - base
-    i1 = base * h + 0.5 * slope * h * h + c * e1
-    i2 = base * base * h + base * slope * h * h + THIRD * slope * slope * h * h * h
-    i2 += 2.0 * c * (base * e1 + slope * e2) + c * c * e3
-    return i1, i2, base + slope * h + c * e
-
-
-@nb.njit(**inlined)
-def _held_piece(w0, a, e, e1, e3, h):  # type: ignore[no-untyped-def]
-    """As `_piece` for a constant input a."""
-    c = w0 - a
-    part = c * e1
-    i1 = a * h + part
-    return i1, a * (i1 + part) + c * c * e3, a + c * e
-
-
-@nb.njit(**inlined)
-def _sloped_piece(w0, a, slope, tau, piece, lane, s):  # type: ignore[no-untyped-def]
-    """As `_piece` for a sample of mean a and this slope; `piece`: which part of the step."""
-    e, e1, e2 = s[P_E + piece + lane], s[P_E1 + piece + lane], s[P_E2 + piece + lane]
-    e3, h, at = s[P_E3 + piece + lane], s[P_H + piece + lane], s[P_AT + piece + lane]
-    return _piece(w0, a + slope * at, slope, tau, e, e1, e2, e3, h)
-
-
-@nb.njit(**inlined)
-def _add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, gain, keep, lane, s):  # type: ignore[no-untyped-def]
-    """Adds one rotor to `keep` times the moments of both half steps.
-
-    Integrals of omega and omega^2: m1, m2 over the first, n1, n2 over the second; omega: w0 at the start, wm, w1.
-    """
-    dead = s[C_W0 + lane]
-    m1, m2, n1, n2 = inv * m1, inv * m2, inv * n1, inv * n2
-    lift, next_lift = gain * (m2 + dead * (dead - 2.0 * m1)), gain * (n2 + dead * (dead - 2.0 * n1))
-    s[A_S2 + lane] = keep * s[A_S2 + lane] + lift
-    s[A_X2 + lane] = keep * s[A_X2 + lane] + x * lift
-    s[A_Y2 + lane] = keep * s[A_Y2 + lane] + y * lift
-    s[A_Z2 + lane] = keep * s[A_Z2 + lane] + spin * gain * m2
-    s[A_O1 + lane] = keep * s[A_O1 + lane] + spin * m1
-    s[A_S1 + lane] = keep * s[A_S1 + lane] + m1
-    s[A_DO + lane] = keep * s[A_DO + lane] + spin * inv * (wm - w0)
-    s[A_S2 + HALF + lane] = keep * s[A_S2 + HALF + lane] + next_lift
-    s[A_X2 + HALF + lane] = keep * s[A_X2 + HALF + lane] + x * next_lift
-    s[A_Y2 + HALF + lane] = keep * s[A_Y2 + HALF + lane] + y * next_lift
-    s[A_Z2 + HALF + lane] = keep * s[A_Z2 + HALF + lane] + spin * gain * n2
-    s[A_O1 + HALF + lane] = keep * s[A_O1 + HALF + lane] + spin * n1
-    s[A_S1 + HALF + lane] = keep * s[A_S1 + HALF + lane] + n1
-    s[A_DO + HALF + lane] = keep * s[A_DO + HALF + lane] + spin * inv * (w1 - wm)
-
-
-@nb.njit(**jit)
-def _turn_held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Rotor r through one step of constant input a: two pieces, the half steps."""
-    lane_kernel()
+@nb.njit(**exact)
+def input_constants(theta: FloatArray, s: FloatArray) -> None:
+    """Derives what scales input and drag torque of all lanes from parameter vectors (LANES, size)."""
     for lane in range(LANES):
-        gain, w0 = rot[r, R_GAIN + lane], rot[r, R_SPEED + lane]
-        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-        m1, m2, wm = _held_piece(w0, a, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-        n1, n2, w1 = _held_piece(wm, a, e, e1, e3, h)
-        rot[r, R_SPEED + lane] = w1
-        _add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, gain, keep, lane, s)
+        s[C_VOLT + lane], s[C_GROWTH + lane] = theta[lane, EXPONENT], theta[lane, GROWTH]
 
 
 @nb.njit(**jit)
-def turn_delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Rotor r through one step of held input that switches within the step."""
-    lane_kernel()
-    for lane in range(LANES):
-        gain, w0 = rot[r, R_GAIN + lane], rot[r, R_SPEED + lane]
-        a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
-        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
-        e, e1, e3, h = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E3 + A + lane], s[P_H + A + lane]
-        k1, k2, w = _held_piece(w0, a0, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-        m1, m2, wm = _held_piece(w, a1, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E3 + C + lane], s[P_H + C + lane]
-        l1, l2, w = _held_piece(wm, a0, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-        n1, n2, w1 = _held_piece(w, a1, e, e1, e3, h)
-        rot[r, R_SPEED + lane] = w1
-        _add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, gain, keep, lane, s)
-
-
-@nb.njit(**jit)
-def _turn_sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
-    lane_kernel()
-    for lane in range(LANES):
-        gain, w0, tau = rot[r, R_GAIN + lane], rot[r, R_SPEED + lane], s[C_TAU + lane]
-        a0, a1 = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
-        s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
-        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, rot[r, R_NEXT + lane]
-        rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
-        k1, k2, w = _sloped_piece(w0, a0, s0, tau, A, lane, s)
-        m1, m2, wm = _sloped_piece(w, a1, s1, tau, B, lane, s)
-        l1, l2, w = _sloped_piece(wm, a0, s0, tau, C, lane, s)
-        n1, n2, w1 = _sloped_piece(w, a1, s1, tau, D, lane, s)
-        rot[r, R_SPEED + lane] = w1
-        _add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, gain, keep, lane, s)
-
-
-@nb.njit(**jit)
-def _turn_linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Rotor r through one step of piecewise linear input that bends within the step."""
-    lane_kernel()
-    for lane in range(LANES):
-        gain, w0, tau = rot[r, R_GAIN + lane], rot[r, R_SPEED + lane], s[C_TAU + lane]
-        a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
-        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
-        s0, s1 = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
-        a0 += (a1 - a0) * (1.0 - s[C_PART + lane])
-        e, e1, e2, e3, h = (
-            s[P_E + A + lane],
-            s[P_E1 + A + lane],
-            s[P_E2 + A + lane],
-            s[P_E3 + A + lane],
-            s[P_H + A + lane],
-        )
-        k1, k2, w = _piece(w0, a0, s0, tau, e, e1, e2, e3, h)
-        a0 += s0 * h
-        e, e1, e2, e3, h = (
-            s[P_E + B + lane],
-            s[P_E1 + B + lane],
-            s[P_E2 + B + lane],
-            s[P_E3 + B + lane],
-            s[P_H + B + lane],
-        )
-        m1, m2, wm = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
-        a1 += s1 * h
-        e, e1, e2, e3, h = (
-            s[P_E + C + lane],
-            s[P_E1 + C + lane],
-            s[P_E2 + C + lane],
-            s[P_E3 + C + lane],
-            s[P_H + C + lane],
-        )
-        l1, l2, w = _piece(wm, a0, s0, tau, e, e1, e2, e3, h)
-        e, e1, e2, e3, h = (
-            s[P_E + D + lane],
-            s[P_E1 + D + lane],
-            s[P_E2 + D + lane],
-            s[P_E3 + D + lane],
-            s[P_H + D + lane],
-        )
-        n1, n2, w1 = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
-        rot[r, R_SPEED + lane] = w1
-        _add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, gain, keep, lane, s)
-
-
-@nb.njit(**jit)
-def _read_inputs(u: FloatArray, slope: FloatArray, k: int, rot: FloatArray, s: FloatArray) -> None:
+def _read_inputs(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArray) -> None:
     """Reads the input one sample ahead of t_k - j dt, for each lane's own j; outside the window its end values hold."""
     lane_kernel()
-    last = float(len(u) - 1)
+    last = float(len(drive.u) - 1)
     for lane in range(LANES):
         s[C_ROW + lane] = min(max(k + 1 - s[C_SHIFT + lane], 0.0), last)
     for r in range(len(rot)):
         for lane in range(LANES):
-            rot[r, R_NEXT + lane] = u[int(s[C_ROW + lane]), r]
-        if len(slope) > 0:
+            rot[r, R_NEXT + lane] = drive.u[int(s[C_ROW + lane]), r]
+        if len(drive.slope) > 0:
             for lane in range(LANES):
-                rot[r, R_NEXT_SLOPE + lane] = slope[int(s[C_ROW + lane]), r]
+                rot[r, R_NEXT_SLOPE + lane] = drive.slope[int(s[C_ROW + lane]), r]
+    if need.voltage:
+        _scale_inputs(drive, rot, s)
 
 
 @nb.njit(**jit)
-def rotors_step(
-    u: FloatArray, slope: FloatArray, k: int, held: bool, delayed: bool, geometry: FloatArray, dt: float,
+def _scale_inputs(drive: Drive, rot: FloatArray, s: FloatArray) -> None:
+    """Multiplies the input just read by (voltage / reference) to each lane's exponent."""
+    for lane in range(LANES):
+        s[T_VOLT + lane] = math.exp(s[C_VOLT + lane] * drive.volts[int(s[C_ROW + lane])])
+    for r in range(len(rot)):
+        for lane in range(LANES):
+            rot[r, R_NEXT + lane] *= s[T_VOLT + lane]
+        if len(drive.slope) > 0:
+            for lane in range(LANES):
+                rot[r, R_NEXT_SLOPE + lane] *= s[T_VOLT + lane]
+
+
+@nb.njit(**jit)
+def turn_rotor(
+    plain: bool, a: float, r: int, held: bool, sloped: bool, geometry: FloatArray, dt: float, need: Needs,
     rot: FloatArray, s: FloatArray,
 ) -> None:  # fmt: skip
-    """Advances all rotors over step k and sums their moments for both half steps.
+    """Advances rotor r over one step and adds it to the moments of both half steps.
 
     Args:
-        u: shape (n, rotors), input [rad/s].
-        slope: shape (n, rotors), of a held input within each sample [rad/s^2]; no rows: it stays the same.
-        k: step, from t_k to t_k+1.
+        plain: the input is `a` in every lane over the whole step; else it is in the rows of the rotor.
+        a: that input [rad/s].
+        r: rotor; the first one begins the sums.
         held: the input acts held, else linear between samples.
-        delayed: False when no lane has a delay.
-        geometry: shape (rotors, 3): x, y [m], spin.
+        sloped: a held input runs on within its samples.
+        geometry: see `Drive`.
         dt: step [s].
+        need: which parts of the model any lane needs.
+        rot: rows of the rotors, advanced in place.
+        s: rows; moments written.
+    """
+    inv, keep = 2.0 / dt, 0.0 if r == 0 else 1.0
+    x, y, spin, z = geometry[r, 0], geometry[r, 1], geometry[r, 2], geometry[r, 3]
+    if need.uneven:
+        uneven_input(r, held, sloped, inv, rot, s)
+        if need.means:
+            mean_uneven(x, y, spin, r, inv, keep, rot, s)
+        else:
+            turn_uneven(x, y, spin, r, inv, keep, rot, s)
+    elif need.means:
+        if plain:
+            mean_held(a, x, y, spin, r, inv, keep, rot, s)
+        elif sloped:
+            mean_sloped(x, y, spin, r, inv, keep, rot, s)
+        elif held:
+            mean_delayed(x, y, spin, r, inv, keep, rot, s)
+        else:
+            mean_linear(x, y, spin, r, inv, keep, rot, s)
+    elif plain:
+        turn_held(a, x, y, spin, r, inv, keep, rot, s)
+    elif sloped:
+        turn_sloped(x, y, spin, r, inv, keep, rot, s)
+    elif held:
+        turn_delayed(x, y, spin, r, inv, keep, rot, s)
+    else:
+        turn_linear(x, y, spin, r, inv, keep, rot, s)
+    if need.hub:
+        _add_hub(r, x, y, z, keep, rot, s)
+    if need.growth:
+        _add_growth(r, spin, rot, s)
+
+
+@nb.njit(**jit)
+def _add_hub(r, x, y, z, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Adds rotor r, at (x, y, z), to the moments of speed that the air at each hub needs."""
+    lane_kernel()
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    for lane in range(LANES):
+        m, n = rot[r, R_M1 + lane], rot[r, R_N1 + lane]
+        s[A_X1 + lane], s[A_X1 + HALF + lane] = keep * s[A_X1 + lane] + x * m, keep * s[A_X1 + HALF + lane] + x * n
+        s[A_Y1 + lane], s[A_Y1 + HALF + lane] = keep * s[A_Y1 + lane] + y * m, keep * s[A_Y1 + HALF + lane] + y * n
+        s[A_XX + lane], s[A_XX + HALF + lane] = keep * s[A_XX + lane] + xx * m, keep * s[A_XX + HALF + lane] + xx * n
+        s[A_YY + lane], s[A_YY + HALF + lane] = keep * s[A_YY + lane] + yy * m, keep * s[A_YY + HALF + lane] + yy * n
+        s[A_XY + lane], s[A_XY + HALF + lane] = keep * s[A_XY + lane] + xy * m, keep * s[A_XY + HALF + lane] + xy * n
+        s[A_Z1 + lane], s[A_Z1 + HALF + lane] = keep * s[A_Z1 + lane] + z * m, keep * s[A_Z1 + HALF + lane] + z * n
+        s[A_ZZ + lane], s[A_ZZ + HALF + lane] = keep * s[A_ZZ + lane] + zz * m, keep * s[A_ZZ + HALF + lane] + zz * n
+        s[A_XZ + lane], s[A_XZ + HALF + lane] = keep * s[A_XZ + lane] + xz * m, keep * s[A_XZ + HALF + lane] + xz * n
+        s[A_YZ + lane], s[A_YZ + HALF + lane] = keep * s[A_YZ + lane] + yz * m, keep * s[A_YZ + HALF + lane] + yz * n
+
+
+@nb.njit(**jit)
+def _add_growth(r, spin, rot, s):  # type: ignore[no-untyped-def]
+    """Adds to rotor r's drag torque what grows with the cube of its speed, from the means of speed and its square."""
+    lane_kernel()
+    for lane in range(LANES):
+        gain = spin * rot[r, R_DRAG + lane] * s[C_GROWTH + lane]
+        rotors = float(len(rot))
+        m1, m2, n1, n2 = rot[r, R_M1 + lane], rot[r, R_M2 + lane], rot[r, R_N1 + lane], rot[r, R_N2 + lane]
+        # The mean of a cube without its skewness, which a half step is too short to show.
+        m3, n3 = m1 * (3.0 * m2 - 2.0 * m1 * m1), n1 * (3.0 * n2 - 2.0 * n1 * n1)
+        s[A_Z2 + lane] += gain * (m3 * rotors * s[C_HOVER + lane] - m2)
+        s[A_Z2 + HALF + lane] += gain * (n3 * rotors * s[C_HOVER + lane] - n2)
+
+
+@nb.njit(**jit)
+def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArray) -> None:
+    """Advances all rotors over step k, from t_k to t_k+1, and sums their moments for both half steps.
+
+    Args:
+        drive: input of the window.
+        k: step.
+        need: which parts of the model any lane needs.
         rot: rows of the rotors, (rotors, ROTOR), advanced in place.
         s: rows; moments of both half steps written.
     """
-    sloped = len(slope) > 0
-    plain = held and not delayed and not sloped
+    sloped = len(drive.slope) > 0
+    plain = drive.held and not (need.delayed or sloped or need.voltage or need.uneven)
     if not plain:
-        _read_inputs(u, slope, k, rot, s)
-    inv = 2.0 / dt
-    for r in range(len(geometry)):
-        x, y, spin = geometry[r, 0], geometry[r, 1], geometry[r, 2]
-        keep = 0.0 if r == 0 else 1.0
-        if plain:
-            _turn_held(u[k, r], x, y, spin, r, inv, keep, rot, s)
-        elif sloped:
-            _turn_sloped(x, y, spin, r, inv, keep, rot, s)
-        elif held:
-            turn_delayed(x, y, spin, r, inv, keep, rot, s)
-        else:
-            _turn_linear(x, y, spin, r, inv, keep, rot, s)
+        _read_inputs(drive, k, need, rot, s)
+    for r in range(len(rot)):
+        turn_rotor(plain, drive.u[k, r], r, drive.held, sloped, drive.geometry, drive.dt, need, rot, s)
 
 
 @nb.njit(**allocating)
-def _table(
-    u: FloatArray, slope: FloatArray, held: bool, delayed: bool, geometry: FloatArray, dt: float, theta: FloatArray,
-    table: FloatArray,
-) -> None:  # fmt: skip
-    """Moments of every step of a window for lanes that share lag, delay, dead speed and losses.
+def _table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
+    """Moments of every step of a window for lanes that share all that acts on rotors.
 
-    Arguments as in `rotors_step`, and: theta, the same parameter vector in every lane, (LANES, size); table,
-    (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
+    Args:
+        drive: input of the window.
+        need: which parts of the model the lanes need.
+        theta: the same parameter vector in every lane, (LANES, size).
+        table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
     """
     s = cache_aligned(N_ROWS * LANES)
-    rot = cache_aligned(len(geometry) * ROTOR).reshape(len(geometry), ROTOR)
-    rotor_constants(theta, dt, rot, s)
-    rotors_start(u, 0, rot)
+    rotors = len(drive.geometry)
+    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    rotor_constants(theta, drive.dt, rot, s)
+    input_constants(theta, s)
+    rotors_start(drive, 0, need, rot, s)
     s[A_S2 : A_S2 + 2 * HALF] = 0.0
-    for k in range(len(u)):
-        rotors_step(u, slope, k, held, delayed, geometry, dt, rot, s)
+    for k in range(len(drive.u)):
+        rotors_step(drive, k, need, rot, s)
         for row in range(ALL_MOMENTS):
             table[k, row] = s[A_S2 + row * LANES]
             table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]
+
+
+@nb.njit(**jit)
+def spread_hub(table: FloatArray, k: int, s: FloatArray) -> None:
+    """Writes the shared moments of step k that the air at each hub needs into all lanes."""
+    lane_kernel()
+    for row in range(PLAIN_MOMENTS, ALL_MOMENTS):
+        first, second, at = table[k, row], table[k, ALL_MOMENTS + row], A_S2 + row * LANES
+        for lane in range(LANES):
+            s[at + lane], s[at + HALF + lane] = first, second
 
 
 @nb.njit(**jit)

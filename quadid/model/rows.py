@@ -23,22 +23,29 @@ def _rows(first: int, count: int) -> range:
 # Constants: rigid body, rotors, air, flight.
 (
     C_B, C_D, C_IXX, C_IYY, C_IZZ, C_IXY, C_IXZ, C_IYZ, C_JXX, C_JYY, C_JZZ, C_JXY, C_JXZ, C_JYZ, C_JR, C_JSPIN,
-    C_INVM, C_MASS, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_WN, C_WE, C_CGX, C_CGY, C_W0,
-    C_RX, C_RY, C_RZ, C_GROUND, C_LOWEST, C_SAG, C_DROP_TIME, C_DROP, C_LOAD_TIME, C_LOAD,
-) = _rows(0, 42)  # fmt: skip
+    C_INVM, C_MASS, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_NR, C_WN, C_WE, C_CGX, C_CGY, C_W0,
+    C_RX, C_RY, C_RZ, C_GROUND, C_LOWEST, C_SAG, C_DROP_TIME, C_DROP, C_LOAD_TIME, C_LOAD, C_HUB, C_TURNING,
+) = _rows(0, 45)  # fmt: skip
 # Constants of the sensors; three rows from C_GB, C_AB, C_GS; nine, row by row of a matrix, from C_R.
-(C_SIGMA, C_KAPPA, C_EC, C_ES, C_EC2, C_ES2, C_AHRS, C_ATT_DELAY) = _rows(C_LOAD + LANES, 8)
+(C_SIGMA, C_KAPPA, C_EC, C_ES, C_EC2, C_ES2, C_AHRS, C_ATT_DELAY) = _rows(C_TURNING + LANES, 8)
 (C_GB, C_AB, C_GS, C_R) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)
-# Constants of the rotors: lag, delay in whole steps and the rest, input row in use.
-(C_TAU, C_SHIFT, C_PART, C_ROW) = _rows(C_R + 9 * LANES, 4)
+# Constants of the rotors: lags, delay in whole steps and the rest, input row in use; constant of the thrust curve,
+# exponent of the voltage, growth of the drag torque.
+(C_TAU, C_TAU_DOWN, C_SHIFT, C_PART, C_ROW, C_CURVE, C_VOLT, C_GROWTH) = _rows(C_R + 9 * LANES, 8)
 # Constants of the four pieces of a step: e = exp(-h / tau), its integrals, the length h, and where it begins, counted
 # from the middle of its sample of the input.
-(P_E, P_E1, P_E2, P_E3, P_H, P_AT) = _rows(C_ROW + LANES, 6)
+(P_E, P_E1, P_E2, P_E3, P_H, P_AT) = _rows(C_GROWTH + LANES, 6)
 PIECE = 6 * LANES
+DOWN = 4 * PIECE
+"""From the constants of speeding up to those of slowing down."""
+# Input of the rotor at work: value and slope of each piece, factor of the voltage.
+(T_A0, T_S0, T_A1, T_S1, T_VOLT) = _rows(P_E + 2 * DOWN, 5)
 # Rotor moments, means over the first half step; those over the second follow at + HALF.
-(A_S2, A_X2, A_Y2, A_Z2, A_O1, A_S1, A_DO, A_G, A_M) = _rows(P_E + 4 * PIECE, 9)
-ALL_MOMENTS = 7
-HALF = 9 * LANES
+(
+    A_S2, A_X2, A_Y2, A_Z2, A_O1, A_S1, A_DO, A_X1, A_Y1, A_Z1, A_XX, A_YY, A_ZZ, A_XY, A_XZ, A_YZ, A_G, A_M,
+) = _rows(T_VOLT + LANES, 18)  # fmt: skip
+ALL_MOMENTS = 16
+HALF = 18 * LANES
 # State: quaternion, rate, velocity, position.
 (X_QW, X_QX, X_QY, X_QZ, X_P, X_Q, X_R, X_VN, X_VE, X_VD, X_N, X_E, X_D) = _rows(A_S2 + 2 * HALF, N_STATE)
 # Mean specific force over the first half step, the second, and the second of the step before.
@@ -58,7 +65,10 @@ HALF = 9 * LANES
 L_PAST = L_NOW + 6 * LANES
 N_ROWS = L_PAST // LANES + 6
 
-# Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gain; the
-# input's slope one sample back, now, one ahead.
-(R_SPEED, R_PAST, R_NOW, R_NEXT, R_GAIN, R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE) = _rows(0, 8)
-ROTOR = 8 * LANES
+# Rows of each rotor, in an array of their own (rotors, ROTOR): speed; input one sample back, now, one ahead; gains of
+# thrust and drag torque; the input's slope one sample back, now, one ahead; means of speed and its square, first half
+# step and second.
+(
+    R_SPEED, R_PAST, R_NOW, R_NEXT, R_GAIN, R_DRAG, R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE, R_M1, R_M2, R_N1, R_N2,
+) = _rows(0, 13)  # fmt: skip
+ROTOR = 13 * LANES

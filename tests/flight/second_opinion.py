@@ -32,8 +32,10 @@ class SecondOpinion:
         self.rotors = flight.vehicle.rotors
         self.n = len(self.rotors)
         self.effects: Mapping[str, Mapping[str, float]] = flight.truth.effects
-        self.omega_h = np.sqrt(self.truth.mass * G / (self.n * self.truth.b))
+        each = self.truth.mass * G / self.n - self.get("thrust_curve", "offset")
+        self.omega_h = np.sqrt(each / self.truth.b) + self.get("thrust_curve", "dead_speed")
         self.tau = self.get("motor_lag", "tau")
+        self.slower = self.get("motor_lag", "tau_down", self.tau)
         self.delay = self.get("command_delay", "delay")
         self.last = float(flight.window.t[-1])
 
@@ -49,7 +51,18 @@ class SecondOpinion:
         """Inertia tensor [kg m^2]; off-diagonal entries are the negative products."""
         j_xy, j_xz, j_yz = self.vector("product_of_inertia", "J_xy J_xz J_yz")
         p = self.truth
-        return np.array([[p.J_xx, -j_xy, -j_xz], [-j_xy, p.J_yy, -j_yz], [-j_xz, -j_yz, p.J_zz]])
+        grown = 1.0 + self.loaded(t) * self.vector("mass_change", "J_xx J_yy J_zz")
+        J_xx, J_yy, J_zz = grown * [p.J_xx, p.J_yy, p.J_zz]
+        return np.array([[J_xx, -j_xy, -j_xz], [-j_xy, J_yy, -j_yz], [-j_xz, -j_yz, J_zz]])
+
+    def loaded(self, t: float) -> bool:
+        """Whether mass has been taken up by time t."""
+        return bool(t >= self.get("mass_change", "time", np.inf))
+
+    def cg(self, t: float) -> FloatArray:
+        """Centre of gravity from the geometric centre [m]."""
+        shift = self.loaded(t) * self.vector("mass_change", "x y")
+        return np.append(self.vector("cg_offset", "x y") + shift, 0.0)
 
     def command(self, t: float) -> FloatArray:
         """Held command that acts at time t."""
@@ -64,52 +77,52 @@ class SecondOpinion:
         if t >= self.get("thrust_drop", "time", np.inf):
             power -= self.get("thrust_drop", "fraction")
         power *= 1.0 - self.get("battery_sag", "fraction") * np.clip(t / self.last, 0.0, 1.0)
-        cg = np.array([self.get("cg_offset", "x"), self.get("cg_offset", "y"), 0.0])
+        cg = self.cg(t)
         ground = self.get("ground_effect", "radius_scale") * propeller_radius(self.flight.vehicle)
         lift = 1.0 / (1.0 - (ground / (4.0 * height)) ** 2)
         force, torque = np.zeros(3), np.zeros(3)
+        k = np.array([self.get("rotor_drag", "k_x"), self.get("rotor_drag", "k_y"), self.get("axial_inflow", "k_z")])
+        h_x, h_y = self.vector("rotor_drag_moment", "h_x h_y")
         spin_sum = spin_dot = 0.0
         for i, rotor in enumerate(self.rotors):
-            share = 1.0 - self.get("weak_rotor", "loss") * (self.get("weak_rotor", "rotor") == i + 1)
-            thrust = power * share * lift * p.b * max(omega[i] - self.get("thrust_curve", "dead_speed"), 0.0) ** 2
-            pull = np.array([0.0, 0.0, -thrust])
+            weak, loss = self.get("weak_rotor", "rotor") == i + 1, self.get("weak_rotor", "loss")
+            lifting = p.b * max(omega[i] - self.get("thrust_curve", "dead_speed"), 0.0) ** 2
+            thrust = power * (1.0 - loss * weak) * lift * (lifting + self.get("thrust_curve", "offset"))
+            arm = np.array(rotor.position) - cg
+            air = -p.mass / self.n * k * (v_body + np.cross(nu, arm)) * omega[i] / self.omega_h
+            pull = air + [0.0, 0.0, -thrust]
             force += pull
-            torque += np.cross(np.array(rotor.position) - cg, pull)
-            torque += rotor.spin * power * share * p.d * omega[i] ** 2 * DOWN
+            torque += np.cross(arm, pull) + [h_y * air[1], -h_x * air[0], 0.0]
+            dragging = 1.0 - self.get("weak_rotor", "drag_loss", loss) * weak
+            grown = 1.0 + self.get("drag_torque_curve", "growth") * (omega[i] / self.omega_h - 1.0)
+            torque += rotor.spin * power * dragging * p.d * omega[i] ** 2 * grown * DOWN
             spin_sum += rotor.spin * omega[i]
             spin_dot += rotor.spin * omega_dot[i]
         torque += p.J_r * spin_sum * np.cross(nu, DOWN)
         torque += self.get("rotor_spin_up", "J") * spin_dot * DOWN
-        activity = omega.sum() / (self.n * self.omega_h)
-        k = np.array([self.get("rotor_drag", "k_x"), self.get("rotor_drag", "k_y"), 0.0])
-        in_plane = -p.mass * k * v_body * activity
-        h_x, h_y = self.vector("rotor_drag_moment", "h_x h_y")
-        torque += np.array([h_y * in_plane[1], -h_x * in_plane[0], 0.0])
-        climb = -v_body[2]
-        lost = p.mass * self.get("axial_inflow", "k_z") * climb * activity * DOWN
-        torque += np.cross(-cg, lost)
         drag = -p.mass * self.get("parasitic_drag", "c") * np.linalg.norm(v_body) * v_body
-        return force + in_plane + lost + drag, torque
+        return force + drag, torque
 
     def rhs(self, t: float, s: FloatArray, now: float) -> FloatArray:
         """Time derivative; `now` picks the command, which does not change inside one integration."""
         velocity, nu, omega = s[3:6], s[10:13], s[13 : 13 + self.n]
         attitude = Rotation.from_quat(s[6:10])
         goal = self.command(now)
-        omega_dot = (goal - omega) / self.tau if self.tau > 0.0 else np.zeros(self.n)
+        lag = np.where(goal >= omega, self.tau, self.slower)
+        omega_dot = (goal - omega) / lag if self.tau > 0.0 else np.zeros(self.n)
         wind = np.array([self.get("wind", "north"), self.get("wind", "east"), 0.0])
         v_body = attitude.inv().apply(velocity - wind)
         force, torque = self.wrench(t, omega, omega_dot, v_body, nu, -s[2])
         mass = self.truth.mass
-        if t >= self.get("mass_change", "time", np.inf):
+        if self.loaded(now):
             mass *= 1.0 + self.get("mass_change", "fraction")
-        inertia = self.inertia(t)
-        nu_dot = np.linalg.solve(inertia, torque - np.cross(nu, inertia @ nu))
-        nu_dot -= np.array([self.get("rate_damping", "l_p") * nu[0], self.get("rate_damping", "m_q") * nu[1], 0.0])
+        inertia = self.inertia(now)
+        coupling = 1.0 - self.get("no_gyroscopic_coupling", "share")
+        nu_dot = np.linalg.solve(inertia, torque - coupling * np.cross(nu, inertia @ nu))
+        nu_dot -= self.vector("rate_damping", "l_p m_q n_r") * nu
         w, v = s[9], s[6:9]
         q_dot = np.append(0.5 * (w * nu + np.cross(v, nu)), -0.5 * v @ nu)
-        cg = np.array([self.get("cg_offset", "x"), self.get("cg_offset", "y"), 0.0])
-        arm = self.vector("imu_lever_arm", "x y z") - cg
+        arm = self.vector("imu_lever_arm", "x y z") - self.cg(now)
         at_imu = force / mass + np.cross(nu_dot, arm) + np.cross(nu, np.cross(nu, arm))
         acceleration = attitude.apply(force / mass) + G * DOWN
         return np.concatenate([velocity, acceleration, q_dot, nu_dot, omega_dot, at_imu])

@@ -37,8 +37,8 @@ def state(rotation: Rotation, velocity: FloatArray, rates: FloatArray, height: f
 def slope(setup: Setup, y: FloatArray, omega: FloatArray) -> FloatArray:
     """Derivative of the state at given rotor speeds."""
     wrench, dy = np.zeros(7), np.zeros(STATES)
-    rotor_wrench(omega, setup.efficiency, setup.body, wrench)
-    derivative(y, wrench, 1.0, 1.0, 0, np.zeros(6), setup.body, setup.air, setup.odd, dy)
+    rotor_wrench(omega, setup.efficiency, 0, setup.body, wrench)
+    derivative(y, omega, wrench, 1.0, 1.0, 0, np.zeros(6), setup.body, setup.air, setup.odd, dy)
     return dy
 
 
@@ -75,7 +75,7 @@ def test_power_balance(turn: FloatArray, velocity: FloatArray, rates: FloatArray
     m, inertia = setup.body.mass, setup.body.inertia[0]
     power = m * y[3:6] @ dy[3:6] + y[15:18] @ inertia @ dy[15:18] - m * GRAVITY * dy[2]
     wrench = np.zeros(7)
-    rotor_wrench(omega, setup.efficiency, setup.body, wrench)
+    rotor_wrench(omega, setup.efficiency, 0, setup.body, wrench)
     pull = Rotation.from_rotvec(turn).apply([0.0, 0.0, -wrench[1]])
     assert power == pytest.approx(pull @ velocity + wrench[2:5] @ rates, rel=1e-9, abs=1e-8)
 
@@ -169,7 +169,7 @@ def test_roll_pitch_yaw_signs_of_the_paper() -> None:
     setup, truth = setup_of(), TruthParameters()
     w = np.array([300.0, 320.0, 350.0, 390.0])
     wrench = np.zeros(7)
-    rotor_wrench(w, setup.efficiency, setup.body, wrench)
+    rotor_wrench(w, setup.efficiency, 0, setup.body, wrench)
     s = w**2
     expected = [0.21 * truth.b * (s[3] - s[1]), 0.21 * truth.b * (s[2] - s[0]), truth.d * (-s[0] + s[1] - s[2] + s[3])]
     np.testing.assert_allclose(wrench[2:5], expected, rtol=1e-12)

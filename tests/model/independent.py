@@ -113,9 +113,12 @@ class Independent:
         self.cg = np.array([self["cg_offset.x"], self["cg_offset.y"], 0.0])
         self.arms, self.spins = vehicle.rotor_positions - self.cg, vehicle.spins
         self.gains = np.array([1.0 - self[f"weak_rotor.loss_{i + 1}"] for i in range(self.n)])
+        self.torque_gains = self.gains - [self[f"weak_rotor.extra_{i + 1}"] for i in range(self.n)]
         self.imu = np.array([self[f"imu_lever_arm.{a}"] for a in "xyz"]) - self.cg
-        self.hover = np.sqrt(self.m * G / (self.n * self.b))
-        self.tau, self.delay = self["motor_lag.tau"], self["command_delay.delay"]
+        each = self.m * G / self.n - self["thrust_curve.offset"]
+        self.hover = np.sqrt(each / self.b) + self["thrust_curve.dead_speed"]
+        self.tau, self.down = self["motor_lag.tau"], self["motor_lag.tau"] + self["motor_lag.slower"]
+        self.delay = self["command_delay.delay"] - self["rotor_telemetry_delay.delay"]
         gaps = [
             float(np.linalg.norm(np.subtract(p.position, q.position))) for p in vehicle.rotors for q in vehicle.rotors
         ]
@@ -133,19 +136,26 @@ class Independent:
         ratio = self.radius / (4.0 * max(height, 0.5 * abs(self.radius), 1e-9))
         near_ground = 1.0 / (1.0 - ratio * abs(ratio))  # Cheeseman and Bennett 1955
         thrust = power * near_ground * self.b * self.gains * (omega - self["thrust_curve.dead_speed"]) ** 2  # Eq. 3
+        thrust += power * near_ground * self.gains * self["thrust_curve.offset"]
         force = -thrust.sum() * DOWN  # Eq. 5
-        torque = cross(thrust @ self.arms, -DOWN)  # Eq. 6: sum of arm x (0, 0, -thrust)
-        torque += power * self.d * (self.spins @ (self.gains * omega**2)) * DOWN  # Eqs. 4 and 6
+        cg = self.cg + self.loaded(t) * np.array([self["mass_change.x"], self["mass_change.y"], 0.0])
+        arms = self.arms + self.cg - cg
+        torque = cross(thrust @ arms, -DOWN)  # Eq. 6: sum of arm x (0, 0, -thrust)
+        grown = 1.0 + self["drag_torque_curve.growth"] * (omega / self.hover - 1.0)
+        torque += power * self.d * (self.spins @ (self.torque_gains * grown * omega**2)) * DOWN  # Eqs. 4 and 6
         torque += cross(nu, self["J_r"] * (self.spins @ omega) * DOWN)  # Eq. 7
         torque += self["rotor_spin_up.J"] * (self.spins @ turning) * DOWN
-        activity = omega.sum() / (self.n * self.hover)
-        in_plane = -self.m * np.array([self["rotor_drag.k_x"], self["rotor_drag.k_y"], 0.0]) * v_air * activity
-        torque += np.array(
-            [self["rotor_drag_moment.h_y"] * in_plane[1], -self["rotor_drag_moment.h_x"] * in_plane[0], 0.0]
-        )
-        lost = -self.m * self["axial_inflow.k_z"] * v_air[2] * activity * DOWN  # climbing: v_air[2] < 0, thrust falls
-        torque += cross(-self.cg, lost)
-        return force + in_plane + lost - self.m * self["parasitic_drag.c"] * np.linalg.norm(v_air) * v_air, torque
+        k = np.array([self["rotor_drag.k_x"], self["rotor_drag.k_y"], self["axial_inflow.k_z"]])
+        higher = np.array([self["rotor_drag_moment.h_y"], -self["rotor_drag_moment.h_x"], 0.0])
+        for arm, speed in zip(arms, omega, strict=True):
+            hub = -self.m / self.n * k * (v_air + cross(nu, arm)) * speed / self.hover
+            force = force + hub
+            torque += cross(arm, hub) + higher * hub[[1, 0, 2]]
+        return force - self.m * self["parasitic_drag.c"] * np.linalg.norm(v_air) * v_air, torque
+
+    def loaded(self, t: float) -> bool:
+        """Whether the payload has been taken up at time t."""
+        return bool(t > self.values.get("mass_change.time", np.inf))
 
     def rhs(
         self, t: float, y: FloatArray, u: FloatArray, slope: FloatArray, t_u: float, span: tuple[float, float]
@@ -154,20 +164,24 @@ class Independent:
         phi, theta, _ = y[EULER]
         nu = y[RATE]
         goal = u + slope * (t - t_u)
-        omega, turning = (y[ROTORS:], (goal - y[ROTORS:]) / self.tau) if self.tau > 0.0 else (goal, slope)
+        lag = np.where(goal >= y[ROTORS:], self.tau, self.down)
+        omega, turning = (y[ROTORS:], (goal - y[ROTORS:]) / lag) if self.tau > 0.0 else (goal, slope)
         R = body_to_world(y[EULER])
         wind = np.array([self["wind.north"], self["wind.east"], 0.0])
         force, torque = self.wrench(t, omega, turning, R.T @ (y[VELOCITY] - wind), nu, -y[POSITION][2], span)
-        mass = self.m * (1.0 + self["mass_change.fraction"] * (t > self.values.get("mass_change.time", np.inf)))
-        nu_dot = np.linalg.solve(self.J, torque - cross(nu, self.J @ nu))
-        nu_dot -= np.array([self["rate_damping.l_p"], self["rate_damping.m_q"], 0.0]) * nu
+        mass = self.m * (1.0 + self["mass_change.fraction"] * self.loaded(t))
+        J = self.J + self.loaded(t) * np.diag([self[f"mass_change.J_{a}"] * self[f"J_{a}"] for a in ("xx", "yy", "zz")])
+        turned = (1.0 - self["no_gyroscopic_coupling.share"]) * cross(nu, J @ nu)
+        nu_dot = np.linalg.solve(J, torque - turned)
+        nu_dot -= np.array([self[f"rate_damping.{a}"] for a in ("l_p", "m_q", "n_r")]) * nu
         euler_dot = np.array([
             nu[0] + np.tan(theta) * (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]),
             np.cos(phi) * nu[1] - np.sin(phi) * nu[2],
             (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]) / np.cos(theta),
         ])  # fmt: skip
         felt = force / mass
-        at_imu = felt + cross(np.asarray(nu_dot), self.imu) + cross(nu, cross(nu, self.imu))
+        imu = self.imu - self.loaded(t) * np.array([self["mass_change.x"], self["mass_change.y"], 0.0])
+        at_imu = felt + cross(np.asarray(nu_dot), imu) + cross(nu, cross(nu, imu))
         rotors = turning if self.tau > 0.0 else np.zeros(self.n)
         return np.concatenate([euler_dot, nu_dot, R @ felt + G * DOWN, y[VELOCITY], at_imu, rotors])
 

@@ -15,7 +15,7 @@ from quadid.window import Sampling, Window
 from tests.model.flights import lively_input, values_of, vector
 
 FloatArray = NDArray[np.float64]
-VEHICLE = Vehicle.shipped("pelican")
+VEHICLE = Vehicle.shipped("pelican").model_copy(update={"reference_voltage": 11.5})
 LAYOUT = Layout(VEHICLE)
 DT = 0.02
 N_PRE = 8
@@ -30,7 +30,7 @@ def noisy_window(seconds: float = 1.4, sampling: Sampling = "held", motion: bool
     gyro, accel, velocity, position = 0.2 * rng.standard_normal((4, n, 3))
     return Window(
         0.0, DT, given.rows, gyro, attitude, accel - [0.0, 0.0, 9.8], velocity if motion else None,
-        position - [0.0, 0.0, 1.5] if motion else None, sampling=sampling,
+        position - [0.0, 0.0, 1.5] if motion else None, np.linspace(12.4, 10.4, n), sampling=sampling,
     )  # fmt: skip
 
 

@@ -1,0 +1,267 @@
+"""Rotor speeds of many parameter vectors at once: lag, delay, and the exact means of speed over each half step.
+
+omega' = (u - omega) / tau.  Over each half step the means of omega and omega^2 are exact for first-order lag and pure
+delay.  The input u, delayed by (j + f) dt, switches (held) or bends (linear) once within a step, f dt after its start;
+each half step is therefore two pieces, one of which may have no length.  A held input may run on at a slope within its
+samples, whose mean it is (`quadid.intersample`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.model import layout as ix
+from quadid.model.layout import places
+
+# isort: off
+from quadid.model.rows import (
+    A_DO, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_CURVE, C_PART, C_SHIFT, C_TAU, C_TAU_DOWN, C_W0, DOWN, HALF, P_AT, P_E,
+    P_E1, P_E2, P_E3, P_H, PIECE, R_DRAG, R_GAIN, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE,
+    R_PAST, R_PAST_SLOPE, R_SPEED, T_A0, T_A1, T_S0, T_S1,
+)  # fmt: skip
+
+# isort: on
+from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
+
+FloatArray = NDArray[np.float64]
+
+THIRD = 1.0 / 3.0
+A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
+"""Pieces of a step: its halves, each before and after the input switches."""
+TAU, SLOWER = places("motor_lag")
+(TELEMETRY,) = places("rotor_telemetry_delay")
+DEAD_SPEED, OFFSET = places("thrust_curve")
+
+
+@nb.njit(**exact)
+def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray) -> None:
+    """Derives the rotors' constants of all lanes.
+
+    Args:
+        theta: parameter vectors (LANES, size).
+        dt: step [s].
+        rot: rows of the rotors (rotors, ROTOR); gains written.
+        s: rows; written.
+    """
+    for lane in range(LANES):
+        th = theta[lane]
+        for r in range(len(rot)):
+            loss = th[ix.LOSS + r]
+            rot[r, R_GAIN + lane], rot[r, R_DRAG + lane] = 1.0 - loss, 1.0 - loss - th[ix.LOSS + len(rot) + r]
+        s[C_W0 + lane], s[C_CURVE + lane] = th[DEAD_SPEED], th[DEAD_SPEED] ** 2 + th[OFFSET] / th[ix.B]
+        delay = (max(th[ix.DELAY], 0.0) - max(th[TELEMETRY], 0.0)) / dt
+        f = delay - math.floor(delay)
+        s[C_SHIFT + lane], s[C_PART + lane] = math.floor(delay), f
+        s[C_TAU + lane], s[C_TAU_DOWN + lane] = max(th[TAU], 0.0), max(th[TAU] + th[SLOWER], 0.0)
+        cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
+        begins = (1.0 - f, 0.0, 1.5 - f, max(0.5 - f, 0.0))  # of each piece, in its sample of the input
+        for way in range(2):
+            tau = s[(C_TAU if way == 0 else C_TAU_DOWN) + lane]
+            for piece in range(4):
+                h = cuts[piece] * dt
+                e = math.exp(-h / max(tau, 1e-12))
+                at = way * DOWN + piece * PIECE + lane
+                s[P_AT + at] = (begins[piece] - 0.5) * dt
+                s[P_E + at] = e
+                s[P_E1 + at] = tau * (1.0 - e)
+                s[P_E2 + at] = tau * (tau - (tau + h) * e)
+                s[P_E3 + at] = 0.5 * tau * (1.0 - e * e)
+                s[P_H + at] = h
+
+
+@nb.njit(**inlined)
+def _piece(w0, a, slope, tau, e, e1, e2, e3, h):  # type: ignore[no-untyped-def]
+    """Integrals of omega and omega^2 over a piece of length h for input a + slope t, and omega at its end."""
+    base = a - slope * tau
+    c = w0 - base
+    i1 = base * h + 0.5 * slope * h * h + c * e1
+    i2 = base * base * h + base * slope * h * h + THIRD * slope * slope * h * h * h
+    i2 += 2.0 * c * (base * e1 + slope * e2) + c * c * e3
+    return i1, i2, base + slope * h + c * e
+
+
+@nb.njit(**inlined)
+def _held_piece(w0, a, e, e1, e3, h):  # type: ignore[no-untyped-def]
+    """As `_piece` for a constant input a."""
+    c = w0 - a
+    part = c * e1
+    i1 = a * h + part
+    return i1, a * (i1 + part) + c * c * e3, a + c * e
+
+
+@nb.njit(**inlined)
+def _sloped_piece(w0, a, slope, tau, piece, lane, s):  # type: ignore[no-untyped-def]
+    """As `_piece` for a sample of mean a and this slope; `piece`: which part of the step."""
+    e, e1, e2 = s[P_E + piece + lane], s[P_E1 + piece + lane], s[P_E2 + piece + lane]
+    e3, h, at = s[P_E3 + piece + lane], s[P_H + piece + lane], s[P_AT + piece + lane]
+    return _piece(w0, a + slope * at, slope, tau, e, e1, e2, e3, h)
+
+
+def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
+    """Compiles the ways of one rotor through a step: by what its input does; `uneven` for lags that differ by way.
+
+    Args:
+        keeps_means: writes what later passes read, the means of speed and its square (rows R_M1 to R_N2).
+    """
+
+    @nb.njit(**inlined)
+    def add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s):  # type: ignore[no-untyped-def]
+        """Adds one rotor to `keep` times the moments of both half steps.
+
+        Integrals of omega and omega^2: m1, m2 over the first, n1, n2 over the second; omega: w0 at the start, wm, w1.
+        """
+        gain, drag, dead, curve = rot[r, R_GAIN + lane], rot[r, R_DRAG + lane], 2.0 * s[C_W0 + lane], s[C_CURVE + lane]
+        m1, m2, n1, n2 = inv * m1, inv * m2, inv * n1, inv * n2
+        lift, next_lift = gain * (m2 - dead * m1 + curve), gain * (n2 - dead * n1 + curve)
+        if keeps_means:
+            rot[r, R_M1 + lane], rot[r, R_M2 + lane] = m1, m2
+            rot[r, R_N1 + lane], rot[r, R_N2 + lane] = n1, n2
+        s[A_S2 + lane] = keep * s[A_S2 + lane] + lift
+        s[A_X2 + lane] = keep * s[A_X2 + lane] + x * lift
+        s[A_Y2 + lane] = keep * s[A_Y2 + lane] + y * lift
+        s[A_Z2 + lane] = keep * s[A_Z2 + lane] + spin * drag * m2
+        s[A_O1 + lane] = keep * s[A_O1 + lane] + spin * m1
+        s[A_S1 + lane] = keep * s[A_S1 + lane] + m1
+        s[A_DO + lane] = keep * s[A_DO + lane] + spin * inv * (wm - w0)
+        s[A_S2 + HALF + lane] = keep * s[A_S2 + HALF + lane] + next_lift
+        s[A_X2 + HALF + lane] = keep * s[A_X2 + HALF + lane] + x * next_lift
+        s[A_Y2 + HALF + lane] = keep * s[A_Y2 + HALF + lane] + y * next_lift
+        s[A_Z2 + HALF + lane] = keep * s[A_Z2 + HALF + lane] + spin * drag * n2
+        s[A_O1 + HALF + lane] = keep * s[A_O1 + HALF + lane] + spin * n1
+        s[A_S1 + HALF + lane] = keep * s[A_S1 + HALF + lane] + n1
+        s[A_DO + HALF + lane] = keep * s[A_DO + HALF + lane] + spin * inv * (w1 - wm)
+
+    @nb.njit(**jit)
+    def held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+        """Rotor r through one step of constant input a: two pieces, the half steps."""
+        lane_kernel()
+        for lane in range(LANES):
+            w0 = rot[r, R_SPEED + lane]
+            e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
+            m1, m2, wm = _held_piece(w0, a, e, e1, e3, h)
+            e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
+            n1, n2, w1 = _held_piece(wm, a, e, e1, e3, h)
+            rot[r, R_SPEED + lane] = w1
+            add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+    @nb.njit(**jit)
+    def delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+        """Rotor r through one step of held input that switches within the step."""
+        lane_kernel()
+        for lane in range(LANES):
+            w0 = rot[r, R_SPEED + lane]
+            a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
+            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
+            e, e1, e3, h = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E3 + A + lane], s[P_H + A + lane]
+            k1, k2, w = _held_piece(w0, a0, e, e1, e3, h)
+            e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
+            m1, m2, wm = _held_piece(w, a1, e, e1, e3, h)
+            e, e1, e3, h = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E3 + C + lane], s[P_H + C + lane]
+            l1, l2, w = _held_piece(wm, a0, e, e1, e3, h)
+            e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
+            n1, n2, w1 = _held_piece(w, a1, e, e1, e3, h)
+            rot[r, R_SPEED + lane] = w1
+            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+    @nb.njit(**jit)
+    def sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+        """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
+        lane_kernel()
+        for lane in range(LANES):
+            w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
+            a0, a1 = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
+            s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
+            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, rot[r, R_NEXT + lane]
+            rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
+            k1, k2, w = _sloped_piece(w0, a0, s0, tau, A, lane, s)
+            m1, m2, wm = _sloped_piece(w, a1, s1, tau, B, lane, s)
+            l1, l2, w = _sloped_piece(wm, a0, s0, tau, C, lane, s)
+            n1, n2, w1 = _sloped_piece(w, a1, s1, tau, D, lane, s)
+            rot[r, R_SPEED + lane] = w1
+            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+    @nb.njit(**jit)
+    def linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+        """Rotor r through one step of piecewise linear input that bends within the step."""
+        lane_kernel()
+        for lane in range(LANES):
+            w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
+            a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
+            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
+            s0, s1 = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
+            a0 += (a1 - a0) * (1.0 - s[C_PART + lane])
+            e, e1, e2 = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E2 + A + lane]
+            e3, h = s[P_E3 + A + lane], s[P_H + A + lane]
+            k1, k2, w = _piece(w0, a0, s0, tau, e, e1, e2, e3, h)
+            a0 += s0 * h
+            e, e1, e2 = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E2 + B + lane]
+            e3, h = s[P_E3 + B + lane], s[P_H + B + lane]
+            m1, m2, wm = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
+            a1 += s1 * h
+            e, e1, e2 = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E2 + C + lane]
+            e3, h = s[P_E3 + C + lane], s[P_H + C + lane]
+            l1, l2, w = _piece(wm, a0, s0, tau, e, e1, e2, e3, h)
+            e, e1, e2 = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E2 + D + lane]
+            e3, h = s[P_E3 + D + lane], s[P_H + D + lane]
+            n1, n2, w1 = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
+            rot[r, R_SPEED + lane] = w1
+            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+    @nb.njit(**inlined)
+    def uneven_piece(w0, a, slope, piece, lane, s):  # type: ignore[no-untyped-def]
+        """As `_piece`, with the lag of speeding up or of slowing down by where the input lies at its start."""
+        at, down, faster = piece + lane, DOWN + piece + lane, a >= w0
+        # Both are read before one is chosen: a choice of where to read would not become vectors.
+        tau, e, e1, e2, e3 = s[C_TAU + lane], s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at]
+        tau_d, f, f1, f2, f3 = s[C_TAU_DOWN + lane], s[P_E + down], s[P_E1 + down], s[P_E2 + down], s[P_E3 + down]
+        tau, e, e1 = (tau if faster else tau_d), (e if faster else f), (e1 if faster else f1)
+        e2, e3 = (e2 if faster else f2), (e3 if faster else f3)
+        return _piece(w0, a, slope, tau, e, e1, e2, e3, s[P_H + at])
+
+    @nb.njit(**jit)
+    def uneven(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+        """Rotor r through one step of any input (rows T_) where speeding up and slowing down lag differently."""
+        lane_kernel()
+        for lane in range(LANES):
+            w0 = rot[r, R_SPEED + lane]
+            a0, s0, a1, s1 = s[T_A0 + lane], s[T_S0 + lane], s[T_A1 + lane], s[T_S1 + lane]
+            k1, k2, w = uneven_piece(w0, a0, s0, A, lane, s)
+            m1, m2, wm = uneven_piece(w, a1, s1, B, lane, s)
+            l1, l2, w = uneven_piece(wm, a0 + s0 * s[P_H + A + lane], s0, C, lane, s)
+            n1, n2, w1 = uneven_piece(w, a1 + s1 * s[P_H + B + lane], s1, D, lane, s)
+            rot[r, R_SPEED + lane] = w1
+            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+    return held, delayed, sloped, linear, uneven
+
+
+@nb.njit(**jit)
+def uneven_input(r: int, held: bool, sloped: bool, inv: float, rot: FloatArray, s: FloatArray) -> None:
+    """Writes value at the start and slope of both pieces of rotor r's input, before and after it switches or bends."""
+    lane_kernel()
+    for lane in range(LANES):
+        s[T_A0 + lane], s[T_A1 + lane] = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
+        s[T_S0 + lane], s[T_S1 + lane] = 0.0, 0.0
+    if sloped:
+        for lane in range(LANES):
+            s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
+            s[T_A0 + lane] += s0 * s[P_AT + A + lane]
+            s[T_A1 + lane] += s1 * s[P_AT + B + lane]
+            s[T_S0 + lane], s[T_S1 + lane] = s0, s1
+            rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
+    elif not held:
+        for lane in range(LANES):
+            a0, a1, a2 = s[T_A0 + lane], s[T_A1 + lane], rot[r, R_NEXT + lane]
+            s[T_S0 + lane], s[T_S1 + lane] = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
+            s[T_A0 + lane] = a0 + (a1 - a0) * (1.0 - s[C_PART + lane])
+    for lane in range(LANES):
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
+
+
+turn_held, turn_delayed, turn_sloped, turn_linear, turn_uneven = _turns_of(False)
+mean_held, mean_delayed, mean_sloped, mean_linear, mean_uneven = _turns_of(True)
