@@ -20,8 +20,8 @@ from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
     C_CGX, C_CGY, C_CPAR, C_D, C_GROUND, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR,
     C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY,
-    C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E,
-    X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q,
+    S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
