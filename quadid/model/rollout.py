@@ -313,8 +313,8 @@ class Rollout:
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
         roll_segments(
-            self.drive, self._terms, self.flight, lanes.table, self.measured, scale, lanes.memory, segments.starts, n_pre, x0,
-            lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length, basis is not None,
+            self.drive, self._terms, self.flight, lanes.table, self.measured, scale, lanes.memory, segments.starts,
+            n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length, basis is not None,
             _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 
