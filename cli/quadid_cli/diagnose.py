@@ -53,6 +53,9 @@ def diagnose(
             done = work.diagnose(train, held, seed=seed, advance=advance)
     target = free_path(folder / done.file_name, vehicle)
     done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))
+    if done.prediction is not None:
+        predicts = free_path(folder / done.prediction_file_name, vehicle)
+        done.result["prediction_file"] = str(output.write_text(predicts, done.prediction.to_yaml()))
     if report is not None:
         done.result["report"] = str(done.report(report, output.command_line()))
     output.write_json(done.result, json)

@@ -52,7 +52,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     print_tables(console, outcome.tables())
     if outcome.verdict is not None:
         print_verdict(console, outcome.verdict)
-    for key, label in (("vehicle_file", "Vehicle file"), ("report", "Report")):
+    for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
         if outcome.result.get(key):
             console.print(f"{label}: {outcome.result[key]}", soft_wrap=True)
     warn(outcome.warnings)

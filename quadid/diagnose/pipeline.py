@@ -15,7 +15,7 @@ from quadid.diagnose.findings import describe
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names
 from quadid.diagnose.plausibility import impossible_causes
-from quadid.diagnose.prediction import POOR, refit_to_predict
+from quadid.diagnose.prediction import POOR, learn_prediction
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import is_long
@@ -111,21 +111,20 @@ def diagnose(
     alike = {c.family for c in search.model.causes if c.label in doubts}
     believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
     findings = describe(decisive, search, per_finding, believed)
-    foresight, said = None, []
-    if verdict is Verdict.UNKNOWN and search.model.reduced_chi_square > POOR:
+    text = extended_vehicle(vehicle, decisive.layout, Fitted.of(search.model))
+    prediction, said = None, []
+    if search.model.reduced_chi_square > POOR:
         report("prediction", 0.0)
         try:
-            foresight = refit_to_predict(windows, vehicle, decisive, search.model, begun.listed, validation)
+            prediction = learn_prediction(windows, Vehicle.from_yaml(text), validation)
         except NotIdentifiableError as error:
-            said.append(f"the extended vehicle file could not be refitted to predict: {error}")
-    if foresight is not None:
-        said.append(foresight.sentence)
-    fitted = Fitted.of(search.model) if foresight is None else foresight.fitted
-    text = extended_vehicle(vehicle, decisive.layout, fitted)
+            said.append(f"no residual terms could be learnt: {error}")
+    if prediction is not None:
+        said.append(prediction.sentence)
     name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
     report("done", 1.0)
     warnings = (*(f.text for f in faults), *doubts.values(), *said)
-    result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, foresight)
+    result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, prediction)
     return result, Workings(search, begun.short, decisive, left)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from quadid.diagnose.prediction import Foresight
+from quadid.diagnose.prediction import Prediction
 from quadid.diagnose.residual_tests import Remainder
 from quadid.jsonable import jsonable
 
@@ -126,7 +126,7 @@ class Validation:
 class Diagnosis:
     """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name.
 
-    With `foresight` the vehicle file holds parameters refitted to predict.
+    The vehicle file holds physical values; `prediction` is what predicts better, if anything does.
     """
 
     verdict: Verdict
@@ -136,7 +136,7 @@ class Diagnosis:
     vehicle_yaml: str
     vehicle_name: str
     warnings: tuple[str, ...] = field(default_factory=tuple)
-    foresight: Foresight | None = None
+    prediction: Prediction | None = None
 
     @property
     def unexplained(self) -> dict[str, float]:
@@ -168,6 +168,7 @@ class Diagnosis:
             "unexplained": self.unexplained,
             "unexplained_follows": self.unexplained_follows,
             "vehicle_file": vehicle_file,
-            "prediction": None if self.foresight is None else self.foresight.to_dict(),
+            "prediction": None if self.prediction is None else self.prediction.to_dict(),
+            "prediction_file": None,
             "warnings": list(self.warnings),
         }

@@ -89,9 +89,9 @@ def select(
         if rounds[-1].accepted is None:
             # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
             far = None if stage.model.causes else stage.longest()
-            if far is None:
+            airborne = [] if far is None else [c for c in listed if far.shooting.finds_velocity(c.names)]
+            if far is None or not airborne:
                 break
-            airborne = [c for c in listed if far.shooting.finds_velocity(c.names)]
             rounds.append(_round(far.shooting, far.model, airborne, elsewhere))
             if rounds[-1].accepted is None:
                 break

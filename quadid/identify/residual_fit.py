@@ -52,10 +52,16 @@ class ResidualFit:
     unseen: dict[int, float]
 
 
-def candidate_terms() -> tuple[ResidualTerm, ...]:
-    """A constant and every signal by itself, on every force and moment; coefficients zero."""
+def candidate_terms(flown: bool = True) -> tuple[ResidualTerm, ...]:
+    """A constant and every signal by itself, on every force and moment, and drag with the speed; coefficients zero.
+
+    Without a measured velocity (`flown` False) neither forces nor what depends on the velocity can be learnt.
+    """
     products = [(), *((name,) for name in SIGNALS if name != "V"), ("V", "v_x"), ("V", "v_y"), ("V", "v_z")]
-    return tuple(ResidualTerm(acts_on=target, product=p, value=0.0) for target in TARGETS for p in products)
+    if not flown:
+        products = [p for p in products if not any(SIGNALS[name] == "m/s" for name in p)]
+    targets = [target for target in TARGETS if flown or target.startswith("moment")]
+    return tuple(ResidualTerm(acts_on=target, product=p, value=0.0) for target in targets for p in products)
 
 
 def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
@@ -68,7 +74,8 @@ def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
     Raises:
         NotIdentifiableError: no run of half a second fits into any window, or the physics run away at once.
     """
-    wide = vehicle.model_copy(update={"residual": candidate_terms()})
+    flown = any(w.velocity is not None for w in windows)
+    wide = vehicle.model_copy(update={"residual": candidate_terms(flown)})
     folds = _folds(windows)
     unseen: dict[int, list[float]] = {}
     for held in range(len(folds)):

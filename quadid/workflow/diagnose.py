@@ -31,7 +31,8 @@ class Diagnosed(Outcome):
     """What a diagnosis found.
 
     Attributes:
-        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` is None until a file is written.
+        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` and ``prediction_file`` are None until
+            files are written.
         found: the diagnosis itself.
         sets: logs scored without and with the findings.
         noise: estimated sensor noise.
@@ -53,14 +54,30 @@ class Diagnosed(Outcome):
         """The fitted vehicle with the findings in it; ``vehicle.save("mine.yaml")`` writes it."""
         from quadid.vehicle import Vehicle
 
-        train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
         vehicle = Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name)
         unseen = self.result["validation"]
         sets = [
             {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
             for log, s in zip(self.logs, self.sets, strict=True)
         ]
-        return proven(vehicle, self.verdict, sets).with_remark(origin_remark(train))
+        return proven(vehicle, self.verdict, sets).with_remark(origin_remark(self._train))
+
+    @property
+    def prediction(self) -> Vehicle | None:
+        """The same physics with residual terms, where those predict better; else None."""
+        if self.found.prediction is None:
+            return None
+        remark = "Residual terms predict better; the physical values are those of the other file."
+        return self.found.prediction.vehicle.with_remark(f"{origin_remark(self._train)}\n{remark}")
+
+    @property
+    def prediction_file_name(self) -> str:
+        """``pelican+motor_lag+prediction.yaml``."""
+        return f"{file_name(self.found.vehicle_name)}+prediction.yaml"
+
+    @property
+    def _train(self) -> list[Log]:
+        return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
 
     @property
     def file_name(self) -> str:

@@ -115,9 +115,12 @@ def section(name: str, one: FlightSet, row: Row) -> str:
         truth = "" if np.isnan(low) else f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
         cells = [_cell(p), p["status"], *((_cell(q), q["status"]) if (q := after.get(p["name"])) else ("", ""))]
         lines.append(f"| {p['name']} | {truth} | {' | '.join(cells)} |")
-    lines += ["", f"Verdict `{row.diagnosed['verdict']}`, error on data not fitted "
-              f"{row.diagnosed['validation']['mse_nominal']:.3g} → {row.diagnosed['validation']['mse_extended']:.3g} "
-              "noise variances. Found: " + (", ".join(_finding(f) for f in row.diagnosed["findings"]) or "nothing") + "."]
+    lines += [
+        "",
+        f"Verdict `{row.diagnosed['verdict']}`, error on data not fitted "
+        f"{row.diagnosed['validation']['mse_nominal']:.3g} → {row.diagnosed['validation']['mse_extended']:.3g} "
+        "noise variances. Found: " + (", ".join(_finding(f) for f in row.diagnosed["findings"]) or "nothing") + ".",
+    ]
     if row.prediction:
         lines += ["", f"Error {AHEAD:g} s ahead on {', '.join(one.unseen)}, as a share of no change:", "",
                   "| | " + " | ".join(QUANTITIES) + " |", "|---|---|---|---|---|"]  # fmt: skip

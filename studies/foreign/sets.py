@@ -41,7 +41,9 @@ SETS: dict[str, FlightSet] = {
     "ardupilot quad_sq": FlightSet(
         "ardupilot_sitl/quad_sq.yaml", ("ardupilot_sitl/quad_sq.bin",), (), _SQ, "ArduPilot's own physics",
     ),
-    "ardupilot x": FlightSet("ardupilot_sitl/sitl_x.yaml", ("ardupilot_sitl/x.bin",), (), _X, "ArduPilot's own physics"),
+    "ardupilot x": FlightSet(
+        "ardupilot_sitl/sitl_x.yaml", ("ardupilot_sitl/x.bin",), (), _X, "ArduPilot's own physics",
+    ),
     "brushed rpm": FlightSet(
         "brushed/vehicle.yaml", ("brushed/jana00.csv@:13", "brushed/jana02.csv@:11"),
         ("brushed/jana00.csv@13:", "brushed/jana02.csv@11:"), _BRUSHED, "thrust stand; published inertias",
@@ -60,7 +62,8 @@ SETS: dict[str, FlightSet] = {
     ),
     "crazyflie rpm": FlightSet(
         "crazyflie_rpm/vehicle.yaml", tuple(f"crazyflie_rpm/figure8_{i}.csv" for i in (17, 20, 22, 27, 34)),
-        tuple(f"crazyflie_rpm/figure8_{i}.csv" for i in (18, 21, 24, 30, 35)), {"b": _near(3.70e-8, 0.03)}, "regression",
+        tuple(f"crazyflie_rpm/figure8_{i}.csv" for i in (18, 21, 24, 30, 35)), {"b": _near(3.70e-8, 0.03)},
+        "regression",
     ),
     "nano-drone": FlightSet(
         "nanodrone/vehicle.yaml",
