@@ -17,6 +17,8 @@ from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
+from quadid.vehicle_size import impossible_hover, impossible_size
+from quadid.yaml_text import read_mapping
 
 FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
@@ -241,6 +243,10 @@ class Vehicle(_Strict):
 
     @model_validator(mode="after")
     def _physical(self) -> Vehicle:
+        low, high = self.parameters["b"].limits
+        slip = impossible_size(self.mass, self.arm) or impossible_hover((self.hover_speed(high), self.hover_speed(low)))
+        if slip:
+            raise ValueError(slip)
         try:
             rotor_drag_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
         except ParameterError as error:
@@ -333,12 +339,7 @@ class Vehicle(_Strict):
         Raises:
             VehicleError: with the key, what is allowed, and the nearest valid one.
         """
-        try:
-            raw = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise VehicleError(f"{origin}: not YAML ({str(error).splitlines()[0]})", "a YAML mapping") from error
-        if not isinstance(raw, dict):
-            raise VehicleError(f"{origin}: holds {type(raw).__name__}", "a mapping with name, mass, rotors, parameters")
+        raw = read_mapping(text, origin, "a mapping with name, mass, rotors, parameters")
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
@@ -378,7 +379,8 @@ class Vehicle(_Strict):
 
 
 def _first_problem(error: ValidationError) -> str:
-    detail = error.errors()[0]
+    details = error.errors()
+    detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])  # a slip explains what is missing
     place = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
         return f"unknown key '{place}'; {nearest(str(detail['loc'][-1]), _valid_keys(detail['loc'][:-1]))}"
