@@ -176,7 +176,7 @@ def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """An explanation in names of the contract, and its rotors from 1."""
     kind = one.hypothesis.kind
     if kind == "effort":
-        return ("thrust_drop" if one.value[0] > 0.0 else "mass_change",), ()
+        return ("thrust_drop" if one.value[0] > 0.0 else "mass_change",), ()  # alike but for the command's kind
     effects = ("cg_offset", "mass_change") if kind == "payload" else (kind,)
     return effects, tuple(j + 1 for j in one.hypothesis.rotors)
 
@@ -214,8 +214,10 @@ def _of_mass(
         more = (
             f"All rotors together need {100.0 * value:+.1f} % command for the same force, their balance is as it was."
         )
-        rival = Rival(("mass_change" if value > 0.0 else "thrust_drop",), (), one.p_value, share)
-        if value > 0.0:
+        # Of measured speeds rather a mass; of commands rather the battery, which they do not show.
+        thrust = value > 0.0 and vehicle.command.kind != "rotor_speed"
+        rival = Rival(("mass_change" if thrust else "thrust_drop",), (), one.p_value, share)
+        if thrust:
             drop = [1.0 - float(np.exp(-v)) for v in (value, low, high)]
             return (change("thrust_drop", [("fraction", "", drop[0], (drop[1], drop[2]))], more, (rival, *lost)),)
         return (change("mass_change", [("fraction", "", value, (low, high))], more, (rival, *lost)),)

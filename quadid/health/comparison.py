@@ -51,17 +51,19 @@ def explain(change: FloatArray, healthy: Healthy, flights: int, hypothesis: Hypo
     """Evidence and posterior of one explanation.
 
     The change is Student-t with the spread's mean degrees of freedom v and p = 4 dimensions:
-    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = c' S^-1 c, to a constant.  Parameters that cannot
+    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = r' S^-1 r with r the
+    change beyond the prior mean's, to a constant.  Parameters that cannot
     be negative restrict the Gaussian posterior; the restriction's odds (posterior over prior) count.
     """
     deviation = healthy.predictive(flights)
     noise = np.diag(deviation**2)
-    a, p = hypothesis.effect, hypothesis.prior
+    a, p, centre = hypothesis.effect, hypothesis.prior, hypothesis.centre
     freedom = float(healthy.freedom.mean())
     spread = noise + a @ p @ a.T
     gain = np.linalg.solve(spread, a @ p).T
-    value = gain @ change
-    quadratic = float(change @ np.linalg.solve(spread, change))
+    beyond = change - a @ centre
+    value = centre + gain @ beyond
+    quadratic = float(beyond @ np.linalg.solve(spread, beyond))
     tail = (freedom + len(change)) / 2.0
     scale = (freedom + quadratic) / (freedom + len(change))
     covariance = scale * (p - gain @ a @ p)

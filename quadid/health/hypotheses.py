@@ -34,7 +34,9 @@ MOST_ROTORS = 3
 _KINDS = {"weak_rotor": 0.7, "payload": 0.2, "cg_offset": 0.06, "effort": 0.04}
 """Prior odds of the kinds of change; a further damaged rotor costs `_ANOTHER`."""
 _ANOTHER = 0.3
-_MASSES = (0.0125, 0.025, 0.05, 0.1)
+_STEP = 0.15
+_MASSES = tuple(float(mass) for mass in 0.01 * np.exp(2.0 * _STEP * np.arange(13)))
+"""Added masses that are tried, from 1 % in steps of twice `_STEP` (relative), each with that standard deviation."""
 
 
 class Hypothesis(NamedTuple):
@@ -44,7 +46,8 @@ class Hypothesis(NamedTuple):
         kind: weak_rotor, payload (mass_change with cg_offset), cg_offset, effort (mass_change or thrust_drop).
         rotors: the damaged ones, from 0.
         effect: change of trim per parameter, shape (4, parameters).
-        prior: covariance of the parameters, shape (parameters, parameters), mean zero.
+        prior: covariance of the parameters, shape (parameters, parameters).
+        centre: their prior mean, shape (parameters,).
         positive: which parameters cannot be negative.
         log_odds: prior.
     """
@@ -53,6 +56,7 @@ class Hypothesis(NamedTuple):
     rotors: tuple[int, ...]
     effect: FloatArray
     prior: FloatArray
+    centre: FloatArray
     positive: tuple[int, ...]
     log_odds: float
 
@@ -81,7 +85,8 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
         for group in chosen:
             effect = np.hstack([single[j] for j in group])
             positive = tuple(range(0, 2 * count, 2))
-            out.append(Hypothesis("weak_rotor", group, effect, np.kron(np.eye(count), block), positive, float(odds)))
+            prior = np.kron(np.eye(count), block)
+            out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, float(odds)))
     return [*out, *_of_mass()]
 
 
@@ -90,13 +95,14 @@ def _of_mass() -> Sequence[Hypothesis]:
     shift = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # per x and y of the CG, in arms
     effort = np.array([[0.0], [0.0], [0.0], [1.0]])
     odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
-    out = [
-        Hypothesis(
-            "payload", (), np.hstack([shift, effort]), np.diag([(REACH * w) ** 2, (REACH * w) ** 2, w**2]), (2,),
-            odds["payload"] - float(np.log(len(_MASSES))),
-        )
-        for w in _MASSES
-    ]  # fmt: skip
-    out.append(Hypothesis("cg_offset", (), shift, SHIFT**2 * np.eye(2), (), odds["cg_offset"]))
-    out.append(Hypothesis("effort", (), effort, np.array([[MASS**2]]), (), odds["effort"]))
+    weights = np.exp(-0.5 * (np.array(_MASSES) / MASS) ** 2)
+    out = []
+    for mass, weight in zip(_MASSES, weights / weights.sum(), strict=True):
+        prior = np.diag([(REACH * mass) ** 2, (REACH * mass) ** 2, (_STEP * mass) ** 2])
+        centre = np.array([0.0, 0.0, mass])
+        log_odds = odds["payload"] + float(np.log(weight))
+        out.append(Hypothesis("payload", (), np.hstack([shift, effort]), prior, centre, (), log_odds))
+    none = np.zeros(2)
+    out.append(Hypothesis("cg_offset", (), shift, SHIFT**2 * np.eye(2), none, (), odds["cg_offset"]))
+    out.append(Hypothesis("effort", (), effort, np.array([[MASS**2]]), none[:1], (), odds["effort"]))
     return out

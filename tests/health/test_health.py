@@ -10,7 +10,7 @@ from quadid.health import Health, assess, flight_trim, healthy_spread
 from quadid.health.comparison import p_healthy
 from quadid.health.hypotheses import hypotheses
 from quadid.health.trims import trim_directions
-from quadid.vehicle import Vehicle
+from quadid.vehicle import Command, Vehicle
 from quadid.window import Recording
 from tests.health.hover import Wrong, hover, squared_speeds
 
@@ -71,8 +71,17 @@ def test_a_weight_on_an_arm_is_a_payload_and_no_rotor() -> None:
     assert named(found)["cg_offset"]["y"] == pytest.approx(shift[1], rel=0.3)
 
 
-def test_more_command_in_the_same_balance_is_thrust_or_mass() -> None:
+def test_more_speed_in_the_same_balance_is_a_mass_or_else_thrust() -> None:
     found = judged(PELICAN, Wrong(effort=0.15), seed=9)
+    (change,) = found.changes
+    assert change.effect == "mass_change"
+    assert change.rivals[0].effects == ("thrust_drop",)
+    assert change.parameters[0][2] == pytest.approx(0.14, abs=0.03)
+
+
+def test_more_command_in_the_same_balance_is_thrust_or_else_a_mass() -> None:
+    commanded = PELICAN.model_copy(update={"command": Command(kind="normalized", max_speed=900.0)})
+    found = judged(commanded, Wrong(effort=0.15), seed=9)
     (change,) = found.changes
     assert change.effect == "thrust_drop"
     assert change.rivals[0].effects == ("mass_change",)
