@@ -74,7 +74,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: health truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: health health-hours truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -89,6 +89,9 @@ campaign: venv ## blinded campaign of hidden effects (hours)
 
 real-logs: venv ## every recorded flight, identified and set beside what is known
 	$(STUDY) studies.real_logs --out docs/results
+
+health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
+	$(STUDY) studies.health.hours --out docs/results
 
 health: venv ## damaged and loaded Crazyflies, recorded; hidden damage, simulated; what their spread allows
 	$(STUDY) studies.health --out docs/results

@@ -152,6 +152,22 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     )  # fmt: skip
 
 
+def changes_of(
+    change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle, shares: FloatArray, changed: bool
+) -> tuple[Change, ...]:
+    """The best explanation of a change of trim.
+
+    Args:
+        change: of trim, shape (4,).
+        healthy: what it counts from, and the spread.
+        flights: number of flights that the change is the mean of.
+        vehicle: geometry.
+        shares: each rotor's share of the load with the change, shape (rotors,).
+        changed: whether it is one; else nothing is named with confidence.
+    """
+    return _changes(compare(change, healthy, flights, hypotheses(vehicle, shares, healthy.mean)), vehicle, changed)
+
+
 def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool) -> tuple[Change, ...]:
     """The best explanation as changes, largest first, with the explanations that lost."""
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])

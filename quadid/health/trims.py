@@ -45,6 +45,7 @@ class FlightTrim(NamedTuple):
         mean: trim at zero velocity, shape (4,), see `AXES`.
         parts: the same of parts of the flight (between landings, else thirds), shape (parts, 4).
         shares: each rotor's share of sum(w), shape (rotors,).
+        wander: standard deviation of means of three seconds about the flight's, shape (4,).
         vibration: logarithm of the accelerometer's noise above a quarter of its rate [log m/s²]; NaN without it.
         seconds: of steady flight.
         channels: what the effort and the motion were taken from, for people.
@@ -54,6 +55,7 @@ class FlightTrim(NamedTuple):
     mean: FloatArray
     parts: FloatArray
     shares: FloatArray
+    wander: FloatArray
     vibration: float
     seconds: float
     channels: str
@@ -66,6 +68,13 @@ def trim_directions(vehicle: Vehicle) -> FloatArray:
     """
     arms = vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[:, :2].mean(axis=0)
     return np.stack([-arms[:, 1] / vehicle.arm, arms[:, 0] / vehicle.arm, vehicle.spins])
+
+
+def trim_of_load(load: FloatArray, force: float | FloatArray, vehicle: Vehicle) -> FloatArray:
+    """Trims of mean squared rotor speeds (…, rotors) at specific forces (…) [m/s²], shape (…, 4)."""
+    total = load.sum(axis=-1)
+    balance = load @ trim_directions(vehicle).T / total[..., None]
+    return np.concatenate([balance, np.log(total / force)[..., None]], axis=-1)
 
 
 def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
@@ -92,14 +101,20 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     edges, load = edges[kept], load[kept]
     force, told = _specific_force(recording, edges)
     total = load.sum(axis=1)
-    trims = np.column_stack([load @ trim_directions(vehicle).T / total[:, None], np.log(total / force)])
+    trims = trim_of_load(load, force, vehicle)
     motion, moved = _motion(recording, vehicle, edges)
     mean, rest = _at_rest(trims, motion)
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
-        recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), _vibration(recording, edges),
-        len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
+        recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), wander(rest),
+        _vibration(recording, edges), len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
     )  # fmt: skip
+
+
+def wander(rest: FloatArray) -> FloatArray:
+    """Standard deviation of means of three seconds about the flight's, shape (4,), from what remains, (seconds, 4)."""
+    count = len(rest) // 3
+    return np.asarray(rest[: 3 * count].reshape(count, 3, -1).mean(axis=1).std(axis=0))
 
 
 def _block_means(t: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -1,0 +1,186 @@
+"""Health in flight: every second the trim of the last seconds against the vehicle's own healthy flights.
+
+Two questions, each with its own yardstick from these flights: does this flight differ from them more than they differ
+from each other, and do the last seconds differ from this flight so far more than seconds of a healthy flight do?  The
+second is the sharper one, for propellers, battery and landing are the same within a flight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.health.changes import Change, changes_of
+from quadid.health.comparison import distance, p_healthy
+from quadid.health.spread import Healthy, healthy_spread
+from quadid.health.trims import AXES, FlightTrim, trim_of_load, wander
+from quadid.vehicle import GRAVITY, Vehicle
+
+FloatArray = NDArray[np.float64]
+
+RECENT = 3
+"""Seconds that are compared, as many as `FlightTrim.wander` is of."""
+SETTLING = 10
+"""Seconds of a flight before its own seconds are compared with it."""
+GUARD = 2
+"""Seconds before the recent ones that count neither as recent nor as before."""
+RARE = 1e-8
+"""An alarm is a second that healthy flight has less often than this, twice in a row: 100 h hold 3.6e5 seconds."""
+LEAST_FLIGHT = 30
+"""Steady seconds that make a flight worth keeping."""
+ENOUGH = 3
+"""So many healthy flights before a flight is judged at all; until then each one is kept."""
+_LEAST_WANDER = np.array([0.002, 0.002, 0.002, 0.005])
+"""Smallest standard deviation of `RECENT` seconds about their flight, of `AXES`."""
+_STEADY_FORCE = 0.1
+"""A second whose specific force differs from gravity by more than this share is no steady flight."""
+_AIRBORNE = 0.5
+"""Flying is at least this share of the usual load."""
+
+
+@dataclass(frozen=True)
+class HealthReport:
+    """What is known of the vehicle's health in flight.
+
+    Attributes:
+        t: time of the last second that it rests on [s].
+        verdict: unchanged, changed or unknown.
+        has_baseline: whether there are enough healthy flights to compare with.
+        score: as `Health.score`; NaN without a baseline.
+        changes: what changed, the most probable explanation.
+        rotor_loss: fraction of thrust that each rotor lost, shape (rotors,); NaN without a baseline.
+        rotor_interval: 95 % intervals, shape (rotors, 2).
+        text: one sentence.
+    """
+
+    t: float
+    verdict: str
+    has_baseline: bool
+    score: float
+    changes: tuple[Change, ...]
+    rotor_loss: tuple[float, ...]
+    rotor_interval: tuple[tuple[float, float], ...]
+    text: str
+
+
+class HealthWatch:
+    """Watches one vehicle's flights.
+
+    Attributes:
+        history: healthy flights, the oldest first.
+    """
+
+    def __init__(self, vehicle: Vehicle, history: Sequence[FlightTrim] = ()) -> None:
+        """Starts with the healthy flights that are known."""
+        self.history = list(history)
+        self._vehicle = vehicle
+        self._healthy: Healthy | None = None
+        self._land()
+
+    def second(self, t: float, load: FloatArray, force: float) -> HealthReport | None:
+        """Takes one second of flight.
+
+        Args:
+            t: its end [s].
+            load: mean squared speed of each rotor, shape (rotors,).
+            force: mean specific force along -z [m/s²].
+
+        Returns:
+            A report on the first steady second, on an alarm, and every ten seconds between.
+        """
+        if abs(force / GRAVITY - 1.0) > _STEADY_FORCE or not load.min() > 0.0:
+            return None
+        self._trims.append(trim_of_load(load, force, self._vehicle))
+        self._shares.append(load / load.sum())
+        if self._healthy is None:
+            if len(self._trims) > 1:
+                return None
+            return self._without_baseline(t)
+        return self._judged(t, self._healthy)
+
+    def airborne(self, load: FloatArray) -> bool:
+        """Whether the rotors carry the vehicle, as far as the healthy flights or the first guess of b indicate."""
+        usual = self._vehicle.mass / self._vehicle.parameters["b"].initial
+        if self._healthy is not None:
+            usual = float(np.exp(self._healthy.mean[AXES.index("effort")]))
+        return bool(load.sum() > _AIRBORNE * usual * GRAVITY)
+
+    def landed(self) -> FlightTrim | None:
+        """Ends a flight; returns its trim where it is healthy and long enough to be kept, and keeps it."""
+        trims, alarmed = np.array(self._trims), self._alarm is not None
+        shares = np.mean(self._shares, axis=0) if self._shares else np.empty(0)
+        self._land()
+        if len(trims) < LEAST_FLIGHT or alarmed:
+            return None
+        mean = trims.mean(axis=0)
+        parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
+        kept = FlightTrim("", mean, parts, shares, wander(trims), np.nan, float(len(trims)), "in flight")
+        self.history.append(kept)
+        self._land()
+        return kept
+
+    def _land(self) -> None:
+        """Forgets the flight; looks at the history anew."""
+        self._trims: list[FloatArray] = []
+        self._shares: list[FloatArray] = []
+        self._suspect = False
+        self._alarm: HealthReport | None = None
+        if len(self.history) >= ENOUGH:
+            self._healthy = healthy_spread(self.history)
+            squares = np.mean([flight.wander**2 for flight in self.history], axis=0)
+            self._wander = np.maximum(np.sqrt(squares), _LEAST_WANDER)
+
+    def _without_baseline(self, t: float) -> HealthReport:
+        nan = (float("nan"),) * len(self._vehicle.rotors)
+        text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
+        return HealthReport(t, "unknown", False, float("nan"), (), nan, ((float("nan"),) * 2,) * len(nan), text)
+
+    def _judged(self, t: float, healthy: Healthy) -> HealthReport | None:
+        if self._alarm is not None or len(self._trims) < RECENT:
+            return None
+        now = np.mean(self._trims[-RECENT:], axis=0)
+        against = [self._of_history(healthy)]
+        before = self._trims[: -RECENT - GUARD]
+        if len(before) >= SETTLING:
+            against.append(self._of_flight(np.mean(before, axis=0), len(before), healthy))
+        chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
+        worst = int(np.argmin(chances))
+        rare = chances[worst] < RARE
+        if rare and self._suspect:
+            self._alarm = self._report(t, now, against[worst], "changed")
+            return self._alarm
+        self._suspect = rare
+        if len(self._trims) == RECENT or len(self._trims) % 10 == 0:
+            return self._report(t, now, against[0], "unchanged")
+        return None
+
+    def _of_history(self, healthy: Healthy) -> Healthy:
+        """The yardstick for seconds of another flight: between flights, and within one."""
+        between, within = healthy.deviation**2 * (1.0 + 1.0 / healthy.flights), self._wander**2
+        return healthy._replace(deviation=np.sqrt((between + within) / 2.0), flights=1)
+
+    def _of_flight(self, mean: FloatArray, seconds: int, healthy: Healthy) -> Healthy:
+        """The yardstick for seconds of the same flight."""
+        freedom = np.full(len(AXES), 10.0 * len(self.history))
+        flights = max(seconds // RECENT, 1)
+        shares = np.mean(self._shares[:seconds], axis=0)
+        return Healthy(mean, self._wander, freedom, flights, shares)
+
+    def _report(self, t: float, now: FloatArray, against: Healthy, verdict: str) -> HealthReport:
+        shares = np.mean(self._shares[-RECENT:], axis=0)
+        changes = changes_of(now - against.mean, against, 1, self._vehicle, shares, verdict == "changed")
+        n = len(self._vehicle.rotors)
+        loss, interval = [0.0] * n, [(0.0, 0.0)] * n
+        for change in changes if verdict == "changed" else ():
+            if change.effect == "weak_rotor":
+                numbers = {name: (value, ci) for name, _, value, ci in change.parameters}
+                j = int(numbers["rotor"][0]) - 1
+                loss[j] = numbers["loss"][0]
+                interval[j] = numbers["loss"][1] or (np.nan, np.nan)
+        far = distance(now - against.mean, against.predictive(1), against.freedom)
+        text = " ".join(change.evidence for change in changes) if verdict == "changed" else "as in healthy flights"
+        score = float(np.sqrt((far**2).sum()))
+        return HealthReport(t, verdict, True, score, changes, tuple(loss), tuple(interval), text)
