@@ -85,7 +85,10 @@ def _along(change: FloatArray, deviation: FloatArray, a: FloatArray, freedom: fl
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
-    """All explanations, the most probable first; those of one kind and rotors count as one, with the best's values."""
+    """All explanations, the best first; those of one kind and rotors count as one, with the best's values.
+
+    The best is the most probable one of the most probable kind: a kind is not worth less because it has many members.
+    """
     groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
     for one in offered:
         groups.setdefault((one.kind, one.rotors), []).append(explain(change, healthy, flights, one))
@@ -94,4 +97,9 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
         best = max(group, key=lambda one: one.log_evidence)
         total = float(np.logaddexp.reduce([one.log_evidence for one in group]))
         found.append(best._replace(log_evidence=total))
-    return sorted(found, key=lambda one: -one.log_evidence)
+    kinds: dict[str, list[float]] = {}
+    for one in found:
+        kinds.setdefault(one.hypothesis.kind, []).append(one.log_evidence)
+    best = max(kinds, key=lambda kind: float(np.logaddexp.reduce(kinds[kind])))
+    first = max((one for one in found if one.hypothesis.kind == best), key=lambda one: one.log_evidence)
+    return [first, *sorted((one for one in found if one is not first), key=lambda one: -one.log_evidence)]

@@ -70,8 +70,8 @@ def main() -> None:
     raised = [alarms(watch, rng, FLIGHT) for _ in range(count)]
     lines = [
         f"## Online\n`make health-hours`, seed 11. {count} healthy flights of {FLIGHT // 60} min "
-        f"({count * FLIGHT / 3600.0:.0f} h of hover), {HISTORY} before them; rotors, battery place and load differ from "
-        f"flight to flight (1 %, 1 mm, 1 %, 1 sigma), the thrust sags by 15 % an hour: **{sum(raised)} alarms**.\n",
+        f"({count * FLIGHT / 3600.0:.0f} h of hover), {HISTORY} before them; rotors, battery and load differ from "
+        f"flight to flight (1 %, 1 mm, 1 %: 1 sigma), thrust sags by 15 % an hour: **{sum(raised)} alarms**.\n",
         "| loss of one rotor | named within 5 s | alarm names the rotor | median seconds from onset |",
         "|---|---|---|---|",
     ]
