@@ -90,8 +90,9 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
     The best is the most probable one of the most probable kind: a kind is not worth less because it has many members.
     """
     groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
-    for one in offered:
-        groups.setdefault((one.kind, one.rotors), []).append(explain(change, healthy, flights, one))
+    for hypothesis in offered:
+        mine = groups.setdefault((hypothesis.kind, hypothesis.rotors), [])
+        mine.append(explain(change, healthy, flights, hypothesis))
     found = []
     for group in groups.values():
         best = max(group, key=lambda one: one.log_evidence)
@@ -100,6 +101,6 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
     kinds: dict[str, list[float]] = {}
     for one in found:
         kinds.setdefault(one.hypothesis.kind, []).append(one.log_evidence)
-    best = max(kinds, key=lambda kind: float(np.logaddexp.reduce(kinds[kind])))
-    first = max((one for one in found if one.hypothesis.kind == best), key=lambda one: one.log_evidence)
+    probable = max(kinds, key=lambda kind: float(np.logaddexp.reduce(kinds[kind])))
+    first = max((one for one in found if one.hypothesis.kind == probable), key=lambda one: one.log_evidence)
     return [first, *sorted((one for one in found if one is not first), key=lambda one: -one.log_evidence)]
