@@ -16,6 +16,7 @@ FloatArray = NDArray[np.float64]
 
 SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal says nothing about what happened between its samples; it is refused."""
+_HIGHEST_COMMAND = 1.5
 _HOW_TO_GET_MOTORS = (
     "log rotor speeds or motor outputs at 50 Hz or more: PX4 SDLOG_PROFILE high rate (actuator_motors, esc_status); "
     "ArduPilot LOG_BITMASK with RCOUT and FAST_ATTITUDE; ROS a rotor_speeds or motor_command topic; "
@@ -53,6 +54,7 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
         )  # fmt: skip
     source = channel.source or channel.name
     if channel.name == "rotor_speed":
+        _check_speeds(recording, channel)
         measured = described and recording.format != "csv"
         signal = RotorSignal(channel.t, channel.values, "instant" if measured else vehicle.command.sampling, source)
     else:
@@ -129,6 +131,17 @@ def _check_columns(recording: Recording, signal: RotorSignal, vehicle: Vehicle) 
         raise LogError(
             f"{recording.name}: {found} rotor columns ({signal.source})", f"{wanted}, the rotors of '{vehicle.name}'",
             "choose the vehicle file that belongs to this log",
+        )  # fmt: skip
+
+
+def _check_speeds(recording: Recording, speed: Channel) -> None:
+    """Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not."""
+    top = float(np.quantile(speed.values, 0.99))
+    if 0.0 < top <= _HIGHEST_COMMAND:
+        raise LogError(
+            f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
+            "rad/s",
+            "name the columns u1 … uN, with command: {kind: normalized, max_speed: <rad/s>} in the vehicle file",
         )  # fmt: skip
 
 

@@ -34,6 +34,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 EULER = ("phi", "theta", "psi")
 _ROTOR = {"rotor_speed": re.compile(r"w([1-9]\d?)"), "motor_command": re.compile(r"u([1-9]\d?)")}
+_SLOWEST_ROW, _FEW_ROWS = 0.9, 20
+"""Slower rows [s] say nothing about a flight; of fewer rows nothing is told."""
 _LINES = 4096
 LONGEST_LINE = 1 << 20
 """Characters; a row of numbers has some hundreds."""
@@ -52,6 +54,7 @@ def read_csv(path: Path) -> Recording:
         raise _no_rows(path, len(names), delimiter)
     if ignored:
         notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
+    _check_seconds(table[:, names.index("t")], path.name)
     clock = LogClock()
     t, accepted = clock.times(table[:, names.index("t")])
     refused = len(t) - int(np.count_nonzero(accepted))
@@ -61,7 +64,7 @@ def read_csv(path: Path) -> Recording:
         values = rows[:, [names.index(c) for c in columns]]
         blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
         if columns == EULER:
-            notes += _suspect_degrees(values)
+            _check_radians(values, path.name)
             values = from_euler(values)
         raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(columns), refused))
     recording = assemble(path.name, "csv", raw, clock, notes)
@@ -77,12 +80,27 @@ def _no_rows(path: Path, width: int, delimiter: str) -> LogError:
     return LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
 
 
-def _suspect_degrees(angles: FloatArray) -> list[str]:
-    """Pitch in radians never leaves +-pi/2, and roll seldom two turns."""
+def _check_radians(angles: FloatArray, origin: str) -> None:
+    """Pitch in radians never leaves +-pi/2, and nothing rolls more than a few turns; raises LogError for degrees."""
     roll, pitch = np.nanmax(np.abs(angles[:, :2]), axis=0, initial=0.0)
     if pitch <= 0.5 * np.pi + 0.01 and roll <= 4.0 * np.pi:
-        return []
-    return [f"phi and theta reach {roll:.3g} and {pitch:.3g}: degrees? they are read as radians"]
+        return
+    raise LogError(
+        f"{origin}: columns phi and theta reach {roll:.3g} and {pitch:.3g}: degrees?", "radians",
+        "multiply phi, theta and psi by 0.0174533",
+    )  # fmt: skip
+
+
+def _check_seconds(t: FloatArray, origin: str) -> None:
+    """Logs have many rows a second; raises LogError for times in milli- or microseconds."""
+    step = sample_period(t)
+    if len(t) < _FEW_ROWS or not step >= _SLOWEST_ROW:
+        return
+    unit, factor = ("milliseconds", 1e-3) if step < 500.0 else ("microseconds", 1e-6)
+    raise LogError(
+        f"{origin}: column t rises by {step:.6g} a row: {unit}?", f"seconds, rows at most {_SLOWEST_ROW} s apart",
+        f"multiply t by {factor:g}",
+    )  # fmt: skip
 
 
 def _header(path: Path) -> tuple[list[str], str]:

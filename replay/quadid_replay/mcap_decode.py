@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid_replay.bag_topics import Topic
 from quadid_replay.cdr_blocks import BlockReader, Read
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns
 from quadid_replay.mcap_messages import MessageType
-from quadid_replay.mcap_records import Topic
 from quadid_replay.signal_columns import UNDECODABLE, SignalColumns
 
 FloatArray = NDArray[np.float64]

@@ -1,11 +1,10 @@
-"""ROS 2 MCAP: picks the topics, decodes them, and brings their stamps onto one clock."""
+"""ROS 2 logs: picks the topics, decodes them, and brings their stamps onto one clock."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,44 +16,46 @@ from quadid.errors import LogError
 from quadid.resample import fresh_rows
 from quadid.sanitise import plain
 from quadid.window import Recording
+from quadid_replay.bag_topics import Topic
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.definition_check import DefinitionError, check_definition
 from quadid_replay.mcap_decode import Source, decode_messages, source_of
 from quadid_replay.mcap_messages import SIGNALS, TYPES, type_name
-from quadid_replay.mcap_records import McapFile, Topic
 from quadid_replay.motors import active_outputs
 from quadid_replay.presets import AUTO, preset_rank
+from quadid_replay.rosbag2_files import Bag, open_bag
 
 
 def read_mcap(path: Path, preset: str = AUTO) -> Recording:
-    """Reads a ROS 2 MCAP log, whole or damaged.
+    """Reads a ROS 2 log, whole or damaged: an MCAP file, a rosbag2 database or a rosbag2 folder.
 
     Args:
-        path: the file.
+        path: the file or folder.
         preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
 
     Raises:
         LogError: no topic of a known type, unknown preset, or a file made to exhaust memory.
     """
-    file = McapFile(path)
+    bag = open_bag(path)
     notes: list[str] = []
-    sources = _sources(file, preset, notes)
+    sources = _sources(bag, preset, notes)
     if not sources:
-        raise _no_topic(path, file, preset, notes)
-    columns, stamps, failed = decode_messages(file.messages(sources.keys()), sources)
-    notes = [*file.damage(), *notes]
+        raise _no_topic(path, bag, preset, notes)
+    columns, stamps, failed = decode_messages(bag.messages(sources.keys()), sources)
+    notes = [*bag.damage(), *notes]
     if failed:
         notes.append(f"{failed} messages could not be decoded and were dropped")
     if stamps.base_ns:
         notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
-    recording = assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
-    return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
+    return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
 
 
-def _sources(file: McapFile, preset: str, notes: list[str]) -> dict[int, Source]:
+def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
     """Picks the topics whose type is known and whose name the preset lists for one of its channels."""
     sources = {}
-    for number, topic in file.topics.items():
+    for number, topic in bag.topics.items():
+        if not topic.type and topic.unread:
+            notes.append(f"{topic.name}: {topic.unread}: not read; record it with a ros2msg definition")
         kind = TYPES.get(type_name(topic.type))
         if kind is None or topic.encoding != "cdr":
             continue
@@ -130,9 +131,10 @@ def _repeats(entry: RawChannel) -> bool:
     return len(fresh_rows(entry.values)) < 0.9 * len(entry.values)
 
 
-def _no_topic(path: Path, file: McapFile, preset: str, notes: list[str]) -> LogError:
-    found = ", ".join(f"{t.name} [{type_name(t.type) or t.encoding}]" for t in list(file.topics.values())[:5])
-    damage = plain("; ".join([*file.damage(), *notes[:4]]), 600)
+def _no_topic(path: Path, bag: Bag, preset: str, notes: list[str]) -> LogError:
+    unread = "type without a readable definition"
+    found = ", ".join(f"{t.name} [{type_name(t.type) or t.unread or unread}]" for t in list(bag.topics.values())[:5])
+    damage = plain("; ".join([*bag.damage(), *notes[:4]]), 600)
     reason = f" ({damage})" if damage else ""
     return LogError(
         f"{path.name}: no topic to read with preset '{preset}' among: {found or 'none'}{reason}",

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator, Set
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -23,6 +23,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid_replay.bag_topics import Topic, usable_definition
 from quadid_replay.mcap_order import Message, Part, in_log_time
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -35,15 +36,6 @@ _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 _FOOTER_SIZE = 9 + 20 + len(MAGIC)
-
-
-class Topic(NamedTuple):
-    """One channel of the file; name, type and encoding are fit to be shown."""
-
-    name: str
-    type: str
-    definition: str
-    encoding: str
 
 
 class _DamagedError(Exception):
@@ -83,9 +75,11 @@ class McapFile:
         out = {}
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
-            text = schema.data.decode("utf-8", "replace") if schema else ""
-            kind = schema.name if schema and schema.encoding == "ros2msg" else ""
-            out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding))
+            held = schema.data.decode("utf-8", "replace") if schema else ""
+            text = usable_definition(schema.name, schema.encoding, held) if schema else ""
+            kind = schema.name if schema and text else ""
+            idl = f"{plain(schema.name, 60)} is described in IDL" if schema and schema.encoding == "ros2idl" else ""
+            out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding), idl)
         return out
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:

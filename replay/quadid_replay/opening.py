@@ -9,6 +9,7 @@ from pathlib import Path
 
 from quadid.errors import LogError
 from quadid.window import Recording
+from quadid_replay.bag_folder import bag_files, is_bag_folder
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
@@ -24,7 +25,8 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     A large one (`LARGE`) is read in a child process with limited memory and time, see `quadid_replay.reading`.
 
     Args:
-        path: the file; its format is told by its content, never by its suffix.
+        path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
+            recording.
         preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
 
     Raises:
@@ -33,13 +35,14 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    recognise(_head(file), file.name)
-    status = file.stat()
-    if status.st_size >= LARGE:
-        stored = 512 * status.st_blocks
-        if stored < _STORED * status.st_size:
+    _kind(file)
+    sizes = [part.stat() for part in _parts(file)]
+    size = sum(part.st_size for part in sizes)
+    if size >= LARGE:
+        stored = 512 * sum(part.st_blocks for part in sizes)
+        if stored < _STORED * size:
             raise LogError(
-                f"{file.name}: {status.st_size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
+                f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
                 "copy it again: the copy or the logger stopped before the end",
             )  # fmt: skip
         from quadid_replay.reading import read_in_child
@@ -50,9 +53,9 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
 
 def read_here(file: Path, preset: str) -> Recording:
     """Reads a log in this process, whatever its size; else as `open_log`."""
-    kind = recognise(_head(file), file.name)
+    kind = _kind(file)
     try:
-        if kind == "mcap":
+        if kind in ("mcap", "rosbag2"):
             from quadid_replay.mcap_reader import read_mcap
 
             recording = read_mcap(file, preset=preset)
@@ -78,10 +81,28 @@ def _reader(kind: Format) -> Callable[[Path], Recording]:
     return read
 
 
+def _kind(file: Path) -> Format:
+    """The format of a file; of a folder, that it is a recording of rosbag2."""
+    try:
+        if file.is_dir() and is_bag_folder(file):
+            return "rosbag2"
+    except (OSError, ValueError):  # `_head` says what is wrong with such a path
+        pass
+    return recognise(_head(file), file.name)
+
+
+def _parts(file: Path) -> list[Path]:
+    return bag_files(file) if file.is_dir() else [file]
+
+
 def _head(file: Path) -> bytes:
     try:
         if file.is_dir():
-            raise LogError(f"{file} is a directory", ALLOWED, "name one log file; for a folder use `quadid fleet`")
+            raise LogError(
+                f"{file} is a directory",
+                ALLOWED,
+                "name one log file, or the folder of a rosbag2 recording; for many logs use `quadid fleet`",
+            )
         if file.exists() and not file.is_file():
             raise LogError(f"{file} is no regular file", ALLOWED, "copy what it yields to a file first")
         with file.open("rb") as stream:
@@ -99,5 +120,9 @@ def _unreadable(file: Path, error: OSError) -> LogError:
 
 
 def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    for part in _parts(file):
+        with part.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

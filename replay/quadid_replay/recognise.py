@@ -6,22 +6,22 @@ from typing import Literal
 
 from quadid.errors import LogError
 
-Format = Literal["mcap", "tlog", "dataflash", "ulog", "usdlog", "csv"]
+Format = Literal["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "csv"]
 HEAD_BYTES = 65536
 """How much of the file is looked at."""
 ALLOWED = (
-    "ROS 2 MCAP, MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, Crazyflie µSD log, "
+    "ROS 2 MCAP and rosbag2 (.db3 or folder), MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, Crazyflie µSD log, "
     "CSV with a header row and a column t"
 )
 
 _MAGIC: tuple[tuple[bytes, Format], ...] = (
     (b"\x89MCAP0\r\n", "mcap"),
+    (b"SQLite format 3\x00", "rosbag2"),
     (b"ULog\x01\x12\x35", "ulog"),
     (b"\xbc\x02\x00", "usdlog"),
 )
 _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"#ROSBAG V2.0", "a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst DIR, then to MCAP"),
-    (b"SQLite format 3\x00", "a rosbag2 SQLite database", "convert it: ros2 bag convert with output storage mcap"),
     (b"\x1f\x8b", "gzip-compressed", "unpack it: gunzip FILE"),
     (b"\x28\xb5\x2f\xfd", "zstd-compressed", "unpack it: zstd -d FILE"),
     (b"PK\x03\x04", "a zip archive", "unpack it: unzip FILE"),

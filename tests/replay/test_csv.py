@@ -10,6 +10,8 @@ from quadid_replay import open_log
 from quadid_replay.frames import from_euler
 
 from quadid.errors import LogError
+from quadid.grid import grid_recording
+from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 
 HEADER = "t,p,q,r,ax,ay,az,phi,theta,psi,w1,w2,w3,w4\n"
@@ -134,10 +136,30 @@ def test_what_is_wrong_is_said_with_what_is_allowed(tmp_path: Path, text: str, e
 
 
 @pytest.mark.parametrize("columns", ["phi,theta,psi", "p,q,r"])
-def test_angles_beyond_a_turn_are_suspected_to_be_degrees(tmp_path: Path, columns: str) -> None:
-    lines = [f"{i * 0.02:.2f},{20 * np.sin(i / 9):.4f},{15 * np.cos(i / 7):.4f},{i % 360}\n" for i in range(200)]
-    recording = open_log(written(tmp_path, f"t,{columns}\n" + "".join(lines)))
-    assert any("degrees" in w for w in recording.warnings) == (columns == "phi,theta,psi")
+def test_angles_beyond_a_turn_are_refused_as_degrees(tmp_path: Path, columns: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"t,{columns}\n" + "".join(f"{0.02 * k},30,-20,{k}\n" for k in range(50)))
+    if columns == "p,q,r":
+        assert "gyro" in open_log(path).channels  # rates may be any number
+    else:
+        with pytest.raises(LogError, match=r"columns phi and theta reach 30 and 20: degrees.*multiply phi"):
+            open_log(path)
+
+
+@pytest.mark.parametrize(("step", "unit"), [(20, "milliseconds"), (2, "milliseconds"), (20_000, "microseconds")])
+def test_time_in_another_unit_is_named_with_its_column(tmp_path: Path, step: int, unit: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,p,q,r\n" + "".join(f"{step * k},0,0,0\n" for k in range(50)))
+    with pytest.raises(LogError, match=rf"column t rises by {step} a row: {unit}\?.*multiply t by"):
+        open_log(path)
+
+
+def test_commands_called_speeds_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = "".join(f"{0.02 * k:.2f},0,0,0,0.5,0.5,0.6,0.5\n" for k in range(100))
+    path.write_text("t,p,q,r,w1,w2,w3,w4\n" + rows)
+    with pytest.raises(LogError, match=r"rotor speeds up to 0\.6 .* commands from 0 to 1.*name the columns u1"):
+        grid_recording(open_log(path), Vehicle.shipped("pelican"))
 
 
 def test_opening_what_is_no_log(tmp_path: Path) -> None:

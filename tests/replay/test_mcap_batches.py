@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from mcap_ros2.writer import Writer as RosWriter
 from quadid_replay import mcap_decode, open_log, write_mcap
+from quadid_replay.bag_topics import Topic
 from quadid_replay.mcap_decode import decode_messages, source_of
 from quadid_replay.mcap_messages import MessageType
-from quadid_replay.mcap_records import Topic
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError

@@ -1,0 +1,121 @@
+"""rosbag2 databases and folders, written by another library, are the same recording as the MCAP file."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from quadid_replay import open_log, write_mcap
+from quadid_replay.mcap_records import McapFile
+from quadid_replay.schemas import schema_text
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from quadid.errors import LogError
+from quadid.window import Recording
+from tests.replay.synthetic import full_recording
+
+
+@pytest.fixture(scope="module")
+def mcap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "flight.mcap"
+    write_mcap(path, full_recording(4.0, 50.0))
+    return path
+
+
+def folder_of(mcap: Path, target: Path, storage: StoragePlugin) -> Path:
+    """The standard messages of an MCAP, as the library rosbags writes them into a folder."""
+    file, store = McapFile(mcap), get_typestore(Stores.ROS2_JAZZY)
+    topics = {n: t for n, t in file.topics.items() if t.type in store.types}
+    with Writer(target, version=9, storage_plugin=storage) as writer:
+        links = {n: writer.add_connection(t.name, t.type, typestore=store) for n, t in topics.items()}
+        for number, stamp, data in file.messages(topics.keys()):
+            writer.write(links[number], stamp, data)
+    return target
+
+
+def same(found: Recording, expected: Recording) -> None:
+    assert {"gyro", "accel", "attitude", "rotor_speed"} <= set(found.channels)
+    for name, channel in found.channels.items():
+        np.testing.assert_array_equal(channel.t, expected.channels[name].t)
+        np.testing.assert_array_equal(channel.values, expected.channels[name].values)
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_a_folder_is_read_as_the_file(tmp_path: Path, mcap: Path, storage: StoragePlugin) -> None:
+    folder = folder_of(mcap, tmp_path / "flight_1", storage)
+    recording = open_log(folder)
+    same(recording, open_log(mcap))
+    assert recording.name == "flight_1"
+    assert len(recording.sha256) == 64
+
+
+def test_a_database_is_read_by_itself_with_or_without_definitions(tmp_path: Path, mcap: Path) -> None:
+    (database,) = folder_of(mcap, tmp_path / "a", StoragePlugin.SQLITE3).glob("*.db3")
+    same(open_log(database), open_log(mcap))
+    with sqlite3.connect(database) as connection:
+        connection.execute("DROP TABLE IF EXISTS message_definitions")
+    connection.close()
+    same(open_log(database), open_log(mcap))
+
+
+def test_a_recording_in_several_files_is_one(tmp_path: Path, mcap: Path) -> None:
+    """The second half is in a file of its own, whose name sorts before that of the first as text does."""
+    folder = folder_of(mcap, tmp_path / "split", StoragePlugin.SQLITE3)
+    (first,) = folder.glob("*.db3")
+    second = folder / "split_10.db3"
+    shutil.copy(first, second)
+    first = first.rename(folder / "split_9.db3")
+    with sqlite3.connect(first) as one:
+        (middle,) = one.execute("SELECT avg(timestamp) FROM messages").fetchone()
+        one.execute("DELETE FROM messages WHERE timestamp >= ?", (middle,))
+    with sqlite3.connect(second) as two:
+        two.execute("DELETE FROM messages WHERE timestamp < ?", (middle,))
+        two.execute("UPDATE messages SET topic_id = topic_id + 100")
+        two.execute("UPDATE topics SET id = id + 100")
+    one.close()
+    two.close()
+    same(open_log(folder), open_log(mcap))
+
+
+def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "other.db") as connection:
+        connection.execute("CREATE TABLE a (b)")
+    connection.close()
+    with pytest.raises(LogError, match="an SQLite database, but no rosbag2"):
+        open_log(tmp_path / "other.db")
+    data = (tmp_path / "other.db").read_bytes()
+    (tmp_path / "damaged.db").write_bytes(data[:100] + b"\xff" * (len(data) - 100))
+    with pytest.raises(LogError, match="damaged SQLite database"):
+        open_log(tmp_path / "damaged.db")
+    (tmp_path / "packed").mkdir()
+    for name in ("metadata.yaml", "a_0.db3", "a_0.db3.zstd"):
+        (tmp_path / "packed" / name).write_text("x")
+    with pytest.raises(LogError, match=r"a_0\.db3\.zstd is compressed"):
+        open_log(tmp_path / "packed")
+    with pytest.raises(LogError, match="is a directory"):
+        open_log(tmp_path)
+
+
+def test_a_definition_in_idl_is_replaced_or_named(tmp_path: Path, mcap: Path) -> None:
+    source = McapFile(mcap)
+    (imu,) = (n for n, t in source.topics.items() if t.type == "sensor_msgs/msg/Imu")
+    path = tmp_path / "idl.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros2")
+        known = writer.register_schema("sensor_msgs/msg/Imu", "ros2idl", b"module sensor_msgs {};")
+        strange = writer.register_schema("my_msgs/msg/Rpm", "ros2idl", b"module my_msgs {};")
+        channel = writer.register_channel("imu", "cdr", known)
+        writer.register_channel("rpm", "cdr", strange)
+        for _, stamp, data in source.messages({imu}):
+            writer.add_message(channel, stamp, data, stamp)
+        writer.finish()  # type: ignore[no-untyped-call]
+    recording = open_log(path)
+    np.testing.assert_array_equal(recording.channels["gyro"].values, open_log(mcap).channels["gyro"].values)
+    assert any("rpm" in note and "IDL" in note for note in recording.warnings)
+    assert schema_text("sensor_msgs/Imu")
