@@ -74,15 +74,15 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: health health-hours truth cases campaign real-diagnosis real-logs paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: health health-hours truth cases campaign foreign real-logs paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
 	$(STUDY) studies.cases
 
-real-diagnosis: venv ## every recorded flight, diagnosed; gain on other flights
-	$(STUDY) studies.real_diagnosis --out docs/results
+foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression and networks (half an hour)
+	$(STUDY) studies.foreign --out docs/results
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results
