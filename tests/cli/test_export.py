@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from quadid.report.programs import FORMATS, export
+from quadid.residual import ResidualTerm
 from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, Vehicle
 from tests.cli.conftest import Cli, one_line
 
@@ -116,6 +117,47 @@ def test_ardupilot_frame_is_json_below_its_comments(vehicle: Vehicle) -> None:
     assert data["moment_inertia"] == [8e-3, 8e-3, 1.5e-2]
     assert data["hoverThrOut"] == pytest.approx(1.3 * GRAVITY / (4 * 2.3e-5 * SPEED**2), rel=1e-5)
     assert "MOT_THST_HOVER," in texts[".param"]
+
+
+def frame_of(vehicle: Vehicle) -> dict[str, Any]:
+    text = export(vehicle, "ardupilot", "x.yaml")[".sitl.json"]
+    read: dict[str, Any] = json.loads(text[text.index("{") :])
+    return read
+
+
+def test_the_simulator_puts_the_motors_where_the_vehicle_has_them() -> None:
+    vehicle = Vehicle.shipped("pelican_x")
+    arm = frame_of(vehicle)["diagonal_size"]
+    # SIM_Frame.cpp, quad X: angles of the motors from forward, clockwise; at this distance from the centre
+    angles = np.radians([45.0, -135.0, -45.0, 135.0])
+    placed = arm * np.column_stack([np.cos(angles), np.sin(angles)])
+    flown = vehicle.rotor_positions[:, :2]
+    assert all(np.linalg.norm(flown - p, axis=1).min() < 1e-4 for p in placed)
+
+
+def test_ardupilot_gets_the_curve_that_was_fitted_and_names_what_it_cannot_hold(vehicle: Vehicle) -> None:
+    curved = vehicle.model_copy(
+        update={
+            "effects": {"thrust_curve": {"dead_speed": -100.0}, "weak_rotor": {"rotor": 2, "loss": 0.1}},
+            "residual": (ResidualTerm(acts_on="moment_x", product=("p",), value=-1e-3),),
+        }
+    )
+    frame = frame_of(curved)
+    text = export(curved, "ardupilot", "x.yaml")[".sitl.json"]
+    full, e = SPEED, frame["propExpo"]
+    speed = np.linspace(0.2, 1.0, 5) * full
+    thrust = (speed + 100.0) ** 2 - 100.0**2  # beyond what is left at no command
+    np.testing.assert_allclose((1 - e) * speed / full + e * (speed / full) ** 2, thrust / thrust[-1], rtol=1e-5)
+    assert "weak_rotor" in text
+    assert "residual (moment_x += -0.001 p)" in text
+    assert "propExpo" not in frame_of(vehicle)
+
+
+def test_pulse_widths_of_the_vehicle_are_spin_limits_of_the_simulator() -> None:
+    pelican = Vehicle.shipped("pelican")
+    pwm = pelican.command.model_copy(update={"kind": "pwm", "range": (1150.0, 1950.0), "max_speed": 900.0})
+    frame = frame_of(pelican.model_copy(update={"command": pwm}))
+    assert (frame["spin_min"], frame["spin_max"]) == (0.15, 0.95)
 
 
 @pytest.mark.parametrize("form", FORMATS)

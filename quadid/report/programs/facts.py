@@ -110,6 +110,7 @@ class Facts:
             used: effects that the form carries.
         """
         left = [name for name in self.vehicle.effects if name not in used]
+        left += [f"residual ({t.formula})" for t in self.vehicle.residual if "residual" not in used]
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
         lines += [
             f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",

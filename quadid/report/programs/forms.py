@@ -30,7 +30,9 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
     """
     facts = Facts(vehicle, source)
     if form == "yaml":
-        return {".yaml": "".join(f"# {line}\n" for line in facts.header(tuple(vehicle.effects))) + vehicle.to_yaml()}
+        return {
+            ".yaml": "".join(f"# {line}\n" for line in facts.header((*vehicle.effects, "residual"))) + vehicle.to_yaml()
+        }
     if form == "px4":
         return {".params": px4(facts)}
     if form == "ardupilot":
