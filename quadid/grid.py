@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.intersample import follow_feedback
+from quadid.mounting import in_body_axes
 from quadid.resample import COINCIDENT, sample_period
 from quadid.resampling_plan import REQUIRED, Plan, holes, make_plan, on_grid, reach
 from quadid.rotor_signal import RotorSignal, rotor_signal
@@ -109,6 +110,7 @@ def grid_recording(
     """
     if rate is not None and not (math.isfinite(rate) and 1.0 <= rate <= 2000.0):
         raise LogError(f"grid rate {rate} Hz", "1 to 2000 Hz", "leave it out for 50 Hz")
+    recording = in_body_axes(recording, vehicle)
     rotor = rotor_signal(recording, vehicle)
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
     spans = _spans(plan)

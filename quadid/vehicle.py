@@ -37,6 +37,7 @@ MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 
 
 class _Strict(BaseModel):
@@ -165,6 +166,13 @@ class Proof(_Strict):
         return "" if self.unseen else "no flight was predicted that was not fitted"
 
 
+class Mounting(_Strict):
+    """The IMU in the body: rotation (roll, pitch, yaw) [rad] and position from the geometric centre, FRD [m]."""
+
+    rotation: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+
+
 class ThrustPoint(_Strict):
     """One reading of a thrust stand, one rotor: speed [rad/s], thrust [N]."""
 
@@ -185,6 +193,8 @@ class Vehicle(_Strict):
         reference_voltage: supply voltage that effects count from [V]; the mean of the training flights.
         noise: known sensor noise, or None.
         stabiliser: known stabiliser gains, or None.
+        mounting: the IMU in the body; its position is the effect `imu_lever_arm`.
+        columns: names in a CSV for those of the contract, such as {p: gyro_x}.
         mixer: from logged mixer inputs to rotors, a name of `MIXERS` or a matrix with a row a rotor; or None.
         residual: forces and moments beyond the catalogue, of a file that predicts.
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
@@ -205,6 +215,8 @@ class Vehicle(_Strict):
     reference_voltage: float | None = Field(default=None, gt=0.0)
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
+    mounting: Mounting = Mounting()
+    columns: dict[str, str] = Field(default_factory=dict, max_length=64)
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
     residual: tuple[ResidualTerm, ...] = Field(default=(), max_length=MOST_TERMS)
     proof: Proof | None = None
@@ -240,6 +252,20 @@ class Vehicle(_Strict):
                 if not isinstance(number, int | float) or math.isnan(number):
                     raise ValueError(f"effect '{name}': {key} = {number!r} is not a number")
         return value or {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lever_arm(cls, value: Any) -> Any:
+        """The position of the IMU is the effect `imu_lever_arm`, which the file may not give twice."""
+        mounting = value.get("mounting") if isinstance(value, dict) else None
+        place = mounting.get("position") if isinstance(mounting, dict) else None
+        effects = value.get("effects") or {} if place else {}
+        if not place or not isinstance(effects, dict) or not isinstance(place, list | tuple) or len(place) != 3:
+            return value
+        arm = dict(zip("xyz", place, strict=True))
+        if effects.get("imu_lever_arm", arm) != arm:
+            raise ValueError("mounting.position and effects.imu_lever_arm differ; give one of them")
+        return {**value, "effects": {**effects, "imu_lever_arm": arm}}
 
     @model_validator(mode="after")
     def _physical(self) -> Vehicle:
@@ -359,9 +385,11 @@ class Vehicle(_Strict):
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
         data = self.model_dump(mode="json", exclude_none=True)
-        for name in ("mass_sigma", "arm_sigma", "thrust_stand", "residual"):
+        for name in ("mass_sigma", "arm_sigma", "thrust_stand", "residual", "columns"):
             if not data[name]:
                 del data[name]
+        if self.mounting == Mounting():
+            del data["mounting"]
         head = "".join(f"# {line}\n" for line in self._remark.splitlines())
         return head + str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
 
@@ -390,7 +418,7 @@ def _first_problem(error: ValidationError) -> str:
 
 def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
     models: dict[str, type[BaseModel]] = {
-        "rotors": Rotor, "thrust_stand": ThrustPoint,
+        "rotors": Rotor, "thrust_stand": ThrustPoint, "mounting": Mounting,
         "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser, "proof": Proof,
     }  # fmt: skip
     model = models.get(str(path[0]), Vehicle) if path else Vehicle

@@ -79,7 +79,7 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
-    recording = open_log(log, preset)
+    recording = open_log(log, preset, described.columns)
     if as_recorded:
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle

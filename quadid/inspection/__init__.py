@@ -9,11 +9,12 @@ from quadid.inspection.airborne import Spans, flying_spans
 from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
 from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
-from quadid.inspection.motor_checks import hover_check, lagged_motion, motor_order_check
+from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
 from quadid.inspection.rotor_checks import rotor_speed_check
 from quadid.inspection.rotor_timing import rotor_timing_check
 from quadid.inspection.timing import channel_facts, timing_checks
+from quadid.mounting import in_body_axes
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 
@@ -31,11 +32,12 @@ def inspect(
         excitation: rows per parameter computed elsewhere (`quadid.identify`); passed on as they are.
     """
     facts = channel_facts(recording)
-    spans = flying_spans(recording, vehicle)
+    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
+    spans = flying_spans(turned, vehicle)
     checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
-    checks += [gravity_check(recording, spans), gyro_check(recording), velocity_check(recording)]
+    checks += [gravity_check(turned, spans), gyro_check(turned), velocity_check(turned)]
     if vehicle is not None:
-        checks += _against_vehicle(recording, vehicle, spans)
+        checks += _against_vehicle(turned, vehicle, spans, lagged_motion(recording, vehicle, spans))
     return Inspection(
         name=recording.name,
         format=recording.format,
@@ -52,9 +54,8 @@ def inspect(
     )
 
 
-def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans) -> list[Check]:
+def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans, lagged: Lagged | str) -> list[Check]:
     """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
-    lagged = lagged_motion(recording, vehicle, spans)
     speeds = rotor_speed_check(recording, vehicle, spans)
     if speeds.verdict is Verdict.ERROR:
         return [speeds]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
+from quadid.mounting import in_body_axes
 from quadid.online.channel_buffer import ChannelBuffer
 from quadid.online.clock import StreamClock
 from quadid.online.command_reconstruction import CommandReconstruction
@@ -266,7 +267,7 @@ class Resampler:
             channel = buffer.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
             if channel is not None:
                 channels[name] = channel
-        recording = Recording("live", "stream", channels)
+        recording = in_body_axes(Recording("live", "stream", channels), self._vehicle)
         try:
             rotor = self._rotor_signal(recording, at, arrived)
         except QuadidError as error:

@@ -65,7 +65,8 @@ def inspect(
         cut = parse_cut(str(log), start, stop)
         whole = None
     described = None if vehicle is None else as_vehicle(vehicle)
-    recording = _part(open_recording(cut.path, preset) if whole is None else whole, cut.start, cut.stop)
+    names = None if described is None else described.columns
+    recording = _part(open_recording(cut.path, preset, names) if whole is None else whole, cut.start, cut.stop)
     rows = () if described is None else _excitation(recording, described)
     found = inspect_recording(recording, described, rows)
     return Inspected({**found.to_dict(), "log": str(cut.path.resolve()), "files": []}, found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -162,7 +162,7 @@ def load(
     """
     described = as_vehicle(vehicle)
     cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
-    recording = open_recording(cut.path, preset)
+    recording = open_recording(cut.path, preset, described.columns)
     doubts = () if unchecked else check_conventions(recording, described)
     windows, report = _gridded(recording, described, rate, cut)
     return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
@@ -178,9 +178,9 @@ def load_logs(
     ]
 
 
-def open_recording(path: Path, preset: str = "auto") -> Recording:
+def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a log of any kind; the reader is a package of its own and is looked up by name only here."""
-    recording: Recording = importlib.import_module("quadid_replay").open_log(path, preset)
+    recording: Recording = importlib.import_module("quadid_replay").open_log(path, preset, columns)
     return recording
 
 

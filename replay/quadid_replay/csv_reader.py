@@ -41,13 +41,17 @@ LONGEST_LINE = 1 << 20
 """Characters; a row of numbers has some hundreds."""
 
 
-def read_csv(path: Path) -> Recording:
+def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a CSV log.
 
+    Args:
+        path: the file.
+        columns: names in this file for those of the contract, such as ``{"p": "gyro_x"}``.
+
     Raises:
-        LogError: no header, a column group that is incomplete, or no usable row.
+        LogError: no header, a column group that is incomplete, a name that is not there, or no usable row.
     """
-    names, delimiter = _header(path)
+    names, delimiter = _header(path, columns or {})
     layout, ignored = _layout(names, path.name)
     table, notes = _table(path, len(names), delimiter)
     if len(table) == 0:
@@ -60,13 +64,13 @@ def read_csv(path: Path) -> Recording:
     refused = len(t) - int(np.count_nonzero(accepted))
     t, rows = t[accepted], table[accepted]
     raw = []
-    for name, columns in layout.items():
-        values = rows[:, [names.index(c) for c in columns]]
+    for name, group in layout.items():
+        values = rows[:, [names.index(c) for c in group]]
         blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
-        if columns == EULER:
+        if group == EULER:
             _check_radians(values, path.name)
             values = from_euler(values)
-        raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(columns), refused))
+        raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(group), refused))
     recording = assemble(path.name, "csv", raw, clock, notes)
     return replace(recording, grid=_uniform_step(recording.channels))
 
@@ -103,19 +107,33 @@ def _check_seconds(t: FloatArray, origin: str) -> None:
     )  # fmt: skip
 
 
-def _header(path: Path) -> tuple[list[str], str]:
+def _header(path: Path, columns: Mapping[str, str]) -> tuple[list[str], str]:
     with path.open("rb") as file:
         line = header_line(file.read(HEAD_BYTES))
     if line is None:
         raise LogError(f"{path.name}: no header row", "t, then column names such as p,q,r,ax,ay,az,w1")
     delimiter = max(",;\t", key=line.count)
     names = [cell.strip().strip('"') for cell in line.split(delimiter)]
+    names = _renamed(names, columns, path.name)
     doubles = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubles:
         raise LogError(f"{path.name}: column {plain(', '.join(doubles))} appears twice", "each column once")
     if "t" not in names:
         raise LogError(f"{path.name}: no column t among {', '.join(names)[:120]}", "a column t with the time [s]")
     return names, delimiter
+
+
+def _renamed(names: list[str], columns: Mapping[str, str], origin: str) -> list[str]:
+    """Gives columns the contract's names; a column that loses its own to another is not used under it."""
+    theirs = {}
+    for own, given in columns.items():
+        if given not in names:
+            raise LogError(
+                f"{origin}: no column {plain(given, 40)}, which `columns` names for {plain(own, 40)}",
+                plain(", ".join(names), 200), nearest(given, names),
+            )  # fmt: skip
+        theirs[given] = own
+    return [theirs.get(name, f"({name})" if name in columns else name) for name in names]
 
 
 def _known() -> list[str]:

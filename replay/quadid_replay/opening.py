@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ _STORED = 0.02
 """A large file of which less than this share is stored holds nothing but zeros: its copy was not finished."""
 
 
-def open_log(path: str | Path, preset: str = AUTO) -> Recording:
+def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
 
     A large one (`LARGE`) is read in a child process with limited memory and time, see `quadid_replay.reading`.
@@ -28,6 +28,7 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
         path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
             recording.
         preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
+        columns: for CSV, names in the file for those of the contract, as in the vehicle file.
 
     Raises:
         LogError: no such file, a directory, an empty file, an unknown format, nothing readable in it, or a file whose
@@ -35,7 +36,7 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    _kind(file)
+    _kind(file, columns)
     sizes = [part.stat() for part in _parts(file)]
     size = sum(part.st_size for part in sizes)
     if size >= LARGE:
@@ -47,18 +48,22 @@ def open_log(path: str | Path, preset: str = AUTO) -> Recording:
             )  # fmt: skip
         from quadid_replay.reading import read_in_child
 
-        return read_in_child(file, preset)
-    return read_here(file, preset)
+        return read_in_child(file, preset, columns)
+    return read_here(file, preset, columns)
 
 
-def read_here(file: Path, preset: str) -> Recording:
+def read_here(file: Path, preset: str, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a log in this process, whatever its size; else as `open_log`."""
-    kind = _kind(file)
+    kind = _kind(file, columns)
     try:
         if kind in ("mcap", "rosbag2"):
             from quadid_replay.mcap_reader import read_mcap
 
             recording = read_mcap(file, preset=preset)
+        elif kind == "csv":
+            from quadid_replay.csv_reader import read_csv
+
+            recording = read_csv(file, columns)
         else:
             recording = _reader(kind)(file)
         return replace(recording, sha256=_sha256(file))
@@ -68,9 +73,7 @@ def read_here(file: Path, preset: str) -> Recording:
 
 def _reader(kind: Format) -> Callable[[Path], Recording]:
     """Imports only the library that this format needs."""
-    if kind == "csv":
-        from quadid_replay.csv_reader import read_csv as read
-    elif kind == "dataflash":
+    if kind == "dataflash":
         from quadid_replay.dataflash_reader import read_dataflash as read
     elif kind == "ulog":
         from quadid_replay.ulog_reader import read_ulog as read
@@ -81,14 +84,14 @@ def _reader(kind: Format) -> Callable[[Path], Recording]:
     return read
 
 
-def _kind(file: Path) -> Format:
+def _kind(file: Path, columns: Mapping[str, str] | None) -> Format:
     """The format of a file; of a folder, that it is a recording of rosbag2."""
     try:
         if file.is_dir() and is_bag_folder(file):
             return "rosbag2"
     except (OSError, ValueError):  # `_head` says what is wrong with such a path
         pass
-    return recognise(_head(file), file.name)
+    return recognise(_head(file), file.name, (columns or {}).get("t", "t"))
 
 
 def _parts(file: Path) -> list[Path]:

@@ -7,6 +7,7 @@ an MCAP that may inflate, could still take more memory than there is; the child 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import pickle
@@ -14,6 +15,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -63,14 +65,15 @@ def _given(name: str, otherwise: float) -> float:
     return value
 
 
-def read_in_child(path: Path, preset: str) -> Recording:
+def read_in_child(path: Path, preset: str, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a log as `quadid_replay.open_log` does, in a child process within `limits`.
 
     Raises:
         LogError: what the reader says; or the log needs more memory or time than the limits, which the error names.
     """
     allowed = limits(path.stat().st_size)
-    command = [sys.executable, "-m", __name__, str(path.absolute()), preset, str(allowed.memory), str(allowed.seconds)]
+    request = json.dumps([str(path.absolute()), preset, dict(columns or {}), *allowed])
+    command = [sys.executable, "-m", __name__, request]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as child:
         try:
             answer, _ = child.communicate(timeout=STANDING * allowed.seconds)
@@ -107,7 +110,7 @@ def _too_large(path: Path, allowed: Limits, how: str = "") -> LogError:
     )  # fmt: skip
 
 
-def _child(path: Path, preset: str, memory: int, seconds: float) -> None:
+def _child(path: Path, preset: str, columns: dict[str, str], memory: int, seconds: float) -> None:
     """What the child does: the answer goes to stdout, and whatever a library prints to stderr."""
     from quadid_replay.opening import read_here
 
@@ -116,7 +119,7 @@ def _child(path: Path, preset: str, memory: int, seconds: float) -> None:
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)
         try:
-            result: object = read_here(path, preset)
+            result: object = read_here(path, preset, columns)
             answer = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
         except QuadidError as error:
             answer = pickle.dumps((error.found, error.allowed, error.fix))
@@ -128,4 +131,5 @@ def _child(path: Path, preset: str, memory: int, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    _child(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))
+    where, *rest = json.loads(sys.argv[1])
+    _child(Path(where), *rest)

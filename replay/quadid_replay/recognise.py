@@ -33,12 +33,13 @@ _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 
 
-def recognise(head: bytes, name: str) -> Format:
+def recognise(head: bytes, name: str, time: str = "t") -> Format:
     """Returns the format of a log that begins with `head`.
 
     Args:
         head: first `HEAD_BYTES` of the file (fewer if it is short).
         name: file name, for errors only.
+        time: name of a CSV's column of time.
 
     Raises:
         LogError: none of the known formats; says what it is when that is known.
@@ -55,7 +56,7 @@ def recognise(head: bytes, name: str) -> Format:
         return "dataflash"
     if _is_tlog(head):
         return "tlog"
-    if _is_csv(head):
+    if _is_csv(head, time):
         return "csv"
     shown = head[:8].hex(" ")
     raise LogError(f"{name}: unknown format (begins with {shown})", ALLOWED, "see docs/logs.md for what each needs")
@@ -94,13 +95,13 @@ def _frame_length(head: bytes, at: int) -> int | None:
     return 8 + 12 + payload + (13 if head[at + 10] & 1 else 0)
 
 
-def _is_csv(head: bytes) -> bool:
-    """Text whose first line that is not a comment holds a column called t."""
+def _is_csv(head: bytes, time: str) -> bool:
+    """Text whose first line that is not a comment holds the column of time."""
     line = header_line(head)
     if line is None:
         return False
     cells = line.replace(";", ",").replace("\t", ",").split(",")
-    return "t" in [cell.strip().strip('"') for cell in cells]
+    return time in [cell.strip().strip('"') for cell in cells]
 
 
 def header_line(head: bytes) -> str | None:
