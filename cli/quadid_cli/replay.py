@@ -210,8 +210,10 @@ def summary(
 def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
     """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
     from quadid_node.stamps import nanoseconds
+    from quadid_node.vehicle_health import health_message
     from quadid_replay import TopicWriter
 
+    from quadid.health.watch import HealthReport
     from quadid.online import Diagnosed, Publish
     from quadid_node import messages
 
@@ -223,6 +225,9 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
             elif isinstance(item, Diagnosed):
                 kind, topic = messages.DIAGNOSIS, messages.TOPICS["diagnosis"]
                 message, t = messages.diagnosis(item, vehicle), item.t
+            elif isinstance(item, HealthReport):
+                kind, topic = messages.HEALTH, "quadid/health"
+                message, t = health_message(item, vehicle), item.t
             else:
                 continue
             writer.write(topic, kind, message, nanoseconds(t))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from quadid.health.watch import HealthReport
 from quadid.online.jobs import Job
-from quadid.online.records import Diagnosed, Event, Phase, Publish
+from quadid.online.records import Diagnosed, Event, HealthyFlight, Phase, Publish
 
-Action = Job | Publish | Diagnosed | Event
+Action = Job | Publish | Diagnosed | HealthReport | HealthyFlight | Event
 
 
 class Outbox:

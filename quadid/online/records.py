@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from quadid.health.trims import FlightTrim
 from quadid.parameters import ParameterSet
 
 
@@ -131,6 +132,19 @@ class Diagnosed:
     stop: float
     findings: tuple[OnlineFinding, ...]
     verdict: str
+
+
+@dataclass(frozen=True)
+class HealthyFlight:
+    """Action: keep a flight for the vehicle's healthy history.
+
+    Attributes:
+        t: when it ended [s].
+        trim: of the flight.
+    """
+
+    t: float
+    trim: FlightTrim
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
     push(sample)            buffer it
     poll() -> actions       every tick of the data's own time, in order:
         watch for sudden changes                -> ChangeRequest, Diagnosed
+        compare with healthy flights            -> HealthReport, HealthyFlight
         diagnose the last minute, now and then  -> DiagnosisRequest, Diagnosed; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
         FitRequest                              -> stops here until `deliver` brings the reply
@@ -14,16 +15,18 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
+from quadid.health.trims import FlightTrim
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.health_supervisor import HealthSupervisor
 from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality, judge
@@ -55,7 +58,7 @@ class Session:
 
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings | None = None, restored: OnlineSet | None = None,
-        next_sequence: int = 1, baseline: OnlineSet | None = None,
+        next_sequence: int = 1, baseline: OnlineSet | None = None, healthy: Sequence[FlightTrim] = (),
     ) -> None:  # fmt: skip
         """Starts a session.
 
@@ -65,6 +68,7 @@ class Session:
             restored: last accepted set of an earlier run; in force, but stale, until this flight confirms it.
             next_sequence: first number not yet given to a set.
             baseline: set from which creeping is measured; default `restored`.
+            healthy: trims of the vehicle's healthy flights, the oldest first.
         """
         self.settings = settings or SessionSettings()
         self.resampler = Resampler(vehicle, self.settings.rate)
@@ -74,6 +78,7 @@ class Session:
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
         self._store = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
         self._change_supervisor = ChangeSupervisor(vehicle, self._store)
+        self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
         self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
         self._supervisor = Supervisor(self._estimator, self.active_set, self._outbox, self.settings.gate)
@@ -226,6 +231,7 @@ class Session:
             self._outbox.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
             self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
+        self._health.look(tick)
         self._study(tick)
         yield
         if self._change_supervisor.seen is not None:

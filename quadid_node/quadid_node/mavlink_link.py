@@ -9,6 +9,7 @@ from typing import Any
 
 from quadid_replay.tlog_messages import READERS
 
+from quadid.health.watch import HealthReport
 from quadid.online import Diagnosed, Event, Publish
 from quadid.online.records import OnlineSet
 from quadid.window import Sample
@@ -199,6 +200,8 @@ class MavlinkLink:
             for finding in output.findings:
                 numbers = " ".join(f"{n} {v:.3g}" for n, v in finding.values.items() if n != "time")
                 self._say(4, f"quadid: {finding.effect} {numbers}{'' if finding.confident else ' (?)'}")
+        elif isinstance(output, HealthReport):
+            self._send_health(output)
         elif isinstance(output, Event) and output.level != "info":
             self._say(SEVERITY[output.level], f"quadid: {output.text}")
 
@@ -246,6 +249,15 @@ class MavlinkLink:
         for name, value in self._entries():
             if len(name) <= 10:
                 self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+
+    def _send_health(self, report: HealthReport) -> None:
+        """Score and loss of each rotor [%] as named values; what changed is a line of text of its own."""
+        values = [("QI_HEALTH", report.score), *((f"QI_LOSS{j + 1}", 100 * v) for j, v in enumerate(report.rotor_loss))]
+        ms = int((self._clock() - self._begin) * 1e3) % 2**32
+        for name, value in values:
+            self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+        if not report.has_baseline:
+            self._say(5, f"quadid: {report.text}")
 
     def _say(self, severity: int, text: str) -> None:
         plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text)

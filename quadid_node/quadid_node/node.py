@@ -18,7 +18,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from quadid.errors import QuadidError
-from quadid.online import Event, Publish
+from quadid.health.watch import HealthReport
+from quadid.online import Diagnosed, Event, Publish
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.commands import Commands
@@ -34,6 +35,7 @@ from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
 from quadid_node.service import Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
+from quadid_node.vehicle_health import health_message
 from quadid_node.worker import ProcessWorker, with_ground
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
@@ -229,7 +231,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
             return
         elif isinstance(output, Publish):
             self._speaker.publish(output.topic, messages.parameter_set(output.item, self._id, self._service.boot_id))
-        else:
+        elif isinstance(output, HealthReport):
+            self._speaker.publish("health", health_message(output, self._id))
+        elif isinstance(output, Diagnosed):
             self._speaker.publish("diagnosis", messages.diagnosis(output, self._id))
 
     def _log(self, level: str, text: str) -> None:

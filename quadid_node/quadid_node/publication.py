@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+from quadid.health.watch import HealthReport
+from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish
 
-Output = Publish | Diagnosed | Event
+Output = Publish | Diagnosed | HealthReport | HealthyFlight | Event
 OF_SETS = ("accepted", "rollback")
 """Kinds of events that say which set is in force."""
 MOST_WAITING = 64

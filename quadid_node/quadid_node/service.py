@@ -15,7 +15,7 @@ from pathlib import Path
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
 from quadid.online.outbox import Action
-from quadid.online.records import Diagnosed, Event, OnlineSet, SetState
+from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish, SetState
 from quadid.online.status import SessionStatus
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
@@ -83,7 +83,9 @@ class Service:
         if restored is None:
             restored = store.restore(settings.gate) if store is not None else Restored(None, 1)
         self.vehicle, self.restored, self.boot_id = vehicle, restored, uuid.uuid4().hex
-        self.session = Session(vehicle, settings, restored.item, restored.next_sequence, restored.baseline)
+        self.session = Session(
+            vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy
+        )
         self._configured: str = settings.gate.approval
         self._approval: str = self._configured
         self._publication = Publication(store)
@@ -276,7 +278,9 @@ class Service:
             self._store.event(output)
         elif isinstance(output, Diagnosed):
             self._store.diagnosis(output)
-        else:
+        elif isinstance(output, HealthyFlight):
+            self._store.healthy_flight(output.trim)
+        elif isinstance(output, Publish):
             self._journal_set(output.topic, output.item)
 
     def _journal_set(self, topic: str, item: OnlineSet) -> None:

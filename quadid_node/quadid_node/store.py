@@ -20,11 +20,14 @@ from types import MappingProxyType
 from typing import IO
 
 from quadid.errors import QuadidError
+from quadid.health.trims import FlightTrim
 from quadid.online.gate import GateSettings, implausible
+from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Diagnosed, Event, OnlineSet
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
 from quadid_node.store_file import StoreError, connect, is_damage, make_tables, set_aside
+from quadid_node.vehicle_health import flight_from_dict, flight_to_dict
 
 KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets and decisions never."""
@@ -58,6 +61,7 @@ class Restored:
         item: the set last in force; None: none.
         next_sequence: the first number of this run.
         baseline: what creeping counts from.
+        healthy: trims of healthy flights, the oldest first.
         approval: auto or manual where a person decided so while the earlier run was configured as this one; else empty.
     """
 
@@ -65,6 +69,7 @@ class Restored:
     next_sequence: int
     baseline: OnlineSet | None = None
     approval: str = ""
+    healthy: tuple[FlightTrim, ...] = ()
 
 
 class Store:
@@ -126,7 +131,20 @@ class Store:
             "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1", (self.vehicle,)
         ).fetchone()
         decided = row[1] if row is not None and row[0] == gate.approval else ""
-        return Restored(last, first_number(int(highest or 0)), approved or first, decided)
+        return Restored(last, first_number(int(highest or 0)), approved or first, decided, self._healthy(db))
+
+    def _healthy(self, db: sqlite3.Connection) -> tuple[FlightTrim, ...]:
+        """Trims of the newest healthy flights; a row that is none is left out, and said."""
+        rows = db.execute(
+            "SELECT data FROM healthy_flights WHERE vehicle = ? ORDER BY id DESC LIMIT ?", (self.vehicle, MOST_FLIGHTS)
+        ).fetchall()
+        out = []
+        for (data,) in reversed(rows):
+            try:
+                out.append(flight_from_dict(json.loads(data)))
+            except (ValueError, KeyError, TypeError) as error:
+                self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
+        return tuple(out)
 
     def _set(self, db: sqlite3.Connection, gate: GateSettings, which: str) -> OnlineSet | None:
         """The first such set; one that no fresh estimate could be is left out, and said."""
@@ -176,6 +194,11 @@ class Store:
         empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
         text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or empty
         self._event("info" if quiet else "warning", "diagnosis", text, item.t, json.dumps(diagnosis_to_dict(item)))
+
+    def healthy_flight(self, flight: FlightTrim) -> None:
+        """Journals a flight that later ones are compared with."""
+        values = (self.vehicle, time.time(), json.dumps(flight_to_dict(flight)))
+        self._put(Row("INSERT INTO healthy_flights (vehicle, wall, data) VALUES (?, ?, ?)", values))
 
     def decision(self, configured: str, approval: str) -> None:
         """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""

@@ -3,7 +3,8 @@
     quadid/<vehicle>/parameters   set in force                       JSON as in `quadid replay`, latest value kept
     quadid/<vehicle>/candidate    every estimate with its reason     latest value kept
     quadid/<vehicle>/diagnosis    findings                           latest value kept
-    quadid/<vehicle>/health       once a second                      latest value kept
+    quadid/<vehicle>/health       of the service, once a second      latest value kept
+    quadid/<vehicle>/vehicle_health   against its healthy flights    latest value kept
     quadid/<vehicle>/alive        liveliness token
     quadid/<vehicle>/command/approve?sequence=N, …/rollback, …/fit_now   queries; access control decides
 
@@ -23,13 +24,15 @@ from typing import Any
 import zenoh
 
 from quadid.errors import QuadidError
+from quadid.health.watch import HealthReport
 from quadid.online import Diagnosed, Publish
 from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
 from quadid_node.publication import Output
 from quadid_node.service import Health, Service
+from quadid_node.vehicle_health import health_to_dict
 
 ROOT = "quadid"
-KINDS = ("parameters", "candidate", "diagnosis", "health")
+KINDS = ("parameters", "candidate", "diagnosis", "health", "vehicle_health")
 COMMANDS = ("approve", "rollback", "fit_now")
 LARGEST = 1 << 18
 """A payload beyond this is not ours [bytes]."""
@@ -155,6 +158,8 @@ class ZenohLink:
             self._put(output.topic, set_to_dict(output.item))
         elif isinstance(output, Diagnosed):
             self._put("diagnosis", diagnosis_to_dict(output))
+        elif isinstance(output, HealthReport):
+            self._put("vehicle_health", health_to_dict(output))
 
     def report(self, health: Health) -> None:
         """Tells how things are."""
@@ -188,7 +193,7 @@ class ZenohLink:
     def _repeat(self) -> None:
         """Tells again what a crowded network may have lost, since it never waits for one."""
         with self._lock:
-            for kind in ("parameters", "diagnosis"):
+            for kind in ("parameters", "diagnosis", "vehicle_health"):
                 if kind in self._latest and kind in self._publishers:
                     self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 

@@ -1,0 +1,83 @@
+"""Health of the vehicle on its way out and into the history: message, JSON, and healthy flights read back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from quadid.health.changes import Change
+from quadid.health.trims import AXES, FlightTrim
+from quadid.health.watch import HealthReport
+from quadid.jsonable import jsonable
+from quadid_node.stamps import stamp
+
+FRAME = "base_link_frd"
+VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}
+
+
+def health_message(report: HealthReport, vehicle: str) -> dict[str, Any]:
+    """quadid_msgs/Health of a report."""
+    nan = math.nan
+    return {
+        "header": {"stamp": stamp(report.t), "frame_id": FRAME},
+        "vehicle_id": vehicle,
+        "verdict": VERDICTS[report.verdict],
+        "has_baseline": report.has_baseline,
+        "score": report.score,
+        "rotor_loss": list(report.rotor_loss),
+        "rotor_loss_lower": [low for low, _ in report.rotor_interval],
+        "rotor_loss_upper": [high for _, high in report.rotor_interval],
+        "mass": nan, "mass_lower": nan, "mass_upper": nan,
+        "changes": [_finding(change) for change in report.changes if report.verdict == "changed"],
+        "text": report.text,
+    }  # fmt: skip
+
+
+def _finding(change: Change) -> dict[str, Any]:
+    """quadid_msgs/Finding of a change; what belongs to fits is NaN."""
+    intervals = [ci or (value, value) for _, _, value, ci in change.parameters]
+    return {
+        "effect": change.effect,
+        "confident": change.confident,
+        "parameter_names": [name for name, *_ in change.parameters],
+        "parameter_units": [unit or "1" for _, unit, *_ in change.parameters],
+        "parameter_values": [float(value) for _, _, value, _ in change.parameters],
+        "ci95_lower": [low for low, _ in intervals],
+        "ci95_upper": [high for _, high in intervals],
+        "mse_before": math.nan, "mse_after": math.nan, "gain_ci95": [math.nan, math.nan],
+        "p_value": change.p_value,
+        "alternatives": [rival.effects[0] for rival in change.rivals],
+        "alternatives_mse": [math.nan] * len(change.rivals),
+        "evidence": change.evidence,
+    }  # fmt: skip
+
+
+def health_to_dict(report: HealthReport) -> dict[str, Any]:
+    """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
+    data: dict[str, Any] = jsonable({
+        "schema": "quadid.health/1", "t": report.t, "verdict": report.verdict, "has_baseline": report.has_baseline,
+        "changes": [change.to_dict() for change in report.changes if report.verdict == "changed"],
+        "score": report.score, "rotor_loss": report.rotor_loss, "rotor_interval": report.rotor_interval,
+        "text": report.text,
+    })  # fmt: skip
+    return data
+
+
+def flight_to_dict(flight: FlightTrim) -> dict[str, Any]:
+    """A healthy flight's trim for the history."""
+    data: dict[str, Any] = jsonable(flight._asdict())
+    return data
+
+
+def flight_from_dict(data: Mapping[str, Any]) -> FlightTrim:
+    """A healthy flight of the history; raises ValueError, KeyError or TypeError for what is none."""
+    mean, parts, shares, wander = (np.array(data[k], dtype=np.float64) for k in ("mean", "parts", "shares", "wander"))
+    if mean.shape != (len(AXES),) or parts.ndim != 2 or parts.shape[1] != len(AXES) or wander.shape != mean.shape:
+        raise ValueError(f"a trim of shape {mean.shape}, parts {parts.shape}")
+    if shares.ndim != 1 or not all(np.isfinite(v).all() for v in (mean, parts, shares, wander)):
+        raise ValueError("numbers that are not finite")
+    seconds = float(data["seconds"])
+    return FlightTrim(str(data["name"]), mean, parts, shares, wander, math.nan, seconds, str(data["channels"]))
