@@ -7,6 +7,7 @@ second is the sharper one, for propellers, battery and landing are the same with
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -134,9 +135,10 @@ class HealthWatch:
             self._wander = np.maximum(np.sqrt(squares), _LEAST_WANDER)
 
     def _without_baseline(self, t: float) -> HealthReport:
-        nan = (float("nan"),) * len(self._vehicle.rotors)
+        n = len(self._vehicle.rotors)
         text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
-        return HealthReport(t, "unknown", False, float("nan"), (), nan, ((float("nan"),) * 2,) * len(nan), text)
+        # The one NaN of the module: reports of equal content are equal.
+        return HealthReport(t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, text)
 
     def _judged(self, t: float, healthy: Healthy) -> HealthReport | None:
         if self._alarm is not None or len(self._trims) < RECENT:
