@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 def export(
     vehicle: VehicleName,
     form: Annotated[
-        str, typer.Option("--format", metavar="F", help="yaml, px4, ardupilot, gazebo, rotorpy or agilicious.")
+        str,
+        typer.Option(
+            "--format", metavar="F", help="yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco or urdf."
+        ),
     ] = "yaml",
     history: Annotated[
         Path | None,

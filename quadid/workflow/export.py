@@ -45,7 +45,7 @@ def export(
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
-        form: yaml, px4, ardupilot, gazebo, rotorpy or agilicious.
+        form: yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco or urdf.
         source: where the values come from, for the file; default the vehicle's file or name.
         anyway: write the values of a fit that is not proven; the file says so at its top.
 

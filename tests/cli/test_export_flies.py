@@ -12,6 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
+from quadid.model.simulate import simulate as fly_file
 from quadid.report.programs import export
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.model.simulate import held, simulate, state
@@ -153,3 +154,63 @@ def test_parameter_files_are_read_by_the_ground_station_libraries(tmp_path: Path
     assert read.load(str(file))
     assert read["MOT_THST_HOVER"] == pytest.approx(hover, rel=1e-4)
     assert "MOT_THST_EXPO" not in read  # no curve was fitted
+
+
+def without_rotor_inertia(vehicle: Vehicle) -> Vehicle:
+    nothing = vehicle.parameters["J_r"].model_copy(update={"initial": 1e-12, "bounds": None})
+    return vehicle.model_copy(update={"parameters": {**vehicle.parameters, "J_r": nothing}})
+
+
+def test_mujoco_flies_the_exported_vehicle_as_our_simulation_does() -> None:
+    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco (extra dev)")
+    vehicle = Vehicle.shipped("pelican")
+    tilted = vehicle.model_copy(update={"effects": {
+        "weak_rotor": {"loss_2": 0.01}, "cg_offset": {"x": 0.0004, "y": -0.0003},
+        "product_of_inertia": {"J_xy": 4e-4},
+    }})  # fmt: skip
+    rows = speeds(vehicle)[:50]
+    expected = fly_file(without_rotor_inertia(tilted), rows, DT)
+    model = mujoco.MjModel.from_xml_string(export(tilted, "mujoco", "test")[".mjcf.xml"])
+    data = mujoco.MjData(model)
+    every = round(DT / model.opt.timestep)
+    b = vehicle.parameters["b"].initial * (1.0 - np.array([0.0, 0.01, 0.0, 0.0]))
+    rate, velocity = [], []
+    for row in rows:
+        data.ctrl[:] = b * row**2
+        for _ in range(every):
+            mujoco.mj_step(model, data)
+        rate.append(data.qvel[3:] * TO_FLU)
+        velocity.append(data.qvel[:3] * TO_FLU)
+    for got, want in ((np.array(rate), expected.rate), (np.array(velocity), expected.velocity)):
+        np.testing.assert_allclose(got, want, atol=1e-3 * np.abs(want).max())
+
+
+def test_urdf_holds_mass_inertia_and_rotors() -> None:
+    import xml.etree.ElementTree as ET
+
+    vehicle = Vehicle.shipped("pelican")
+    root = ET.fromstring(export(vehicle, "urdf", "x")[".urdf"])
+    mass, inertia = root.find(".//mass"), root.find(".//inertia")
+    assert mass is not None
+    assert inertia is not None
+    assert float(mass.attrib["value"]) == vehicle.mass
+    assert float(inertia.attrib["ixx"]) == pytest.approx(vehicle.parameters["J_xx"].initial)
+    places = [[float(v) for v in o.attrib["xyz"].split()] for o in root.findall(".//joint/origin")]
+    np.testing.assert_allclose(places, vehicle.rotor_positions * TO_FLU, atol=1e-9)
+
+
+def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -> None:
+    pelican = Vehicle.shipped("pelican")
+    bare = export(pelican, "px4", "x")[".params"]
+    rich = export(
+        pelican.model_copy(update={"effects": {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "parasitic_drag": {"c": 0.03},
+                                               "motor_lag": {"tau": 0.04}}}), "px4", "x")[".params"]  # fmt: skip
+    values = {row.split("\t")[2]: float(row.split("\t")[3]) for row in rich.splitlines() if not row.startswith("#")}
+    assert values["SIH_MASS"] == pelican.mass
+    assert values["SIH_IXX"] == pytest.approx(pelican.parameters["J_xx"].initial)
+    assert values["SIH_KDV"] == pytest.approx(0.25 * pelican.mass)
+    assert values["SIH_T_TAU"] == 0.04
+    assert values["EKF2_MCOEF"] == pytest.approx(0.25)
+    assert values["EKF2_BCOEF_X"] == pytest.approx(0.5 * 1.225 / 0.03)
+    for name in ("SIH_KDV", "SIH_T_TAU", "EKF2_MCOEF", "THR_MDL_FAC"):
+        assert f"\t{name}\t" not in bare

@@ -7,11 +7,13 @@ from quadid.report.programs.agilicious import agilicious
 from quadid.report.programs.ardupilot import ardupilot_frame, ardupilot_parameters
 from quadid.report.programs.facts import Facts
 from quadid.report.programs.gazebo import gazebo
+from quadid.report.programs.mujoco import mujoco
 from quadid.report.programs.px4 import px4
 from quadid.report.programs.rotorpy import rotorpy
+from quadid.report.programs.urdf import urdf
 from quadid.vehicle import Vehicle
 
-FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy", "agilicious")
+FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy", "agilicious", "mujoco", "urdf")
 
 
 def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
@@ -43,4 +45,8 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
         return {"_params.py": rotorpy(facts)}
     if form == "agilicious":
         return {".agilicious.yaml": agilicious(facts)}
+    if form == "mujoco":
+        return {".mjcf.xml": mujoco(facts)}
+    if form == "urdf":
+        return {".urdf": urdf(facts)}
     raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))

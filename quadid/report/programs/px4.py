@@ -1,11 +1,23 @@
-"""PX4: control allocation geometry and thrust model, as a parameter file that QGroundControl loads."""
+"""PX4: control allocation, thrust model, simulation in hardware, drag fusion; a file that QGroundControl loads."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from quadid.report.programs.facts import Facts
 
 _FLOAT, _INT = 9, 6  # MAV_PARAM_TYPE
-_CARRIED = ("cg_offset", "weak_rotor")
+_CARRIED = (
+    "cg_offset",
+    "weak_rotor",
+    "product_of_inertia",
+    "rotor_drag",
+    "parasitic_drag",
+    "rate_damping",
+    "motor_lag",
+)
+AIR_DENSITY = 1.225
+"""Of the standard atmosphere [kg/m^3], in which a ballistic coefficient is stated."""
 
 
 def px4(facts: Facts) -> str:
@@ -26,9 +38,45 @@ def px4(facts: Facts) -> str:
         lines.append("# No CA_ROTORn_CT, THR_MDL_FAC, MPC_THR_HOVER: the rotor speed at full command is not known")
         lines.append("# (command.max_speed in the vehicle file).")
     else:
-        lines.append(
-            "# THR_MDL_FAC 1: thrust goes with the square of the command, since rotor speed goes with the command."
-        )
-        rows += [("MPC_THR_HOVER", facts.hover_thrust, _FLOAT), ("THR_MDL_FAC", 1.0, _FLOAT)]
+        rows.append(("MPC_THR_HOVER", facts.hover_thrust, _FLOAT))
+        if "thrust_curve" not in facts.vehicle.effects:
+            lines.append("# No THR_MDL_FAC: no thrust curve was fitted.")
+    rows += [(name, value, _FLOAT) for name, value in (*_in_hardware(facts), *_drag_fusion(facts))]
     lines += [f"1\t1\t{name}\t{value:.8g}\t{kind}" for name, value, kind in rows]
     return "\n".join(lines) + "\n"
+
+
+def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
+    """Simulation in hardware (SIH), a quad X: mass, inertia, arms, full thrust and torque, damping, motor lag."""
+    j, k = facts.inertia, facts.effect
+    rows = [("SIH_MASS", facts.vehicle.mass)]
+    rows += [
+        (f"SIH_I{a}{b}", float(j["XYZ".index(a), "XYZ".index(b)])) for a, b in ("XX", "YY", "ZZ", "XY", "XZ", "YZ")
+    ]
+    rows += [
+        ("SIH_L_ROLL", float(np.mean(np.abs(facts.arms[:, 1])))),
+        ("SIH_L_PITCH", float(np.mean(np.abs(facts.arms[:, 0])))),
+    ]
+    if facts.max_speed is not None:
+        full = float(np.mean(facts.thrust)) * facts.max_speed**2
+        rows += [("SIH_T_MAX", full), ("SIH_Q_MAX", full * facts.torque_per_thrust)]
+    if "rotor_drag" in facts.vehicle.effects:
+        rows.append(("SIH_KDV", facts.vehicle.mass * 0.5 * (k("rotor_drag", "k_x") + k("rotor_drag", "k_y"))))
+    if "rate_damping" in facts.vehicle.effects:
+        rows.append(
+            ("SIH_KDW", 0.5 * (float(j[0, 0]) * k("rate_damping", "l_p") + float(j[1, 1]) * k("rate_damping", "m_q")))
+        )
+    if "motor_lag" in facts.vehicle.effects:
+        rows.append(("SIH_T_TAU", k("motor_lag", "tau")))
+    return rows
+
+
+def _drag_fusion(facts: Facts) -> list[tuple[str, float]]:
+    """Drag of EKF2: momentum drag of the propellers [1/s], ballistic coefficients [kg/m^2]; only what was fitted."""
+    rows = []
+    if "rotor_drag" in facts.vehicle.effects:
+        rows.append(("EKF2_MCOEF", 0.5 * (facts.effect("rotor_drag", "k_x") + facts.effect("rotor_drag", "k_y"))))
+    c = facts.effect("parasitic_drag", "c")
+    if c > 0.0:
+        rows += [(f"EKF2_BCOEF_{axis}", 0.5 * AIR_DENSITY / c) for axis in "XY"]
+    return rows
