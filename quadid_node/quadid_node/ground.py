@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from quadid.online.jobs import Job
-from quadid_node.parcel import ParcelError, pack, unpack
+from quadid_node.parcel import ParcelError, content, pack, unpack
 from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
 
 WORK = f"{ROOT}/*/work/fit"
@@ -91,7 +91,7 @@ def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]
 
 def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
     try:
-        request = unpack(query.payload.to_bytes() if query.payload is not None else b"")
+        request = unpack(content(query.payload))
         if not isinstance(request, Job):
             raise ParcelError(f"a parcel with a {type(request).__name__}", "a request of a fit")
     except ParcelError as error:

@@ -16,7 +16,7 @@ import zenoh
 
 from quadid.online.jobs import Job, JobReply
 from quadid_node.ground import ALIVE
-from quadid_node.parcel import ParcelError, pack, unpack
+from quadid_node.parcel import LARGEST, ParcelError, pack, unpack
 from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble
 from quadid_node.zenoh_link import ZenohError, config_of, key_of, open_session
 
@@ -59,7 +59,8 @@ class Ground:
 
         def take(reply: Any) -> None:
             ok = reply.ok
-            answers.put((request.number, ok.payload.to_bytes() if ok is not None else None))
+            small = ok is not None and len(ok.payload) <= LARGEST
+            answers.put((request.number, None if ok is None else ok.payload.to_bytes() if small else b""))
 
         self._session.get(
             self._key, take, payload=pack(request), timeout=seconds, target=zenoh.QueryTarget.BEST_MATCHING

@@ -36,6 +36,8 @@ KINDS = ("parameters", "candidate", "diagnosis", "health", "vehicle_health")
 COMMANDS = ("approve", "rollback", "fit_now")
 LARGEST = 1 << 18
 """A payload beyond this is not ours [bytes]."""
+LARGEST_MESSAGE = 1 << 25
+"""Zenoh itself takes no larger messages [bytes], whatever the configuration says; its own default is 1 GiB."""
 MOST_COMMANDS = 16
 RETRY = 3.0
 REPEAT = 5
@@ -72,6 +74,12 @@ def _connect(where: str, config: Any) -> Any:
 
 def config_of(where: str) -> Any:
     """The Zenoh configuration that `where` stands for, see `open_session`; raises ZenohError."""
+    config = _config_of(where)
+    config.insert_json5("transport/link/rx/max_message_size", str(LARGEST_MESSAGE))
+    return config
+
+
+def _config_of(where: str) -> Any:
     if where == "local":
         return zenoh.Config()
     if re.match(r"^(tcp|udp|tls|quic|ws|unixsock-stream)/", where):
@@ -313,9 +321,9 @@ class Fleet:
 
 
 def _parse(payload: Any) -> dict[str, Any] | None:
-    data = payload.to_bytes()
-    if len(data) > LARGEST:
+    if len(payload) > LARGEST:
         return None
+    data = payload.to_bytes()
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):

@@ -88,4 +88,8 @@ FAULTS: dict[int, Fault] = {
         "history with an impossible set, used-up numbers, odd bytes; held exclusively at the start",
         "not taken up, set aside, left out and said; the writer lives on; the start waits, then refuses",
     ),
+    26: Fault(
+        "Zenoh parcel of a few bytes that claims gigabytes, names constructors, has other types",
+        "data only: declared types and sizes checked before memory is taken; refused by worker, service, ground",
+    ),
 }
