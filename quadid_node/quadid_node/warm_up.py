@@ -8,8 +8,10 @@ from pathlib import Path
 
 STILL = 180.0
 """A child that is not ready and has not worked for so long [s] is given up,"""
-WORK = 1800.0
-"""... and so is one that has worked for so long [s of the processor]."""
+STEP = 1.0
+"""... less than this [s of the processor] being no work: a child that hangs still wakes up now and then,"""
+WORK = 600.0
+"""... and so is one that has worked for so long [s of the processor]; compiling takes a minute or two of it."""
 
 
 class WarmUp:
@@ -23,11 +25,11 @@ class WarmUp:
     def given_up(self) -> str:
         """Why the child is given up; empty while it may go on."""
         now, used = self._clock(), processor_seconds(self._pid)
-        if used is not None and used > self._used:
+        if used is not None and used >= self._used + STEP:
             self._used, self._moved = used, now
         if now - self._moved > STILL:
             return f"not ready, and idle for {STILL:g} s"
-        return f"not ready after {WORK:g} s of work" if self._used > WORK else ""
+        return f"not ready after {WORK:g} s of work" if (used or 0.0) > WORK else ""
 
 
 def processor_seconds(pid: int) -> float | None:

@@ -27,7 +27,7 @@ def watch(work: dict[str, float | None]) -> WarmUp:
 
 def test_a_child_that_works_may_take_its_time(work: dict[str, float | None]) -> None:
     child = watch(work)
-    for step in range(1, 100):  # a busy machine: two per cent of a core
+    for step in range(1, 30):  # a busy machine: two per cent of a core
         work.update(now=100.0 * step, used=2.0 * step)
         assert child.given_up() == ""
 
@@ -40,6 +40,15 @@ def test_a_child_that_stands_still_or_never_ends_is_given_up(work: dict[str, flo
     assert "idle" in child.given_up()
     work["used"] = WORK + 1.0
     assert "of work" in child.given_up()
+
+
+def test_a_child_that_hangs_and_only_wakes_up_now_and_then_is_given_up(work: dict[str, float | None]) -> None:
+    """Threads that wait use a tick of the processor a minute: it once kept a child for hours."""
+    child = watch(work)
+    given_up_at = next(
+        now for now in range(0, 4000, 10) if work.update(now=float(now), used=3e-4 * now) or child.given_up()
+    )
+    assert STILL < given_up_at <= STILL + 10
 
 
 def test_where_the_system_tells_nothing_the_clock_decides(work: dict[str, float | None]) -> None:
