@@ -70,6 +70,7 @@ def serve(
     from quadid_node.serve import Outlet, run
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
+    from quadid_node.signing_memory import memory_path
     from quadid_node.store import Store, default_path
     from quadid_node.worker import ProcessWorker, with_ground
 
@@ -86,7 +87,9 @@ def serve(
     with ExitStack() as opened:
         store = Store(file or default_path(), known)  # first: who is refused here must not have taken the port
         opened.callback(store.close)
-        link = MavlinkLink(mavlink, len(described.rotors), system, read_key(key) if key is not None else None)
+        secret = read_key(key) if key is not None else None
+        kept = memory_path((file or default_path()).parent, secret) if secret is not None else None
+        link = MavlinkLink(mavlink, len(described.rotors), system, secret, memory=kept)
         opened.callback(link.close)
         worker = with_ground(ProcessWorker(described), ground or "", known)
         opened.callback(worker.close)
@@ -129,11 +132,12 @@ class _Console:
         traffic = self._link.traffic()
         rates = ", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"
         if traffic.denied:
-            rates += f" | the autopilot refused some messages ({', '.join(traffic.denied)})"
+            rates += f" | refused by the autopilot: {', '.join(traffic.denied)}"
         if traffic.refused:
             rates += f" | {traffic.refused} frames refused"
         if traffic.behind:
             rates += f" | signed with our key, but {traffic.behind:.0f} s behind this clock: give the vehicle the time"
+        rates += "".join(f" | {problem}" for problem in traffic.problems)
         status = health.status
         self._console.print(
             f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}",
@@ -159,6 +163,7 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
         "status": status_to_dict(health.status),
         "rates": traffic.rates,
         "denied": list(traffic.denied),
+        "problems": list(traffic.problems),
         "refused": traffic.refused,
         "behind": traffic.behind,
         "dropped": traffic.dropped,

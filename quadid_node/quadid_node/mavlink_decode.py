@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,6 +19,8 @@ from quadid_node.chooser import Chooser
 ARDUPILOT = 3
 REBOOT = 1.0
 """The vehicle's clock this far back [s] is one that began anew."""
+_NEEDED = re.compile(r"SERVO(?:[1-9]|[12]\d|3[0-2])_FUNCTION")
+"""Parameters that are kept; any other name would only take memory."""
 MOTOR_PREFERENCE = {
     "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
     "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
@@ -36,7 +39,7 @@ class MavlinkDecoder:
 
     Attributes:
         counts: messages by name.
-        parameters: parameters of the autopilot seen so far.
+        parameters: those parameters of the autopilot that tell which output is which motor.
         autopilot: its MAV_AUTOPILOT.
     """
 
@@ -62,7 +65,8 @@ class MavlinkDecoder:
         name = message.get_type()
         self.counts[name] += 1
         if name == "PARAM_VALUE":
-            self.parameters[str(message.param_id)] = float(message.param_value)
+            if _NEEDED.fullmatch(str(message.param_id)):
+                self.parameters[str(message.param_id)] = float(message.param_value)
             return
         if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
             return

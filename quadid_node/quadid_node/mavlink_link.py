@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from quadid_replay.tlog_messages import READERS
@@ -14,7 +15,9 @@ from quadid.online import Diagnosed, Event, Publish
 from quadid.online.records import OnlineSet
 from quadid.window import Sample
 from quadid_node.mavlink_decode import MavlinkDecoder
-from quadid_node.mavlink_wire import LinkError, Wire, dialect
+from quadid_node.mavlink_peers import Source
+from quadid_node.mavlink_requests import Requests
+from quadid_node.mavlink_wire import LinkError, Wire, dialect, sender
 from quadid_node.publication import Output
 
 COMPONENT = 191
@@ -25,8 +28,6 @@ REQUESTED = {
     "LOCAL_POSITION_NED": 20.0, "BATTERY_STATUS": 1.0,
 }  # fmt: skip
 """Messages asked for, with their rates [Hz]."""
-REPEAT_REQUEST = 10.0
-"""Messages that come at less than 60 % of the asked rate are asked for again after this long [s]."""
 FRAMES_A_SECOND = 4000
 """More frames than this are a flood: the rest is dropped unread."""
 PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
@@ -45,6 +46,7 @@ class Traffic:
 
     Attributes:
         behind: a stream signed with our key is refused because its stamps are this far behind [s]; 0 for none.
+        problems: what speaks against the link, sentences for people.
     """
 
     rates: dict[str, float]
@@ -52,6 +54,7 @@ class Traffic:
     refused: int
     dropped: int
     behind: float = 0.0
+    problems: tuple[str, ...] = ()
 
 
 class MavlinkLink:
@@ -63,7 +66,7 @@ class MavlinkLink:
 
     def __init__(
         self, url: str, rotors: int, system: int = 0, key: bytes | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = time.monotonic, memory: Path | None = None,
     ) -> None:  # fmt: skip
         """Opens the link.
 
@@ -73,23 +76,26 @@ class MavlinkLink:
             system: system id of the vehicle; 0 takes the first autopilot heard.
             key: signing key.
             clock: seconds, monotonic.
+            memory: file that keeps the time stamps of signatures over a restart.
 
         Raises:
             LinkError: the link cannot be opened.
         """
         if not 0 <= system <= 255:
             raise LinkError(f"system id {system}", "1 to 255, or 0 for the first one heard")
-        self._wire = Wire(url, system or 1, COMPONENT, key)
+        self._wire, self._key = Wire(url, system or 1, COMPONENT, key, memory), key is not None
+        self._source = Source()
         self._decoder = MavlinkDecoder(rotors)
         self._clock = clock
         self.vehicle_system = 0
         self._only, self._target = system, 0
-        self._beat, self._tell, self._asked, self._measured = -1e9, -1e9, -1e9, clock()
+        self._beat, self._tell, self._measured = -1e9, -1e9, clock()
         self._begin = clock()
         self._before: dict[str, int] = {}
         self._rates: dict[str, float] = {}
-        self._denied: set[str] = set()
+        self._requests = Requests()
         self._set: OnlineSet | None = None
+        self._text = 0
         self._budget, self._budget_second = FRAMES_A_SECOND, 0
 
     # --- in
@@ -99,9 +105,11 @@ class MavlinkLink:
         now = self._clock()
         if int(now) != self._budget_second:
             self._budget_second, self._budget = int(now), FRAMES_A_SECOND
-        for message in self._wire.receive(_WANTED, self._budget):
+        for message in self._wire.receive(_WANTED, self._budget, None if self._key else self._count):
             self._budget -= 1
             kind = message.get_type()
+            if self._is_vehicle(message) and not self._source.take(self._wire.source, now):
+                continue
             if kind == "HEARTBEAT":
                 self._on_heartbeat(message)
             elif kind == "COMMAND_ACK":
@@ -111,6 +119,12 @@ class MavlinkLink:
             elif self._is_vehicle(message):
                 yield from self._decoder.samples(message, now)
 
+    def _count(self, frame: bytes) -> None:
+        """Without a key every frame of the vehicle's ids is looked at: two senders have two rows of numbers."""
+        number, system, component = sender(frame)
+        if (system, component) == (self.vehicle_system, self._target):
+            self._source.count(self._wire.source, number, self._clock())
+
     def _is_vehicle(self, message: Any) -> bool:
         return bool(
             self.vehicle_system
@@ -119,7 +133,9 @@ class MavlinkLink:
         )
 
     def _on_heartbeat(self, message: Any) -> None:
-        """The first autopilot heard is our vehicle; we speak under its system id."""
+        """The first autopilot heard is our vehicle; we speak under its system id, to who is heard again and again."""
+        ours = message.autopilot != dialect.MAV_AUTOPILOT_INVALID and self._only in (0, message.get_srcSystem())
+        self._wire.peers.hello(self._wire.source, time.monotonic(), ours and not self._other(message))
         if message.autopilot == dialect.MAV_AUTOPILOT_INVALID or self.vehicle_system:
             return
         if self._only and message.get_srcSystem() != self._only:
@@ -132,13 +148,18 @@ class MavlinkLink:
             if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
                 self._wire.send(dialect.MAVLink_param_request_read_message(self.vehicle_system, self._target, name, -1))
 
+    def _other(self, message: Any) -> bool:
+        return self.vehicle_system not in (0, message.get_srcSystem())
+
     def _on_ack(self, message: Any) -> None:
-        """Notes a refused request for messages; what it refused the protocol does not say, the rates do."""
+        """Notes a refused request for a message."""
         if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return
-        if message.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
+        if message.result in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
+            self._requests.answered("")
+        else:
             known = dialect.enums["MAV_RESULT"].get(message.result)
-            self._denied.add(known.name if known is not None else f"result {message.result}")
+            self._requests.answered(known.name if known is not None else f"result {message.result}")
 
     def _for_us(self, message: Any) -> bool:
         return message.target_system in (0, self._wire.mav.srcSystem) and message.target_component in (0, COMPONENT)
@@ -180,9 +201,8 @@ class MavlinkLink:
             ))  # fmt: skip
         if now - self._measured >= 2.0:
             self._measure(now)
-        if self.vehicle_system and now - self._asked >= REPEAT_REQUEST:
-            self._asked = now
-            self._ask()
+        if self.vehicle_system:
+            self._ask(now)
         if self._set is not None and now - self._tell >= 5.0:
             self._tell = now
             self._send_values()
@@ -208,20 +228,26 @@ class MavlinkLink:
     def traffic(self) -> Traffic:
         """What comes over the link."""
         wire = self._wire
-        return Traffic(dict(self._rates), tuple(sorted(self._denied)), wire.refused, wire.dropped, wire.mav.behind)
+        problems = [self._source.problem, wire.memory_problem]
+        if not self._key and wire.signed:
+            problems.append("the frames are signed, but no key is given to check them: give --key")
+        if self._key and wire.refused and not self.vehicle_system and not wire.signed:
+            problems.append("a key is given, but the frames are not signed: give the vehicle the key (SETUP_SIGNING)")
+        said = tuple(p for p in problems if p)
+        return Traffic(dict(self._rates), self._requests.denied, wire.refused, wire.dropped, wire.mav.behind, said)
 
     def close(self) -> None:
         """Closes the link."""
         self._wire.close()
 
-    def _ask(self) -> None:
+    def _ask(self, now: float) -> None:
         """Asks for the messages that do not come at 60 % of their rate."""
-        for name, rate in REQUESTED.items():
-            if name in _IDS and self._rates.get(name, 0.0) < 0.6 * rate:
-                self._wire.send(dialect.MAVLink_command_long_message(
-                    self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
-                    float(_IDS[name]), 1e6 / rate, 0.0, 0.0, 0.0, 0.0, 0.0,
-                ))  # fmt: skip
+        lacking = [n for n, rate in REQUESTED.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
+        for name in self._requests.due(lacking, now):
+            self._wire.send(dialect.MAVLink_command_long_message(
+                self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
+                float(_IDS[name]), 1e6 / REQUESTED[name], 0.0, 0.0, 0.0, 0.0, 0.0,
+            ))  # fmt: skip
 
     def _measure(self, now: float) -> None:
         counts = self._decoder.counts
@@ -233,7 +259,9 @@ class MavlinkLink:
         """Our read-only parameters: number and state of the set, then values and relative standard deviations."""
         if self._set is None:
             return [("QI_SEQ", 0.0)]
-        out = [("QI_SEQ", float(self._set.sequence)), ("QI_STALE", float(self._set.state.value == "stale"))]
+        high, low = divmod(self._set.sequence, 1 << 24)  # a float holds 24 bits
+        out = [("QI_SEQ", float(low)), ("QI_SEQ_HI", float(high)), ("QI_MASS", self._set.mass)]
+        out += [("QI_STALE", float(self._set.state.value == "stale")), ("QI_OLD", float(bool(self._set.outdated)))]
         for p in self._set.parameters:
             if p.name in PARAMETERS:
                 out += [(PARAMETERS[p.name], p.value), (f"{PARAMETERS[p.name]}_SD", p.sigma)]
@@ -260,5 +288,11 @@ class MavlinkLink:
             self._say(5, f"quadid: {report.text}")
 
     def _say(self, severity: int, text: str) -> None:
-        plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text)
-        self._wire.send(dialect.MAVLink_statustext_message(severity, plain[:_TEXT].encode()))
+        plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text).encode()
+        if len(plain) <= _TEXT:
+            self._wire.send(dialect.MAVLink_statustext_message(severity, plain))
+            return
+        self._text = self._text % 65535 + 1
+        for k in range(min(len(plain) // _TEXT + 1, 256)):  # the last one is short, be it empty
+            piece = plain[k * _TEXT : (k + 1) * _TEXT]
+            self._wire.send(dialect.MAVLink_statustext_message(severity, piece, self._text, k))

@@ -7,7 +7,7 @@ import hashlib
 import hmac
 import socket
 import time
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 from quadid_replay.esc_messages import extend_dialect
 
 from quadid.errors import QuadidError
+from quadid_node.mavlink_peers import Peers
+from quadid_node.signing_memory import SigningMemory
 
 dialect: Any = extend_dialect(ardupilotmega)
 _Coder: Any = dialect.MAVLink
@@ -29,6 +31,7 @@ _SIGNED, _SIGNATURE = 1, 13
 READS_AT_ONCE = 500
 """Datagrams or pieces of a stream after which whoever receives gets to do other things, as heeding a signal."""
 _LONGEST = 12 + 255 + _SIGNATURE
+_DATAGRAM = 65535
 
 
 class LinkError(QuadidError):
@@ -67,6 +70,12 @@ def _length(buffer: bytearray) -> int | None:
 def message_id(frame: bytes) -> int:
     """Number of the message in a frame."""
     return frame[5] if frame[0] == 0xFE else frame[7] | frame[8] << 8 | frame[9] << 16
+
+
+def sender(frame: bytes) -> tuple[int, int, int]:
+    """Frame number, system and component of a frame."""
+    place = 2 if frame[0] == 0xFE else 4
+    return frame[place], frame[place + 1], frame[place + 2]
 
 
 class SafeMavlink(_Coder):
@@ -143,9 +152,13 @@ class Wire:
     Attributes:
         refused: frames with a wrong checksum, and with a key those without a good signature.
         dropped: bytes dropped unread because too many came.
+        source: of the frame yielded last: UDP address, None on other links.
+        unsigned, signed: whether frames of the two kinds came.
     """
 
-    def __init__(self, url: str, system: int, component: int, key: bytes | None = None) -> None:
+    def __init__(
+        self, url: str, system: int, component: int, key: bytes | None = None, memory: Path | None = None,
+    ) -> None:  # fmt: skip
         """Opens the link.
 
         Args:
@@ -153,6 +166,7 @@ class Wire:
             system: our system id.
             component: our component id.
             key: signing key; with one, every frame that is not signed with it is refused.
+            memory: file that keeps the newest time stamps of signatures over a restart.
 
         Raises:
             LinkError: the link cannot be opened.
@@ -170,31 +184,45 @@ class Wire:
             ) from error
         self._datagrams = isinstance(self._conn, mavutil.mavudp)
         self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
+        self._memory: SigningMemory | None = None
         if key is not None:
             self.mav.signing.secret_key = key
             self.mav.signing.sign_outgoing = True
             self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * 100_000)
+            self._memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
         self._buffer = bytearray()
         self.refused = self.dropped = 0
+        self.source: Any = None
+        self.peers = Peers()
+        self.signed = self.unsigned = False
 
-    def receive(self, wanted: Container[int], most: int) -> Iterator[Any]:
+    @property
+    def memory_problem(self) -> str:
+        """Why time stamps of signatures are not kept over a restart, or empty."""
+        return self._memory.problem if self._memory is not None else ""
+
+    def receive(
+        self, wanted: Container[int], most: int, count: Callable[[bytes], None] | None = None,
+    ) -> Iterator[Any]:  # fmt: skip
         """Yields the wanted messages that have arrived; never waits, and ends however fast more of them come.
 
         Args:
             wanted: message numbers; others are not even decoded.
             most: frames to decode at most; what comes beyond is read and dropped.
+            count: gets every frame, whether wanted and believable or not.
         """
         decoded = 0
         for _ in range(READS_AT_ONCE):
             data = self._read()
             if not data:
-                return
+                break
             if decoded >= most:
                 self.dropped += len(data)
                 continue
             self._buffer = bytearray(data) if self._datagrams else self._buffer + data
-            believed = False
             for frame in frames(self._buffer, self._datagrams):
+                if count is not None:
+                    count(frame)
                 if message_id(frame) not in wanted:
                     continue
                 decoded += 1
@@ -202,15 +230,19 @@ class Wire:
                     message = self.mav.decode(bytearray(frame))
                 except dialect.MAVError:
                     self.refused += 1
+                    self.signed |= _is_signed(frame)
                     continue
-                believed = True
+                self.signed, self.unsigned = self.signed | _is_signed(frame), self.unsigned | (not _is_signed(frame))
                 yield message
-            self._keep_peer(believed)
+        if self._memory is not None:
+            self._memory.keep()
 
     def send(self, message: Any) -> None:
         """Sends a message; a link that is down loses it."""
         frame = message.pack(self.mav)
         self.mav.seq = (self.mav.seq + 1) % 256
+        if self._datagrams:
+            self._conn.clients = self.peers.answered(time.monotonic())
         try:
             self._conn.write(frame)
         except OSError:
@@ -218,18 +250,20 @@ class Wire:
 
     def close(self) -> None:
         """Closes the link."""
+        if self._memory is not None:
+            self._memory.keep(at_once=True)
         self._conn.close()
 
     def _read(self) -> bytes:
-        """Bytes that have arrived, or none; remembers who was not known before."""
-        self._known = set(getattr(self._conn, "clients", ()))
+        """Bytes that have arrived, or none; notes where they came from."""
         try:
+            if self._datagrams:
+                data, self.source = self._conn.port.recvfrom(_DATAGRAM)
+                return bytes(data)
             return bytes(self._conn.recv(4096) or b"")
         except (OSError, TypeError):
             return b""
 
-    def _keep_peer(self, believed: bool) -> None:
-        """Answers go to every address that was heard: one that said nothing believable is forgotten again."""
-        clients = getattr(self._conn, "clients", None)
-        if clients is not None and not believed:
-            clients &= self._known
+
+def _is_signed(frame: bytes) -> bool:
+    return frame[0] == 0xFD and bool(frame[2] & _SIGNED)

@@ -92,4 +92,8 @@ FAULTS: dict[int, Fault] = {
         "Zenoh parcel of a few bytes that claims gigabytes, names constructors, has other types",
         "data only: declared types and sizes checked before memory is taken; refused by worker, service, ground",
     ),
+    27: Fault(
+        "second source under the vehicle's own ids, another address or merged into one stream; peers that come once",
+        "refused or nothing believed, and said; only who is heard again and again is answered",
+    ),
 }

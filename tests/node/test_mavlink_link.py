@@ -13,12 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from quadid_node.mavlink_decode import MavlinkDecoder
 from quadid_node.mavlink_link import FRAMES_A_SECOND, MavlinkLink
+from quadid_node.mavlink_peers import Source
+from quadid_node.mavlink_requests import Requests
 from quadid_node.mavlink_wire import SafeMavlink, dialect, frames
 from quadid_replay.tlog_writer import mavlink_messages
 
 from quadid.online.records import Diagnosed, Event, OnlineFinding
 from tests.faults.evidence import Happened
-from tests.node.mavlink_ends import Sender, accepted, free_port, samples
+from tests.node.mavlink_ends import KEY, Sender, accepted, free_port, samples
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE
 
@@ -77,6 +79,8 @@ def test_a_flight_over_the_wire_gives_every_channel(link: MavlinkLink, port: int
 def test_parameters_are_listed_read_and_never_set(link: MavlinkLink, port: int) -> None:
     vehicle, station = Sender(port), Sender(port, 255, 190)
     vehicle.heartbeat()
+    station.heartbeat(autopilot=8)
+    samples(link, 0.6)
     station.heartbeat(autopilot=8)
     samples(link, 0.1)
     link.publish(accepted())
@@ -187,6 +191,105 @@ def test_a_stream_in_pieces_gives_all_frames(seed: int, garbage: bool) -> None:
         data = data[size:]
         found += len(list(frames(buffer, whole=False)))
     assert found == 20
+
+
+def test_a_second_source_under_the_same_id_is_refused_and_said(
+    link: MavlinkLink, port: int, happened: Happened
+) -> None:
+    vehicle, other = Sender(port), Sender(port)
+    vehicle.heartbeat()
+    samples(link, 0.1)
+    for k in range(60):
+        vehicle.imu(1.0 + 0.01 * k)
+        other.imu(500.0 + 0.01 * k, rate=50.0)
+    got = [s for s in samples(link, 0.3) if s.channel == "gyro"]
+    assert [s.values[0] for s in got] == pytest.approx([0.1] * 60), "only the first one's, and all of them"
+    assert "second source" in link.traffic().problems[0]
+    happened(27, "60 frames of a second UDP source under the vehicle's ids: none taken, said")
+
+
+def test_two_senders_mixed_into_one_stream_are_told_by_their_frame_numbers(happened: Happened) -> None:
+    """As a router that merges links does: one address, or a serial line, which has none."""
+    lossy, mixed, rng = Source(), Source(), random.Random(1)
+    for k in range(400):
+        assert lossy.take(None, 0.02 * k)
+        if rng.random() < 0.5:
+            lossy.count(None, k % 256, 0.02 * k)
+    assert lossy.problem == ""
+    took = 0
+    for k in range(400):
+        for start in (0, 97):
+            mixed.count(None, (start + k) % 256, 0.02 * k)
+            took += mixed.take(None, 0.02 * k)
+    assert "two sources" in mixed.problem
+    assert took <= 40
+    for k in range(400):
+        mixed.count(None, k % 256, 20.0 + 0.02 * k)
+        mixed.take(None, 20.0 + 0.02 * k)
+    assert mixed.problem == "", "when the other is gone it goes on"
+    happened(27, f"two senders merged into one stream: {took} of 800 frames taken until seen; half lost: no alarm")
+
+
+def test_who_said_hello_once_is_not_answered(link: MavlinkLink, port: int, happened: Happened) -> None:
+    vehicle = Sender(port)
+    vehicle.heartbeat()
+    once = [Sender(port, 200, 1 + k) for k in range(20)]
+    for sender in once:
+        sender.heartbeat(autopilot=8)
+    samples(link, 1.3)
+    assert vehicle.heard(0.3)
+    assert not any(sender.heard(0.05) for sender in once)
+    happened(27, "20 addresses that sent one heartbeat: none answered, the vehicle is")
+
+
+def test_parameters_nobody_needs_take_no_memory() -> None:
+    decoder = MavlinkDecoder(4)
+    for k in range(1000):
+        name = f"X{k}".encode()
+        list(decoder.samples(decoded(dialect.MAVLink_param_value_message(name, 1.0, 9, 100, 0)), 0.0))
+    assert decoder.parameters == {}
+
+
+def test_a_long_text_comes_in_pieces_and_whole(link: MavlinkLink, port: int) -> None:
+    vehicle = Sender(port)
+    vehicle.heartbeat()
+    samples(link, 0.1)
+    vehicle.heard(0.3)
+    texts = ["mass_change: " + "x" * 100, "y" * 92]  # the second fills its two pieces
+    for text in texts:
+        link.publish(Event(1.0, "warning", "finding", text))
+    pieces = [m for m in vehicle.heard() if m.get_type() == "STATUSTEXT"]
+    whole: dict[int, str] = {}
+    for m in pieces:
+        assert m.id > 0
+        whole[m.id] = whole.get(m.id, "") + m.text
+    assert list(whole.values()) == [f"quadid: {text}" for text in texts]
+    assert len(pieces[-1].text) < 50, "a short piece ends it"
+
+
+def test_a_refused_message_is_named_and_asked_for_no_more() -> None:
+    requests, names = Requests(), ["HIGHRES_IMU", "ESC_STATUS"]
+    assert requests.due(names, 0.0) == names
+    requests.answered("MAV_RESULT_DENIED")
+    assert not requests.denied, "at first all are asked for at once: nobody can say which was refused"
+    asked = []
+    for k in range(1, 2000):
+        for name in requests.due(names, 0.1 * k):
+            asked.append(name)
+            requests.answered("MAV_RESULT_DENIED" if name == "ESC_STATUS" else "")
+    assert requests.denied == ("ESC_STATUS (MAV_RESULT_DENIED)",)
+    assert asked.count("ESC_STATUS") == 1
+    assert 1 < asked.count("HIGHRES_IMU") < 5, "not for ever"
+
+
+def test_a_signed_link_without_a_key_is_said(port: int) -> None:
+    link, vehicle = MavlinkLink(f"udpin:127.0.0.1:{port}", 4), Sender(port, key=KEY)
+    try:
+        vehicle.heartbeat()
+        samples(link, 0.1)
+        assert any("no key is given" in problem for problem in link.traffic().problems)
+    finally:
+        link.close()
 
 
 def test_servo_outputs_follow_the_autopilots_motor_functions_and_unwrap() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 from quadid_node.mavlink_link import MavlinkLink
 from quadid_node.mavlink_wire import LinkError, dialect, read_key
+from quadid_node.signing_memory import memory_path
 
 from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, free_port, samples
@@ -98,6 +100,40 @@ def test_old_signatures_of_a_new_stream_are_refused(port: int) -> None:
         assert link.vehicle_system == 0
     finally:
         link.close()
+
+
+def test_replays_are_refused_after_a_restart_and_with_the_clock_set_back(
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    memory = memory_path(tmp_path / "deep", KEY)
+    vehicle, thief = Sender(port, key=KEY), Sender(port)
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY, memory=memory)
+    stolen = [vehicle.heartbeat(), *(vehicle.imu(1.0 + 0.01 * k) for k in range(20))]
+    assert samples(link, 0.2)
+    link.close()
+    hour = 3600.0
+    for clock_back in (0.0, hour):
+        now = time.time
+        monkeypatch.setattr(time, "time", lambda now=now, back=clock_back: now() - back)
+        link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY, memory=memory)
+        monkeypatch.undo()
+        try:
+            for frame in stolen:
+                thief.socket.send(frame)
+            assert samples(link, 0.2) == []
+            assert link.vehicle_system == 0
+            assert link.traffic().refused == len(stolen)
+        finally:
+            link.close()
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY, memory=memory)
+    try:
+        vehicle.mav.signing.timestamp += 3 * 100_000  # it went on meanwhile
+        vehicle.heartbeat()
+        vehicle.imu(5.0)
+        assert samples(link, 0.2), "the vehicle itself is heard again"
+    finally:
+        link.close()
+    happened(14, f"{len(stolen)} recorded frames after a restart, and with our clock set back by an hour: all refused")
 
 
 @pytest.mark.parametrize("data", [b"", b"short", b"z" * 64])

@@ -1,0 +1,91 @@
+"""Who speaks on a MAVLink link: one source for the vehicle, and the few peers that are answered."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+Address = Hashable
+SILENT = 3.0
+"""A source that is silent for so long [s] may be replaced by another: the vehicle came back from elsewhere."""
+GAPS = 20.0
+"""Two streams in one have a mean step of the frame numbers near 128; losses of 95 % look like this many."""
+JUDGED = 40
+"""Frames after which the steps are judged."""
+CALM = 2.0
+"""Frame numbers must follow for so long [s] before a stream that two had mixed is believed again."""
+HELLOS, HELLO_SECONDS = 2, 0.5
+"""A peer is answered after so many believable heartbeats that span this time [s],"""
+FORGOTTEN = 15.0
+"""... until it is silent for so long [s],"""
+MOST_PEERS = 8
+"""... and never more of them at a time."""
+
+
+class Source:
+    """Holds that all frames of the vehicle come from one sender.
+
+    Attributes:
+        problem: what speaks against it now, or empty.
+        refused: frames refused as those of a second one.
+    """
+
+    def __init__(self) -> None:
+        self.problem, self.refused = "", 0
+        self._address: Address | None = None
+        self._heard, self._mixed_until, self._refused_at = -1e9, -1e9, -1e9
+        self._last: int | None = None
+        self._steps = self._frames = 0
+
+    def take(self, address: Address | None, now: float) -> bool:
+        """Whether a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
+        if now - self._heard > SILENT:
+            self._address, self._last = address, None
+        if address != self._address:
+            self.refused, self._refused_at = self.refused + 1, now
+            self.problem = f"a second source {address} sends as our vehicle ({self._address}): its frames are refused"
+            return False
+        self._heard = now
+        if now < self._mixed_until:
+            self.refused += 1
+            self.problem = "two sources are mixed in one stream (their frame numbers alternate): nothing is believed"
+            return False
+        if now - self._refused_at > SILENT:
+            self.problem = ""
+        return True
+
+    def count(self, address: Address | None, sequence: int, now: float) -> None:
+        """Looks at the number of every frame: those of one sender follow each other, those of two alternate."""
+        if address != self._address:
+            return
+        if self._last is not None:
+            self._steps += (sequence - self._last) % 256
+            self._frames += 1
+        self._last = sequence
+        if self._frames >= JUDGED:
+            if self._steps > GAPS * self._frames:
+                self._mixed_until = now + CALM
+            self._steps = self._frames = 0
+
+
+class Peers:
+    """Addresses that are answered: the vehicle's, and those that have shown to be ground stations."""
+
+    def __init__(self) -> None:
+        self._hellos: dict[Address, list[float]] = {}
+        self._vehicle: Address | None = None
+
+    def hello(self, address: Address, now: float, vehicle: bool) -> None:
+        """Notes a believable heartbeat."""
+        if vehicle:
+            self._vehicle = address
+        known = self._hellos.get(address)
+        if known is not None:
+            self._hellos[address] = [known[0], now, known[2] + 1.0]
+        elif len(self._hellos) < 4 * MOST_PEERS:
+            self._hellos[address] = [now, now, 1.0]
+
+    def answered(self, now: float) -> set[Address]:
+        """Who gets what we send."""
+        self._hellos = {a: seen for a, seen in self._hellos.items() if now - seen[1] <= FORGOTTEN}
+        steady = [a for a, (first, last, n) in self._hellos.items() if n >= HELLOS and last - first >= HELLO_SECONDS]
+        return {*steady[:MOST_PEERS], *([self._vehicle] if self._vehicle in self._hellos else [])}
