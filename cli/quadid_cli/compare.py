@@ -9,6 +9,7 @@ import typer
 
 from quadid.workflow.loading import GRID
 from quadid_cli.options import (
+    Columns,
     JsonTarget,
     Logs,
     OutFolder,
@@ -52,12 +53,13 @@ def compare(
     stop: Stop = None,
     preset: Preset = "auto",
     unchecked: Unchecked = False,
+    columns: Columns = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
     """Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side."""
     from quadid.workflow import compare as work
-    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -65,8 +67,8 @@ def compare(
     names = work.check_names(method, objective)
     described = load_vehicle(vehicle)
     hertz = GRID if rate is None else rate
-    train = load_logs(logs, described, hertz, start, stop, preset, unchecked)
-    held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
+    train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+    held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
     with terminal.progress() as advance:
         result = work.compare(
             train, held, methods=names, seeds=range(seed, seed + seeds), budget=budget, objective=objective,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from quadid.workflow.loading import GRID
 from quadid_cli.options import (
+    Columns,
     JsonTarget,
     Logs,
     OutFolder,
@@ -32,12 +33,13 @@ def diagnose(
     stop: Stop = None,
     preset: Preset = "auto",
     unchecked: Unchecked = False,
+    columns: Columns = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
     from quadid.workflow import diagnose as work
-    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
 
@@ -47,8 +49,8 @@ def diagnose(
     folder = output.out_folder(out)
     hertz = GRID if rate is None else rate
     with explained(report, f"Diagnosis of {described.name}", [*logs, *(validate or [])], described, preset):
-        train = load_logs(logs, described, hertz, start, stop, preset, unchecked)
-        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
+        train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
         with terminal.progress() as advance:
             done = work.diagnose(train, held, seed=seed, advance=advance)
     target = free_path(folder / done.file_name, vehicle)

@@ -10,6 +10,7 @@ import typer
 from quadid.workflow.loading import GRID
 from quadid.workflow.searching import OPTIMIZERS
 from quadid_cli.options import (
+    Columns,
     JsonTarget,
     Logs,
     OutFolder,
@@ -43,12 +44,13 @@ def identify(
     stop: Stop = None,
     preset: Preset = "auto",
     unchecked: Unchecked = False,
+    columns: Columns = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid.workflow import identify as work
-    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid.workflow.searching import check_optimizer
     from quadid_cli import output, terminal
     from quadid_cli.explaining import explained
@@ -60,8 +62,8 @@ def identify(
     target = fitted_path(output.out_folder(out), described, vehicle)
     hertz = GRID if rate is None else rate
     with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
-        train = load_logs(logs, described, hertz, start, stop, preset, unchecked)
-        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked)
+        train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
         try:
             with terminal.progress() as advance:
                 done = work.identify(train, held, optimizer=optimizer, seed=seed, advance=advance)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from quadid.report.text_table import Cell
-from quadid_cli.options import JsonTarget, Preset, Start, Stop
+from quadid_cli.options import Columns, JsonTarget, Preset, Start, Stop
 
 if TYPE_CHECKING:
     from quadid.workflow.inspect import Inspected
@@ -33,14 +33,16 @@ def inspect(
     start: Start = None,
     stop: Stop = None,
     preset: Preset = "auto",
+    columns: Columns = None,
 ) -> None:
     """What a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing."""
     from quadid.workflow.inspect import inspect as inspected
+    from quadid.workflow.loading import parse_columns
     from quadid_cli.output import check_file, json_text, out_folder, write_json, write_text
 
     check_file(json, "--json")
     folder = None if out is None else out_folder(out)
-    done = inspected(log, vehicle, start=start, stop=stop, preset=preset)
+    done = inspected(log, vehicle, start=start, stop=stop, preset=preset, columns=parse_columns(columns or []))
     if folder is not None:
         target = folder / f"{Path(done.result['log']).name}.inspect.json"
         done.result["files"] = [str(target)]

@@ -19,6 +19,8 @@ from typer.main import get_command
 COMMANDS: dict[str, str] = {
     "demo": "Fly, identify and diagnose a simulated Pelican; write a report.",
     "simulate": "Fly the closed-loop vehicle and log it, to a file or live.",
+    "init": "A vehicle file to fill in, or filled in from a log.",
+    "vehicles": "The vehicles that ship.",
     "inspect": "What a log holds, whether it can be true, and what is missing.",
     "identify": "Identify the parameters of a vehicle from its flight logs.",
     "score": "Open-loop prediction error of a vehicle file on logs.",
@@ -45,6 +47,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "quadid simulate late.csv --effect motor_lag:tau=0.04",
         "quadid simulate udpout:127.0.0.1:14550 --seconds 60",
     ),
+    "init": ("quadid init mine", "quadid init mine --from flight.bin --mass 1.9"),
+    "vehicles": ("quadid vehicles",),
     "inspect": ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
     "identify": (
         "quadid identify flight.mcap --validate other.mcap --vehicle pelican --report report.html",
@@ -132,6 +136,11 @@ core itself: more threads than one only wait for each other, on a busy machine f
 
 def app_main() -> int:
     """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer."""
+    if sys.stderr is None:  # closed by the shell: what is written to it goes nowhere
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - it stays open to the end
+    if sys.stdout is None:
+        print("quadid: stdout is closed; fix: send it to a file, or to /dev/null", file=sys.stderr)
+        return 2
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
     try:

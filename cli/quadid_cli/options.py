@@ -11,7 +11,7 @@ Logs = Annotated[
     list[str],
     typer.Argument(
         metavar="LOG",
-        help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216 uses seconds 76 to 216.",
+        help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, format auto-detected. LOG@76:216 uses seconds 76 to 216.",
     ),
 ]
 
@@ -32,7 +32,7 @@ VehicleName = Annotated[
 ]
 Validate = Annotated[
     list[str] | None,
-    typer.Option("--validate", metavar="LOG", help="A log that is scored but not fitted; may be given again."),
+    typer.Option("--validate", metavar="LOG", help="A log that is scored but not fitted; repeatable."),
 ]
 JsonTarget = Annotated[
     str | None,
@@ -59,6 +59,10 @@ Preset = Annotated[
     typer.Option(
         "--preset", metavar="NAME", help="Topic names of ROS logs: auto, canonical, mavros, px4, ardupilot, rotors."
     ),
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--columns", metavar="NAME=C", help="What a CSV calls a column, as gyro_x=p,gyro_y=q; repeatable."),
 ]
 Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
 ReportFile = Annotated[

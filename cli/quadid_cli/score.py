@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from quadid_cli.options import JsonTarget, Logs, OutFolder, OwnRate, Preset, Start, Stop, Unchecked, VehicleName
+from quadid_cli.options import (
+    Columns,
+    JsonTarget,
+    Logs,
+    OutFolder,
+    OwnRate,
+    Preset,
+    Start,
+    Stop,
+    Unchecked,
+    VehicleName,
+)
 
 
 def score(
@@ -21,17 +32,18 @@ def score(
     stop: Stop = None,
     preset: Preset = "auto",
     unchecked: Unchecked = False,
+    columns: Columns = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
     from quadid.workflow import score as work
-    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid_cli import output, tables, terminal
 
     output.check_file(json, "--json")
     wanted = parse_horizons(horizons)
-    opened = load_logs(logs, load_vehicle(vehicle), rate, start, stop, preset, unchecked)
+    opened = load_logs(logs, load_vehicle(vehicle), rate, start, stop, preset, unchecked, parse_columns(columns or []))
     done = work.score(opened, horizons=wanted, rate=rate)
     output.write_json(done.result, json)
     tables.print_outcome(terminal.console(quiet=json == "-"), done)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,7 +43,7 @@ class Inspected(Outcome):
 
 def inspect(
     log: str | Path | Log, vehicle: str | Path | Vehicle | None = None, *, start: float | None = None,
-    stop: float | None = None, preset: str = "auto",
+    stop: float | None = None, preset: str = "auto", columns: Mapping[str, str] | None = None,
 ) -> Inspected:  # fmt: skip
     """Inspects a log, and never refuses one that can be read.
 
@@ -52,6 +53,7 @@ def inspect(
         start: first time to look at [s], after the log's first IMU sample.
         stop: last time [s], likewise.
         preset: topic names of ROS logs.
+        columns: names in a CSV by names of the contract, beside those of the vehicle file.
 
     Raises:
         LogError: not readable, or nothing in the span.
@@ -65,8 +67,10 @@ def inspect(
         cut = parse_cut(str(log), start, stop)
         whole = None
     described = None if vehicle is None else as_vehicle(vehicle)
-    names = None if described is None else described.columns
-    recording = _part(open_recording(cut.path, preset, names) if whole is None else whole, cut.start, cut.stop)
+    if whole is None:
+        named = {} if described is None else described.columns
+        whole = open_recording(cut.path, preset, {**named, **(columns or {})})
+    recording = _part(whole, cut.start, cut.stop)
     rows = () if described is None else _excitation(recording, described)
     found = inspect_recording(recording, described, rows)
     return Inspected({**found.to_dict(), "log": str(cut.path.resolve()), "files": []}, found)

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, VehicleError
 
@@ -142,7 +142,7 @@ def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:
 
 def load(
     log: str | Path, vehicle: str | Path | Vehicle, *, rate: float | None = GRID, start: float | None = None,
-    stop: float | None = None, preset: str = "auto", unchecked: bool = False,
+    stop: float | None = None, preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
 ) -> Log:  # fmt: skip
     """Opens a log of any kind, checks it, and brings it onto the grid.
 
@@ -154,6 +154,7 @@ def load(
         stop: last time to use [s], likewise.
         preset: topic names of ROS logs.
         unchecked: use the log even when its units, frames or motors look wrong.
+        columns: names in a CSV by names of the contract, as ``{"p": "gyro_x"}``; beside those of the vehicle file.
 
     Raises:
         LogError: not readable, in wrong units or frames, motors in another order, or nothing left of it.
@@ -162,7 +163,7 @@ def load(
     """
     described = as_vehicle(vehicle)
     cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
-    recording = open_recording(cut.path, preset, described.columns)
+    recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
     doubts = () if unchecked else check_conventions(recording, described)
     windows, report = _gridded(recording, described, rate, cut)
     return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
@@ -170,12 +171,11 @@ def load(
 
 def load_logs(
     texts: Sequence[str], vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
-    preset: str = "auto", unchecked: bool = False,
+    preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
 ) -> list[Log]:  # fmt: skip
     """Opens several logs, see `load`."""
-    return [
-        load(text, vehicle, rate=rate, start=start, stop=stop, preset=preset, unchecked=unchecked) for text in texts
-    ]
+    options: dict[str, Any] = {"start": start, "stop": stop, "preset": preset, "unchecked": unchecked}
+    return [load(text, vehicle, rate=rate, columns=columns, **options) for text in texts]
 
 
 def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
@@ -210,6 +210,22 @@ def beginning(windows: Iterable[Window], longest: float) -> tuple[list[Window], 
         taken.append(window if len(window) <= rows else window.slice(0, rows))
         seconds += len(taken[-1]) * window.dt
     return taken, seconds
+
+
+def parse_columns(texts: Sequence[str]) -> dict[str, str]:
+    """Reads ``gyro_x=p`` (name in the file = name of the contract); returns ``{"p": "gyro_x"}``.
+
+    Raises:
+        LogError: a text of another form.
+    """
+    out = {}
+    for text in ",".join(texts).split(","):
+        given, sign, known = (part.strip() for part in text.partition("="))
+        if text and not (given and sign and known):
+            raise LogError(f"--columns {text}", "NAME_IN_FILE=NAME", "for example --columns gyro_x=p")
+        if text:
+            out[known] = given
+    return out
 
 
 def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]:

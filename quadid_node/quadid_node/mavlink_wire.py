@@ -25,6 +25,7 @@ SIGNING_EPOCH = 1420070400
 """Signature timestamps count 10 us units from 2015-01-01."""
 MOST_BEHIND = 60 * 100_000
 """A new stream may be this far behind the newest signature seen [10 us]: older ones are replays."""
+LAST_PORT = 65535
 KEY_BYTES = 32
 _HEAD = {0xFE: 8, 0xFD: 12}
 _SIGNED, _SIGNATURE = 1, 13
@@ -130,10 +131,15 @@ def read_key(path: Path) -> bytes:
     return data
 
 
-def _refuse_shared_port(device: str) -> None:
-    """pymavlink lets two programs listen on one UDP port, and the second one takes the first one's frames away."""
+def _check_port(device: str) -> None:
+    """Raises LinkError for a port that none is, or that is taken.
+
+    pymavlink lets two programs listen on one UDP port, and the second one takes the first one's frames away.
+    """
     kind, _, place = device.partition(":")
     host, _, port = place.rpartition(":")
+    if port.isdigit() and int(port) > LAST_PORT:
+        raise LinkError(f"port {port} in {device}", f"1 to {LAST_PORT}", "for example udpin:0.0.0.0:14550")
     if kind not in ("udpin", "udp") or not port.isdigit():
         return
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -172,7 +178,7 @@ class Wire:
             LinkError: the link cannot be opened.
         """
         device, _, baud = url.partition(",")
-        _refuse_shared_port(device)
+        _check_port(device)
         try:
             options = {"baud": int(baud)} if baud else {}
             self._conn: Any = mavutil.mavlink_connection(device, autoreconnect=True, **options)

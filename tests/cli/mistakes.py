@@ -1,0 +1,276 @@
+"""Forty mistakes and more: how each is made, and what the first line that a person sees must name.
+
+python -m tests.cli.mistakes > docs/mistakes.md
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import quadid
+from quadid.vehicle import Vehicle
+
+Rows = np.ndarray
+Table = tuple[list[str], Rows]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder with a flight as CSV (`log`) and as MCAP (`mcap`), and room for the spoilt ones."""
+
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        """A flight of 20 s with velocity and position."""
+        return self.folder / "flight.csv"
+
+    @property
+    def mcap(self) -> Path:
+        """The same flight."""
+        return self.folder / "flight.mcap"
+
+    def table(self) -> Table:
+        """Header and numbers of the flight."""
+        names = self.log.read_text(encoding="utf-8").splitlines()[0].split(",")
+        return names, np.loadtxt(self.log, delimiter=",", skiprows=1)
+
+    def write(self, names: Sequence[str], rows: Rows, separator: str = ",") -> Path:
+        """A log of these columns."""
+        path = self.folder / "log.csv"
+        np.savetxt(path, rows, delimiter=separator, header=separator.join(names), comments="", fmt="%.10g")
+        return path
+
+    def scaled(self, columns: str, factor: float) -> Path:
+        """The flight with some columns multiplied."""
+        names, rows = self.table()
+        rows[:, [names.index(n) for n in columns.split()]] *= factor
+        return self.write(names, rows)
+
+    def moved(self, columns: str, taken: str) -> Path:
+        """The flight with the values of other columns in some columns; ``-q`` for the negative of q."""
+        names, rows = self.table()
+        new = rows.copy()
+        for name, source in zip(columns.split(), taken.split(), strict=True):
+            new[:, names.index(name)] = rows[:, names.index(source.lstrip("-"))] * (-1.0 if source[0] == "-" else 1.0)
+        return self.write(names, new)
+
+    def without(self, columns: str) -> Path:
+        """The flight without some columns."""
+        names, rows = self.table()
+        keep = [i for i, n in enumerate(names) if n not in columns.split()]
+        return self.write([names[i] for i in keep], rows[:, keep])
+
+    def named(self, **names: str) -> Path:
+        """The flight with other column names."""
+        old, rows = self.table()
+        return self.write([names.get(n, n) for n in old], rows)
+
+    def bytes(self, name: str, content: bytes) -> Path:
+        """Any file."""
+        path = self.folder / name
+        path.write_bytes(content)
+        return path
+
+    def vehicle(self, **changes: Any) -> Path:
+        """A Pelican file with other entries; None leaves one out."""
+        data = {**yaml.safe_load(Vehicle.shipped("pelican").to_yaml()), **changes}
+        text = yaml.safe_dump({k: v for k, v in data.items() if v is not None})
+        return self.bytes("vehicle.yaml", text.encode())
+
+    def arms(self, factor: float) -> Path:
+        """A Pelican file with other arms."""
+        rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
+        return self.vehicle(rotors=[{**r, "position": [factor * x for x in r["position"]]} for r in rotors])
+
+    def degrees(self) -> Path:
+        """The flight with Euler angles in degrees in place of quaternions."""
+        names, rows = self.table()
+        w, x, y, z = (rows[:, names.index(n)] for n in ("qw", "qx", "qy", "qz"))
+        angles = [
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]  # fmt: skip
+        keep = [i for i, n in enumerate(names) if n not in ("qw", "qx", "qy", "qz")]
+        columns = np.column_stack([rows[:, keep], *np.degrees(angles)])
+        return self.write([*(names[i] for i in keep), "phi", "theta", "psi"], columns)
+
+    def commas(self) -> Path:
+        """The flight with decimal commas, separated by semicolons."""
+        path = self.write(*self.table(), separator=";")
+        path.write_text(path.read_text().replace(".", ","), encoding="utf-8")
+        return path
+
+    def still(self) -> Path:
+        """Ten seconds on the ground with idling rotors."""
+        rng = np.random.default_rng(0)
+        rows = np.column_stack([0.02 * np.arange(500), 0.002 * rng.standard_normal((500, 3)), np.full((500, 4), 100.0)])
+        return self.write(["t", "p", "q", "r", "w1", "w2", "w3", "w4"], rows)
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What was done wrong, the call, and words of which its first line must hold one.
+
+    With `vague` the line does not name the cause yet: the page says so, and the test only wants one line.
+    """
+
+    what: str
+    call: Callable[[Place], Sequence[str | Path]]
+    names: str
+    code: int = 2
+    vague: bool = False
+
+
+def fit(log: Callable[[Place], Path | str]) -> Callable[[Place], Sequence[str | Path]]:
+    """A call of identify with a spoilt log."""
+    return lambda p: ("identify", log(p), "--vehicle", "pelican", "--out", p.folder)
+
+
+def of(vehicle: Callable[[Place], Path | str]) -> Callable[[Place], Sequence[str | Path]]:
+    """A call of identify with a spoilt vehicle."""
+    return lambda p: ("identify", p.log, "--vehicle", vehicle(p), "--out", p.folder)
+
+
+MISTAKES = (
+    Mistake("gyro in degrees a second", fit(lambda p: p.scaled("p q r", 57.29578)), "deg/s"),
+    Mistake("Euler angles in degrees", fit(lambda p: p.degrees()), "degrees", vague=True),
+    Mistake("time in milliseconds", fit(lambda p: p.scaled("t", 1e3)), "ms|millisecond", vague=True),
+    Mistake("time in microseconds", fit(lambda p: p.scaled("t", 1e6)), "us|µs|microsecond", vague=True),
+    Mistake("rotor speeds in rpm", fit(lambda p: p.scaled("w1 w2 w3 w4", 9.549297)), "rpm"),
+    Mistake("acceleration in g", fit(lambda p: p.scaled("ax ay az", 1 / 9.80665)), " g"),
+    Mistake("two motors exchanged", fit(lambda p: p.moved("w1 w2", "w2 w1")), "2, 1, 3, 4"),
+    Mistake("motors numbered from another arm", fit(lambda p: p.moved("w1 w2 w3 w4", "w2 w3 w4 w1")), "order"),
+    Mistake("body axes forward, left, up", fit(lambda p: p.moved("q r ay az", "-q -r -ay -az")), "FLU"),
+    Mistake(
+        "world axes east, north, up",
+        fit(lambda p: p.moved("x y z vx vy vz qw qx qy qz", "y x -z vy vx -vz qw qy qx -qz")),
+        "ENU",
+        vague=True,
+    ),
+    Mistake("quaternion with its scalar last", fit(lambda p: p.moved("qw qx qy qz", "qx qy qz qw")), "qw|scalar|order"),
+    Mistake(
+        "normalised commands as rad/s",
+        fit(lambda p: p.scaled("w1 w2 w3 w4", 1e-3)),
+        "normali[sz]ed|command",
+        3,
+        vague=True,
+    ),
+    Mistake("decimal commas", fit(lambda p: p.commas()), "comma"),
+    Mistake(
+        "other column names", fit(lambda p: p.named(p="gyro_x", q="gyro_y", r="gyro_z")), "gyro_x|columns", vague=True
+    ),
+    Mistake("time column called time", fit(lambda p: p.named(t="time")), "column t|unknown format|time", vague=True),
+    Mistake("one column of three missing", fit(lambda p: p.without("r")), "lacks column r"),
+    Mistake("no rotor signal", fit(lambda p: p.without("w1 w2 w3 w4")), "no rotor speeds"),
+    Mistake("no gyro", fit(lambda p: p.without("p q r")), "no gyro"),
+    Mistake("a rotor column left out", fit(lambda p: p.without("w2")), "without a hole"),
+    Mistake("an empty file", fit(lambda p: p.bytes("log.bin", b"")), "empty"),
+    Mistake("a picture as a log", fit(lambda p: p.bytes("log.bin", b"\x89PNG\r\n" * 30)), "unknown format"),
+    Mistake("a packed log", fit(lambda p: p.bytes("log.gz", b"\x1f\x8b\x08" + bytes(99))), "gunzip"),
+    Mistake("no such file", fit(lambda p: p.folder / "no.csv"), "no file"),
+    Mistake("a folder as a log", fit(lambda p: p.folder), "directory"),
+    Mistake("a log cut at its beginning", fit(lambda p: p.bytes("cut.mcap", p.mcap.read_bytes()[:3000])), "cut.mcap"),
+    Mistake("a span outside the log", fit(lambda p: f"{p.log}@50:60"), "nothing"),
+    Mistake("a span backwards", fit(lambda p: f"{p.log}@9:3"), "swap"),
+    Mistake("a second of flight", fit(lambda p: f"{p.log}@3:4.2"), "1.5 s", 3),
+    Mistake("never off the ground", fit(lambda p: p.still()), "rotor|hover|say nothing|fly", 3, vague=True),
+    Mistake(
+        "the fitted log as validation", lambda p: (*fit(lambda p: p.log)(p), "--validate", p.log), "proves nothing"
+    ),
+    Mistake(
+        "the same flight in another format",
+        lambda p: (*fit(lambda p: p.log)(p), "--validate", p.mcap),
+        "proves nothing",
+    ),
+    Mistake("mass in grams", of(lambda p: p.vehicle(mass=1300.0)), "gram|mass"),
+    Mistake("mass half as much again", of(lambda p: p.vehicle(mass=1.95)), "mass", 0, vague=True),
+    Mistake("arms in millimetres", of(lambda p: p.arms(1000.0)), "arm|mm|position"),
+    Mistake("arms ten times too short", of(lambda p: p.arms(0.1)), "rotors 0.021 m"),
+    Mistake("a key misspelt", of(lambda p: p.vehicle(mass=None, mas=1.3)), "did you mean 'mass'"),
+    Mistake("a vehicle name misspelt", of(lambda p: "pelicn"), "pelican"),
+    Mistake("a vehicle file that is not there", of(lambda p: p.folder / "none.yaml"), "no vehicle file"),
+    Mistake("another airframe", of(lambda p: "hexacopter"), "rotor columns"),
+    Mistake("the log as the vehicle", of(lambda p: p.mcap), "not text"),
+    Mistake(
+        "an inertia that no body has",
+        of(
+            lambda p: p.vehicle(
+                parameters={"b": 2e-5, "d": 4e-7, "J_xx": 1e-3, "J_yy": 1e-3, "J_zz": 1e-1, "J_r": 3e-5}
+            )
+        ),
+        "triangle",
+    ),
+    Mistake("an effect misspelt", lambda p: ("simulate", p.folder / "x.csv", "--effect", "rotor_drg"), "rotor_drag"),
+    Mistake("no vehicle given", lambda p: ("identify", p.log), "--vehicle"),
+    Mistake("a search misspelt", lambda p: (*fit(lambda p: p.log)(p), "--optimizer", "psoo"), "did you mean 'pso'"),
+    Mistake(
+        "results into no folder",
+        lambda p: (*fit(lambda p: p.log)(p), "--json", p.folder / "no" / "r.json"),
+        "no folder",
+    ),
+    Mistake("a horizon of 0", lambda p: ("score", p.log, "--vehicle", "pelican", "--horizons", "0"), "horizons"),
+    Mistake("a port of 99999", lambda p: ("serve", "--vehicle", "pelican", "--mavlink", "udpin:0.0.0.0:99999"), "port"),
+    Mistake("a command misspelt", lambda p: ("identfy", p.log), "identify|No such command"),
+    Mistake(
+        "a red fit exported",
+        lambda p: ("export", "--vehicle", p.vehicle(proof={"verdict": "poor"}), "--format", "px4"),
+        "--anyway",
+    ),
+)
+
+
+def prepare(folder: Path) -> Place:
+    """Flies the flight that the mistakes are made with."""
+    flown = quadid.simulate(seconds=20.0, seed=12, extras=("velocity", "position"))
+    place = Place(folder)
+    flown.save(place.log)
+    flown.save(place.mcap)
+    return place
+
+
+def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
+    """Exit code, and the first line of stderr, else the verdict; folders left out."""
+    from quadid_cli.main import app_main
+
+    out, err, kept = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["quadid", *map(str, mistake.call(place))]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = app_main()
+    finally:
+        sys.argv = kept
+    lines = [line for line in err.getvalue().splitlines() if line.strip()] or out.getvalue().splitlines()[-1:]
+    return code, re.sub(r"/\S*/(?=[^/\s]*)", "", lines[0])
+
+
+def page() -> str:
+    """The table of docs/mistakes.md."""
+    head = [
+        "# Mistakes, and the first line that each gives", "",
+        "`python -m tests.cli.mistakes > docs/mistakes.md`; a test makes every mistake and compares.", "",
+        "Where a line does not name the cause yet, the mistake is marked with *.", "",
+        "| mistake | first line |", "|---|---|",
+    ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        place = prepare(Path(folder))
+        rows = [
+            f"| {m.what}{' *' * m.vague} | `{first_line(m, place)[1].replace('|', '/').replace('`', '')}` |"
+            for m in MISTAKES
+        ]
+    return "\n".join([*head, *rows]) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
