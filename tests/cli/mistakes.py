@@ -145,9 +145,9 @@ def of(vehicle: Callable[[Place], Path | str]) -> Callable[[Place], Sequence[str
 
 MISTAKES = (
     Mistake("gyro in degrees a second", fit(lambda p: p.scaled("p q r", 57.29578)), "deg/s"),
-    Mistake("Euler angles in degrees", fit(lambda p: p.degrees()), "degrees", vague=True),
-    Mistake("time in milliseconds", fit(lambda p: p.scaled("t", 1e3)), "ms|millisecond", vague=True),
-    Mistake("time in microseconds", fit(lambda p: p.scaled("t", 1e6)), "us|µs|microsecond", vague=True),
+    Mistake("Euler angles in degrees", fit(lambda p: p.degrees()), "degrees"),
+    Mistake("time in milliseconds", fit(lambda p: p.scaled("t", 1e3)), "ms|millisecond"),
+    Mistake("time in microseconds", fit(lambda p: p.scaled("t", 1e6)), "us|µs|microsecond"),
     Mistake("rotor speeds in rpm", fit(lambda p: p.scaled("w1 w2 w3 w4", 9.549297)), "rpm"),
     Mistake("acceleration in g", fit(lambda p: p.scaled("ax ay az", 1 / 9.80665)), " g"),
     Mistake("two motors exchanged", fit(lambda p: p.moved("w1 w2", "w2 w1")), "2, 1, 3, 4"),
