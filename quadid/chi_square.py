@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import math
 
+Z95 = 1.959963984540054
+"""Standard deviations of a normal variable that 95 % lie within."""
+
 
 def survival(x: float, freedom: int) -> float:
     """Probability that a chi-square variable of `freedom` degrees exceeds `x`.

@@ -21,6 +21,19 @@ class Status(StrEnum):
     IDENTIFIED = "identified"
     RATIO_ONLY = "ratio_only"
     PRIOR_DOMINATED = "prior_dominated"
+    UNRELIABLE = "unreliable"
+
+
+UNKNOWN = frozenset({Status.PRIOR_DOMINATED, Status.UNRELIABLE})
+"""Statuses of numbers that are not to be used as measured."""
+AT_BOUND = 1e-3
+"""Distance from a bound, relative to it, within which a value rests on it: what stands there is the bound, not data."""
+
+
+def at_bound(value: float, low: float, high: float) -> bool:
+    """Whether `value` rests on one of its bounds; a bound of zero has the scale of the other one."""
+    scale = (abs(low) or abs(high), abs(high) or abs(low))
+    return value <= low + AT_BOUND * scale[0] or value >= high - AT_BOUND * scale[1]
 
 
 NOMINAL_UNITS: dict[str, str] = {
@@ -49,6 +62,7 @@ class Parameter:
         status: what the data say about it.
         relative_to: for `ratio_only`, the parameter whose ratio to this one is known.
         ci95: 95 % interval; derived from `sigma` by the fit, which may use the log scale.
+        prior_share: share of what is known about it that was known before the flight, 0 to 1; NaN when unknown.
     """
 
     name: str
@@ -60,6 +74,7 @@ class Parameter:
     status: Status = Status.IDENTIFIED
     relative_to: str | None = None
     ci95: tuple[float, float] = (math.nan, math.nan)
+    prior_share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -105,6 +120,8 @@ class ParameterSet:
         raise ParameterError(f"unknown parameter '{name}'", fix=nearest(name, self.names))
 
 
+INERTIAS = ("J_xx", "J_yy", "J_zz")
+"""Principal moments of inertia."""
 INERTIA_SLACK = 3.0
 """How far a guess may break the triangle inequality.  The paper's own Table 2 breaks it by 24 % (J_zz = 0.0292 against
 J_xx + J_yy = 0.0236) and a first guess may be off by half, so only a breach beyond any such guess is a wrong file."""
@@ -119,11 +136,10 @@ def impossible_inertia(diagonal: Sequence[float], slack: float = INERTIA_SLACK) 
         diagonal: J_xx, J_yy, J_zz [kg m^2].
         slack: factor by which the inequality may be broken; 1 for none.
     """
-    names = ("J_xx", "J_yy", "J_zz")
-    for name, value in zip(names, diagonal, strict=True):
+    for name, value in zip(INERTIAS, diagonal, strict=True):
         if not value > 0.0:
             return f"{name} = {value:g} kg m^2 is not positive"
-    for i, name in enumerate(names):
+    for i, name in enumerate(INERTIAS):
         others = sum(diagonal) - diagonal[i]
         if diagonal[i] > slack * others:
             return f"{name} = {diagonal[i]:g} kg m^2 breaks the triangle inequality: the other two sum to {others:g}"

@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy import stats
 
+from quadid.chi_square import Z95
 from quadid.diagnose import Diagnosis, diagnose
 from quadid.diagnose import log_evidence as rule
 from quadid.diagnose.cross_validation import Gain, paired_gain
@@ -33,7 +34,6 @@ from quadid.diagnose.result import FoundParameter
 from quadid.diagnose.score_test import screen
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
-from quadid.identify.covariance import Z95
 from quadid.identify.shooting import Shooting
 from studies.campaign import Case, cases, flown
 from studies.page import put_section

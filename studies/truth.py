@@ -20,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.chi_square import Z95
 from quadid.diagnose.attribution import settle
 from quadid.flight import draw_truth, fly
 from quadid.identify.excitation import bounds_of
@@ -99,7 +100,7 @@ def table(outcomes: list[Outcome]) -> str:
     error, sigma = np.array([o.error for o in outcomes]), np.array([o.sigma for o in outcomes])
     limit = np.array([o.bound for o in outcomes])
     n = len(outcomes)
-    inside = np.mean(np.abs(error) <= 1.959964 * sigma, axis=0)
+    inside = np.mean(np.abs(error) <= Z95 * sigma, axis=0)
     rows = [
         "| parameter | RMS error % | bound of one cut % | ratio | bias % ± s.e. | coverage % ± s.e. |",
         "|---|---|---|---|---|---|",

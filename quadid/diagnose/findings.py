@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from quadid.chi_square import survival
+from quadid.chi_square import Z95, survival
 from quadid.diagnose.attribution import Worth
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
 from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
-from quadid.identify.covariance import Z95, uncertainty
+from quadid.identify.covariance import uncertainty
 from quadid.identify.shooting import Shooting
 
 MOST_ALTERNATIVES = 4

@@ -7,10 +7,10 @@ selection prefers causes whose numbers are possible; where none is, the finding 
 
 from __future__ import annotations
 
+from quadid.chi_square import Z95
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
-from quadid.identify.covariance import Z95
 from quadid.model.layout import Entry
 
 LIKELY_SENSOR = 10.0

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.chi_square import Z95
 from quadid.identify.gauss_newton import Prior, prior_terms
 from quadid.identify.shooting import Free, Linearised
-from quadid.parameters import Parameter, ParameterSet, Status
+from quadid.parameters import Parameter, ParameterSet, Status, at_bound
 
 FloatArray = NDArray[np.float64]
 
-Z95 = 1.959963984540054
 LAG_SECONDS = 2.0
 """Scores of segments up to this far apart may be correlated."""
 KNOWN = 0.03
@@ -24,6 +24,8 @@ RATIO_GAIN = 0.25
 """A ratio is known when its standard deviation is below RATIO_SIGMA and below RATIO_GAIN of the parameter's own."""
 PRIOR_SHARE = 0.5
 """A parameter whose posterior is wider than this share of its prior is prior-dominated."""
+SPREAD_LIMIT = 0.1
+"""Spread of estimates of one parameter (log scale) beyond which none of them is to be used."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +36,31 @@ class Uncertainty:
         covariance: posterior with prior, corrected, shape (P, P).
         inflation: factor on each standard deviation from autocorrelated or excess residuals, shape (P,).
         prior_sigma: standard deviation of the prior, shape (P,).
+        grown: factor on each standard deviation from what estimates differ by, see `reliability`, shape (P,); None: not
+            compared.
+        spread: what has to stay below `SPREAD_LIMIT`, shape (P,).
     """
 
     covariance: FloatArray
     inflation: FloatArray
     prior_sigma: FloatArray
+    grown: FloatArray | None = None
+    spread: FloatArray | None = None
 
     @property
     def sigma(self) -> FloatArray:
         """Standard deviation of each scaled parameter, shape (P,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def prior_share(self) -> FloatArray:
+        """Share of the information on each parameter that the prior brings, shape (P,)."""
+        return np.asarray(np.minimum((self.from_noise / (self.inflation * self.prior_sigma)) ** 2, 1.0))
+
+    @property
+    def from_noise(self) -> FloatArray:
+        """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
+        return self.sigma if self.grown is None else self.sigma / self.grown
 
 
 def uncertainty(
@@ -100,26 +117,28 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
             if log
             else (value - half * e.typical, value + half * e.typical)
         )
-        status, partner = _status(j, free, unc)
+        status, partner = _status(j, free, unc, value)
         out.append(
             Parameter(
                 e.name, e.unit, value, float(sigma[j]) * (value if log else e.typical), float(initial[e.index]),
-                (e.lower, e.upper), status, partner, ci,
+                (e.lower, e.upper), status, partner, ci, float(unc.prior_share[j]),
             )
         )  # fmt: skip
     scale = free.jacobian(theta)
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
 
 
-def _status(j: int, free: Free, unc: Uncertainty) -> tuple[Status, str | None]:
-    sigma = unc.sigma
-    if not free.is_log[j]:
-        dominated = sigma[j] > PRIOR_SHARE * unc.prior_sigma[j]
-        return (Status.PRIOR_DOMINATED if dominated else Status.IDENTIFIED), None
-    if sigma[j] <= KNOWN:
-        return Status.IDENTIFIED, None
-    if sigma[j] > PRIOR_SHARE * unc.prior_sigma[j]:
+def _status(j: int, free: Free, unc: Uncertainty, value: float) -> tuple[Status, str | None]:
+    sigma, entry = unc.sigma, free.entries[j]
+    if at_bound(value, entry.lower, entry.upper):
+        return Status.UNRELIABLE, None
+    if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j]:
         return Status.PRIOR_DOMINATED, None
+    limit = SPREAD_LIMIT if free.is_log[j] else SPREAD_LIMIT * max(1.0, abs(value) / entry.typical)
+    if unc.spread is not None and unc.spread[j] > limit:
+        return Status.UNRELIABLE, None
+    if not free.is_log[j] or sigma[j] <= KNOWN:
+        return Status.IDENTIFIED, None
     best, partner = math.inf, None
     for k in np.flatnonzero(free.is_log):
         if k != j and sigma[k] > 0.3 * sigma[j]:

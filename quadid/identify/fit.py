@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import WindowError
+from quadid.identify.answer import final_answer
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
-from quadid.identify.gauss_newton import Convergence, Polished, Prior, default_prior, polish
+from quadid.identify.gauss_newton import Convergence, Polished, default_prior, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.noise_estimation import flexible_names as flexible_names
 from quadid.identify.noise_estimation import noise_floor as noise_floor
@@ -19,11 +20,12 @@ from quadid.identify.noise_estimation import residual_noise as residual_noise
 from quadid.identify.noise_estimation import reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
+from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
-from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.parameters import NOMINAL_NAMES, ParameterSet, at_bound
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -118,7 +120,7 @@ def check_windows(windows: Sequence[Window]) -> None:
 
 def fit(
     windows: Sequence[Window], vehicle: Vehicle, options: FitOptions | None = None, names: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, out_of_reach: Mapping[str, str] | None = None,
 ) -> Fit:  # fmt: skip
     """Identifies parameters from flight data.
 
@@ -128,6 +130,7 @@ def fit(
         options: swarm, seed, segment length.
         names: parameters to free; by default the paper's six.
         progress: called with a stage and a fraction done.
+        out_of_reach: parameters that the channels of the log cannot show, and why; they keep the file's value.
 
     Raises:
         WindowError: unusable data, or no gyro in them.
@@ -147,7 +150,7 @@ def fit(
             short, theta, short.free(free_names), settings, options.particles, options.seed, report
         )
     if not options.polish:
-        return _finish(short, theta, free_names, Convergence.BUDGET, evaluations)
+        return final_answer(_finish(short, theta, free_names, Convergence.BUDGET, evaluations), out_of_reach or {})
     report("polish", 0.0)
     short = short.at_most(SHORT_SEGMENTS)
     free = short.free(free_names)
@@ -169,8 +172,8 @@ def fit(
         final, result = short, first
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
-    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust)
-    return replace(found, warnings=(*aside, *found.warnings))
+    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, first)
+    return final_answer(replace(found, warnings=(*aside, *found.warnings)), out_of_reach or {})
 
 
 def _thinned(whole: Shooting, used: Shooting) -> tuple[str, ...]:
@@ -203,13 +206,14 @@ def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Fre
 
 def _at_rest(free: Free, theta: FloatArray) -> bool:
     """True when no parameter rests on a bound."""
-    return all(e.lower * 1.001 < theta[e.index] < e.upper * 0.999 for e in free.entries)
+    return not any(at_bound(float(theta[e.index]), e.lower, e.upper) for e in free.entries)
 
 
 def _finish(
     shooting: Shooting, theta: FloatArray, names: list[str], outcome: Convergence, evaluations: int,
-    polished: Polished | None = None, robust: bool = False,
+    polished: Polished | None = None, robust: bool = False, short: Polished | None = None,
 ) -> Fit:  # fmt: skip
+    """Intervals and statuses; `short` is the fit to short segments, which tells what the numbers are worth."""
     free = shooting.free(names)
     prior = default_prior(shooting, free)
     both = None if polished is None else with_second_cut(shooting, polished, free, prior, robust)
@@ -217,20 +221,24 @@ def _finish(
     unc = uncertainty(lin, free, prior, theta, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
+    doubts: tuple[str, ...] = ()
+    if polished is not None and short is not None and np.isfinite(polished.cost):
+        trust = reliability(shooting, polished, free, prior, short)
+        unc, doubts = trust.widened(unc), trust.reasons(free)
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(
         shooting.vehicle, theta, parameters, shooting.noise, unc, outcome, evaluations,
-        _warnings(free, theta, unc, prior),
+        (*doubts, *_warnings(free, theta, unc)),
     )  # fmt: skip
 
 
-def _warnings(free: Free, theta: FloatArray, unc: Uncertainty, prior: Prior) -> tuple[str, ...]:
+def _warnings(free: Free, theta: FloatArray, unc: Uncertainty) -> tuple[str, ...]:
     out = []
     for e in free.entries:
-        value = theta[e.index]
-        if value <= e.lower * (1 + 1e-9) or value >= e.upper * (1 - 1e-9):
+        value = float(theta[e.index])
+        if at_bound(value, e.lower, e.upper):
             out.append(f"{e.name} = {value:.4g} {e.unit} rests on its bound [{e.lower:.4g}, {e.upper:.4g}]")
     grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
     if grown:

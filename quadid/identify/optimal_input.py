@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.chi_square import Z95
 from quadid.errors import ParameterError
 
 FloatArray = NDArray[np.float64]
@@ -51,4 +52,4 @@ def d_optimal(information: FloatArray, known: FloatArray, blocks: int) -> list[i
 def halfwidths(information: FloatArray) -> FloatArray:
     """Relative 95 % half-width of each log parameter, all others unknown too, shape (P,): exp(1.96 sigma) - 1."""
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    return np.asarray(np.expm1(np.minimum(1.959963984540054 * sigma, 50.0)))
+    return np.asarray(np.expm1(np.minimum(Z95 * sigma, 50.0)))

@@ -6,24 +6,20 @@ Numbers stay Python floats; NaN and infinities mean "no answer" and become null 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from quadid.identify.covariance import Z95
 from quadid.identify.fit import Fit
 from quadid.identify.open_loop import QUANTITIES
 from quadid.identify.prediction import HorizonScore
 from quadid.identify.score import SetScore
 from quadid.model.layout import Layout
-from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.parameters import NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
 from quadid.vehicle import ParameterPrior, Vehicle
 
 JsonDict = dict[str, Any]
 
-_UNKNOWN = Status.PRIOR_DOMINATED
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 
@@ -76,7 +72,7 @@ def identify_result(
 
 
 def parameter_entry(p: Parameter) -> JsonDict:
-    """One parameter: name, unit, value, 95 % interval, initial value, status; the partner of a known ratio."""
+    """One parameter of the contract; `prior_share` is the share of the information that the prior brings."""
     entry: JsonDict = {
         "name": p.name,
         "unit": p.unit,
@@ -84,6 +80,7 @@ def parameter_entry(p: Parameter) -> JsonDict:
         "ci95": list(p.ci95),
         "initial": p.initial,
         "status": p.status.value,
+        "prior_share": p.prior_share,
     }
     if p.relative_to is not None:
         entry["relative_to"] = p.relative_to
@@ -106,7 +103,7 @@ def _set_entry(s: ScoredSet) -> JsonDict:
 def inertia_warnings(parameters: ParameterSet) -> list[str]:
     """Says when identified moments of inertia cannot belong to a rigid body."""
     values = {p.name: p for p in parameters if p.name in ("J_xx", "J_yy", "J_zz")}
-    if len(values) < 3 or any(p.status is Status.PRIOR_DOMINATED for p in values.values()):
+    if len(values) < 3 or any(p.status in UNKNOWN for p in values.values()):
         return []
     why = impossible_inertia([values[n].value for n in ("J_xx", "J_yy", "J_zz")], slack=1.3)
     if why is None:
@@ -114,52 +111,6 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
     return [
         f"no rigid body has these moments of inertia: {why}; check mass, rotor positions and units in the vehicle file"
     ]
-
-
-def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
-    """The fit without what these data cannot tell: such parameters keep the vehicle file's value and say nothing.
-
-    Args:
-        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
-        reasons: why, by parameter, in words.
-
-    Returns:
-        The fit with the status ``prior_dominated``, the prior's interval and a warning for every name in `reasons`.
-    """
-    names = [n for n in fit.parameters.names if n in reasons]
-    if not names:
-        return fit
-    layout = Layout(fit.vehicle)
-    theta, covariance = fit.theta.copy(), np.array(fit.parameters.covariance)
-    rows = []
-    for j, p in enumerate(fit.parameters):
-        if p.name in reasons:
-            spread = float(fit.uncertainty.prior_sigma[j])
-            theta[layout.entry(p.name).index] = p.initial
-            covariance[j, :], covariance[:, j] = 0.0, 0.0
-            covariance[j, j] = (spread * p.initial) ** 2
-            ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
-            p = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, status=_UNKNOWN)
-        rows.append(p)
-    why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
-    told = [f"{who}: the vehicle file's values stand, because {reason}" for reason, who in why.items() if who]
-    kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
-    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*told, *kept))
-
-
-def bound_by_file(fit: Fit) -> Fit:
-    """The fit with ``prior_dominated`` for every parameter that rests on a bound: that value is the file's, not data's.
-
-    The data may well push against the bound; the fit's warnings name it.
-    """
-
-    def honest(p: Parameter) -> Parameter:
-        low, high = p.bounds
-        inside = low * (1.0 + 1e-9) < p.value < high * (1.0 - 1e-9)
-        return p if inside or p.name not in NOMINAL_NAMES else replace(p, status=_UNKNOWN, relative_to=None)
-
-    parameters = ParameterSet(tuple(honest(p) for p in fit.parameters), np.array(fit.parameters.covariance))
-    return replace(fit, parameters=parameters)
 
 
 def answered(parameters: ParameterSet) -> bool:
@@ -179,23 +130,23 @@ def fitted_vehicle(fit: Fit) -> Vehicle:
 
 
 def with_values(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
-    """The vehicle with these nominal values as initial guess, and their standard deviations; bounds are kept.
+    """The vehicle with these nominal values as initial guess; bounds are kept unless a value lies outside.
 
-    What the data say nothing about stays as the vehicle file has it, so that nobody takes it for measured.
+    Only identified values carry their standard deviation: a guess, or a number of a model that misses the flight, never
+    becomes a sharp prior of the next fit.
     """
     priors = dict(vehicle.parameters)
     for p in parameters:
-        if p.name in NOMINAL_NAMES and p.status is not Status.PRIOR_DOMINATED:
+        if p.name in NOMINAL_NAMES:
             priors[p.name] = _prior(priors[p.name], p)
     return vehicle.model_copy(update={"parameters": priors})
 
 
 def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
     value = _rounded(p.value)
-    if given.bounds is not None:
-        value = min(max(value, given.bounds[0]), given.bounds[1])
-    sigma = _rounded(p.sigma) if math.isfinite(p.sigma) and p.sigma > 0.0 else None
-    return ParameterPrior(initial=value, bounds=given.bounds, sigma=sigma)
+    known = p.status is Status.IDENTIFIED and math.isfinite(p.sigma) and p.sigma > 0.0
+    bounds = given.bounds and (min(given.bounds[0], value), max(given.bounds[1], value))
+    return ParameterPrior(initial=value, bounds=bounds, sigma=_rounded(p.sigma) if known else None)
 
 
 def _rounded(value: float) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from quadid.chi_square import Z95
 from quadid.errors import QuadidError
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.jobs import Job, JobReply
@@ -22,7 +23,6 @@ DIAGNOSED_SECONDS = 60.0
 """Flight that a diagnosis looks at [s]."""
 ANSWER_AFTER = 30.0
 """Time of the data between question and published answer [s]."""
-Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from quadid.chi_square import Z95
+from quadid.identify.covariance import PRIOR_SHARE
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, SetState
-from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status, impossible_inertia
+from quadid.parameters import NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
 
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
-Z95 = 1.959963984540054
 
 
 class GateSettings(BaseModel):
@@ -138,8 +139,8 @@ def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
         if p.name in NOMINAL_NAMES and not p.value > 0.0:
             return f"{p.name} = {p.value:g} {p.unit} is not positive"
         low, high = p.bounds
-        slack = 1e-9 * abs(p.value)
-        if not low + slack < p.value < high - slack and p.status is not Status.PRIOR_DOMINATED:
+        guessed = p.status is Status.PRIOR_DOMINATED or p.prior_share > PRIOR_SHARE**2
+        if at_bound(p.value, low, high) and not guessed:
             return f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]"
     why = impossible_inertia([parameters[n].value for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack)
     return f"impossible inertia: {why}" if why else None
@@ -158,7 +159,7 @@ def _width(case: Case, settings: GateSettings) -> str | None:
     for p in case.parameters:
         half = Z95 * p.sigma / max(abs(p.value), 1e-300)
         if p.name in MUST_BE_KNOWN:
-            if p.status is Status.PRIOR_DOMINATED or half > settings.width:
+            if p.status in UNKNOWN or half > settings.width:
                 return f"{p.name} is known to {half:.1%} only, wanted {settings.width:.1%}: keep flying"
         elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
             return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
@@ -191,7 +192,7 @@ def _is_sharper(case: Case, settings: GateSettings) -> bool:
     assert case.in_force is not None
     old = case.in_force.parameters
     return case.age >= settings.pause and any(
-        p.sigma < settings.sharper * old[p.name].sigma and p.status is not Status.PRIOR_DOMINATED
+        p.sigma < settings.sharper * old[p.name].sigma and p.status not in UNKNOWN
         for p in case.parameters
         if p.name in old.names
     )
@@ -208,7 +209,7 @@ def _step(case: Case, settings: GateSettings) -> str | None:
             if p.name not in reference.parameters.names:
                 continue
             old = reference.parameters[p.name]
-            known = Status.PRIOR_DOMINATED not in (p.status, old.status)
+            known = not UNKNOWN & {p.status, old.status}
             change = p.value / old.value - 1.0 if p.name in NOMINAL_NAMES and old.value > 0.0 else 0.0
             # What was only guessed before may be learned: its own interval says how far it may move.
             room = limit + (2.0 * old.sigma / old.value if known and old.value > 0.0 else math.inf)

@@ -135,14 +135,13 @@ def identify(
         ParameterError: an unknown search.
     """
     from quadid.identify.controller_gains import find_autopilot
-    from quadid.identify.result import answered, bound_by_file, identify_result, mask_unidentifiable
+    from quadid.identify.result import answered, identify_result
 
     check_optimizer(optimizer)
     described, train, held = settled(logs, validate, vehicle)
     windows = [w for log in train for w in log.windows]
     begin = time.perf_counter()
-    fit = search(optimizer, windows, described, seed, advance)
-    fit = bound_by_file(mask_unidentifiable(fit, out_of_reach(train)))
+    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
     seconds = time.perf_counter() - begin
     autopilot = find_autopilot(windows, described)
     sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]

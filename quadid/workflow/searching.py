@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from quadid.errors import NotIdentifiableError, ParameterError, nearest
@@ -39,18 +39,23 @@ def check_length(windows: Sequence[Window]) -> None:
         )  # fmt: skip
 
 
-def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance) -> Fit:
+def search(
+    name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
+    out_of_reach: Mapping[str, str] | None = None,
+) -> Fit:  # fmt: skip
     """Identifies the parameters with the search called `name`.
 
     The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
-    the parameters are where that search ended, not where the standard fit ends.
+    the parameters are where that search ended, not where the standard fit ends.  Parameters `out_of_reach` of the
+    channels, with the reason, keep the file's value.
     """
     from quadid.identify.fit import FitOptions, fit
 
     check_length(windows)
     if name == "pso_polish":
-        return fit(windows, vehicle, FitOptions(seed=seed), progress=advance)
+        return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
     from quadid.baselines.optimisers import minimise
+    from quadid.identify.answer import final_answer
     from quadid.identify.evaluate_at import fit_at
     from quadid.identify.shooting_objective import BoxProblem
 
@@ -58,4 +63,5 @@ def search(name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, ad
     advance(name, 0.0)
     problem = BoxProblem(windows, vehicle)
     found = minimise(name, problem.cost, problem.start, problem.lower, problem.upper, BUDGET, seed, problem.residual)
-    return fit_at(windows, vehicle, problem.theta(found.x), standard.noise, found.evaluations, str(found.stop))
+    at = fit_at(windows, vehicle, problem.theta(found.x), standard.noise, found.evaluations, str(found.stop))
+    return final_answer(at, out_of_reach or {})

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.online.gate import CHECKS, Z95, Case, GateSettings, decide
+from quadid.chi_square import Z95
+from quadid.online.gate import CHECKS, Case, GateSettings, decide
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia

@@ -1,0 +1,92 @@
+"""The last word on a fit: what these data cannot show keeps its guess, and guesses belong to a rigid body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quadid.chi_square import Z95
+from quadid.model.layout import Layout
+from quadid.parameters import INERTIAS, UNKNOWN, ParameterSet, Status, impossible_inertia
+
+if TYPE_CHECKING:
+    from quadid.identify.fit import Fit
+
+
+def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
+    """The fit as every command, the library and the node give it.
+
+    Args:
+        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
+        out_of_reach: parameters that the channels of the log cannot show, and why, in words.
+    """
+    return possible_inertia(mask_unidentifiable(fit, out_of_reach))
+
+
+def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
+    """The fit without what these data cannot tell: such parameters keep the vehicle file's value and say nothing.
+
+    Args:
+        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
+        reasons: why, by parameter, in words.
+
+    Returns:
+        The fit with the status ``prior_dominated``, the prior's interval and a warning for every name in `reasons`.
+    """
+    names = [n for n in fit.parameters.names if n in reasons]
+    if not names:
+        return fit
+    layout = Layout(fit.vehicle)
+    theta, covariance = fit.theta.copy(), np.array(fit.parameters.covariance)
+    rows = []
+    for j, p in enumerate(fit.parameters):
+        if p.name in reasons:
+            spread = float(fit.uncertainty.prior_sigma[j])
+            theta[layout.entry(p.name).index] = p.initial
+            covariance[j, :], covariance[:, j] = 0.0, 0.0
+            covariance[j, j] = (spread * p.initial) ** 2
+            ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
+            p = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, prior_share=1.0,
+                        status=Status.PRIOR_DOMINATED)  # fmt: skip
+        rows.append(p)
+    why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
+    told = [f"{who}: the vehicle file's values stand, because {reason}" for reason, who in why.items() if who]
+    kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
+    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*told, *kept))
+
+
+def possible_inertia(fit: Fit) -> Fit:
+    """The fit with guessed moments of inertia moved to where a rigid body can have them beside those identified.
+
+    Each principal moment lies between the difference and the sum of the other two.  Where identified ones alone are
+    impossible, the largest is not to be used, and is moved as a guess is.
+    """
+    values = {p.name: p for p in fit.parameters if p.name in INERTIAS}
+    if len(values) < len(INERTIAS) or impossible_inertia([values[n].value for n in INERTIAS], 1.0) is None:
+        return fit
+    movable = [n for n in INERTIAS if values[n].status in UNKNOWN]
+    if not movable:
+        if impossible_inertia([values[n].value for n in INERTIAS]) is None:
+            return fit
+        movable = [max(INERTIAS, key=lambda n: values[n].value)]
+    name = max(movable, key=lambda n: values[n].sigma / values[n].value)
+    one, two = (values[n].value for n in INERTIAS if n != name)
+    old = values[name]
+    value = min(max(old.value, abs(one - two)), one + two)
+    status = old.status if old.status in UNKNOWN else Status.UNRELIABLE
+    moved = replace(old, value=value, status=status, relative_to=None)
+    theta = fit.theta.copy()
+    theta[Layout(fit.vehicle).entry(name).index] = value
+    said = (
+        f"{name}: moved from {old.value:.4g} to {value:.4g} {old.unit}, because no rigid body has the former beside "
+        "the other two moments of inertia"
+    )
+    parameters = tuple(moved if p.name == name else p for p in fit.parameters)
+    return replace(
+        fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
+        warnings=(*fit.warnings, said),
+    )  # fmt: skip
