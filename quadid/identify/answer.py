@@ -62,16 +62,15 @@ def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
 def possible_inertia(fit: Fit) -> Fit:
     """The fit with guessed moments of inertia moved to where a rigid body can have them beside those identified.
 
-    Each principal moment lies between the difference and the sum of the other two.  Where identified ones alone are
-    impossible, the largest is not to be used, and is moved as a guess is.
+    Each principal moment lies between the difference and the sum of the other two; what breaks that by more than a
+    vehicle file may is moved there.  Where identified ones alone are impossible, the largest is not to be used, and is
+    moved as a guess is.
     """
     values = {p.name: p for p in fit.parameters if p.name in INERTIAS}
-    if len(values) < len(INERTIAS) or impossible_inertia([values[n].value for n in INERTIAS], 1.0) is None:
+    if len(values) < len(INERTIAS) or impossible_inertia([values[n].value for n in INERTIAS]) is None:
         return fit
     movable = [n for n in INERTIAS if values[n].status in UNKNOWN]
     if not movable:
-        if impossible_inertia([values[n].value for n in INERTIAS]) is None:
-            return fit
         movable = [max(INERTIAS, key=lambda n: values[n].value)]
     name = max(movable, key=lambda n: values[n].sigma / values[n].value)
     one, two = (values[n].value for n in INERTIAS if n != name)

@@ -221,11 +221,11 @@ def _finish(
     unc = uncertainty(lin, free, prior, theta, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
+    theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     doubts: tuple[str, ...] = ()
     if polished is not None and short is not None and np.isfinite(polished.cost):
         trust = reliability(shooting, polished, free, prior, short)
         unc, doubts = trust.widened(unc), trust.reasons(free)
-    theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(

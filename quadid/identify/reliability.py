@@ -41,6 +41,8 @@ MOST_CAUSES = 4
 """Causes that are fitted: the one that promises most, and those that would move the parameters most."""
 MOST_SEGMENTS = 150
 """Segments that causes are fitted to: differences of that size need no more."""
+WIDE = 0.7
+"""Standard deviation of a prior (scaled parameters) that leaves the data to themselves."""
 LONGER = 2.5
 """Length of segments that other motion decides in, relative to the short ones of a model with moments set aside."""
 
@@ -93,6 +95,10 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         prior: of those.
         short: the fit to short segments, which see faster motion only.
     """
+    if problem.vehicle.mass_sigma > 0.0 or problem.vehicle.arm_sigma > 0.0:
+        # Sharp priors pull against a wrong mass or arm; that is settled by `with_uncertain_scale`, and no misfit.
+        prior = Prior(prior.mean, np.maximum(prior.sigma, WIDE))
+        found = polish(problem, found.theta, free, prior, found.states, settled=True)
     own = uncertainty(found.lin, free, prior, found.theta)
     between, mean = _between_blocks(found, prior, own)
     left = float(found.lin.cost.sum() / found.lin.rows.sum())

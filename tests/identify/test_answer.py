@@ -1,0 +1,94 @@
+"""The last word on a fit: guesses stay guesses, and what is written passes our own checks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.identify.answer import final_answer, possible_inertia
+from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.result import fitted_vehicle, parameter_entry
+from quadid.parameters import INERTIAS, ParameterSet, Status, at_bound, impossible_inertia
+from quadid.vehicle import ParameterPrior, Vehicle
+from tests.identify.flights import PELICAN, flown, guessed
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    return fit([flown(3).window], guessed(flown(3).truth.parameters), FitOptions(iterations=0))
+
+
+def changed(fit: Fit, **values: tuple[float, Status]) -> Fit:
+    """The fit with other values and statuses."""
+    out = tuple(
+        replace(p, value=values[p.name][0], status=values[p.name][1]) if p.name in values else p for p in fit.parameters
+    )
+    return replace(fit, parameters=ParameterSet(out, np.array(fit.parameters.covariance)))
+
+
+def test_only_identified_values_are_written_with_a_sigma(found: Fit) -> None:
+    b, d = found.parameters["b"].value, found.parameters["d"].value
+    doubtful = changed(found, b=(b, Status.UNRELIABLE), d=(d, Status.RATIO_ONLY))
+    written = fitted_vehicle(doubtful).parameters
+    assert written["b"].sigma is None
+    assert written["d"].sigma is None
+    assert written["J_xx"].sigma is not None
+    assert written["b"].initial == pytest.approx(b, rel=1e-6)
+
+
+def test_what_no_channel_shows_keeps_the_guess_without_a_sigma(found: Fit) -> None:
+    masked = final_answer(found, {"J_zz": "the log has no yaw"})
+    assert masked.parameters["J_zz"].status is Status.PRIOR_DOMINATED
+    assert masked.parameters["J_zz"].prior_share == 1.0
+    assert masked.parameters["J_zz"].value == found.vehicle.parameters["J_zz"].initial
+    assert any("no yaw" in w for w in masked.warnings)
+    assert fitted_vehicle(masked).parameters["J_zz"].sigma is None
+
+
+def test_a_guess_that_no_rigid_body_has_is_moved_and_said(found: Fit) -> None:
+    wrong = changed(found, J_zz=(20.0 * found.parameters["J_zz"].value, Status.PRIOR_DOMINATED))
+    moved = possible_inertia(wrong)
+    assert impossible_inertia([moved.parameters[n].value for n in INERTIAS], 1.0) is None
+    assert moved.parameters["J_xx"] == wrong.parameters["J_xx"]
+    assert any(w.startswith("J_zz: moved from") for w in moved.warnings)
+    text = fitted_vehicle(moved).to_yaml()
+    assert Vehicle.from_yaml(text, "moved").parameters["J_zz"].initial == pytest.approx(moved.parameters["J_zz"].value)
+
+
+def test_identified_values_that_no_rigid_body_has_are_not_left_identified(found: Fit) -> None:
+    wrong = changed(found, J_zz=(20.0 * found.parameters["J_zz"].value, Status.IDENTIFIED))
+    assert possible_inertia(wrong).parameters["J_zz"].status is Status.UNRELIABLE
+    assert possible_inertia(found) is found
+
+
+def test_a_prior_that_decides_is_named() -> None:
+    """A file whose b is sharp and wrong decides b; the same file with a wide prior leaves it to the flight."""
+    truth = flown(3).truth.parameters
+    sharp = guessed(truth)
+    b = 0.98 * truth.as_dict()["b"]
+    priors = {**sharp.parameters, "b": ParameterPrior(initial=b, sigma=1e-5 * b)}
+    decided = fit([flown(3).window], sharp.model_copy(update={"parameters": priors}), FitOptions(iterations=0))
+    assert decided.parameters["b"].status is not Status.IDENTIFIED
+    assert parameter_entry(decided.parameters["b"])["prior_share"] > 0.5
+    free = fit([flown(3).window], sharp, FitOptions(iterations=0))
+    assert free.parameters["b"].status is Status.IDENTIFIED
+    assert parameter_entry(free.parameters["b"])["prior_share"] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "rests"),
+    [(1.0005, 1.0, 2.0, True), (1.002, 1.0, 2.0, False), (1.999, 1.0, 2.0, True), (0.0, 0.0, 0.2, True),
+     (0.001, 0.0, 0.2, False), (1.0, -np.inf, np.inf, False)],
+)  # fmt: skip
+def test_one_tolerance_says_what_rests_on_a_bound(value: float, low: float, high: float, rests: bool) -> None:
+    assert at_bound(value, low, high) is rests
+
+
+def test_a_value_on_a_bound_is_unreliable() -> None:
+    truth = flown(3).truth.parameters
+    b = truth.as_dict()["b"]
+    priors = {**guessed(truth).parameters, "b": ParameterPrior(initial=0.6 * b, bounds=(0.5 * b, 0.7 * b))}
+    vehicle = PELICAN.model_copy(update={"parameters": priors})
+    assert fit([flown(3).window], vehicle, FitOptions(iterations=0)).parameters["b"].status is Status.UNRELIABLE
