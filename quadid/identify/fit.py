@@ -25,7 +25,7 @@ from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
-from quadid.parameters import NOMINAL_NAMES, ParameterSet, at_bound
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -172,7 +172,9 @@ def fit(
         final, result = short, first
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
-    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, first)
+    # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
+    judge = None if set(INERTIAS) & set(out_of_reach or ()) else first
+    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, judge)
     return final_answer(replace(found, warnings=(*aside, *found.warnings)), out_of_reach or {})
 
 

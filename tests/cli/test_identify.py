@@ -35,7 +35,7 @@ def test_json_has_exactly_the_keys_of_the_contract(done: tuple[Run, dict[str, An
     assert (result["schema"], result["vehicle"], result["optimizer"]) == ("quadid.identify/1", "pelican", "pso_polish")
     assert 0.0 < result["seconds"] < 300.0
     for p in result["parameters"]:
-        assert list(p) == ["name", "unit", "value", "ci95", "initial", "status"]
+        assert list(p) == ["name", "unit", "value", "ci95", "initial", "status", "prior_share"]
         assert p["unit"] == NOMINAL_UNITS[p["name"]]
     assert [s["role"] for s in result["sets"]] == ["train", "validate"]
     assert [s["log"] for s in result["sets"]] == ["train.mcap", "unseen.csv"]
@@ -190,5 +190,5 @@ def test_what_rests_on_a_bound_is_not_identified(inside: Cli, flights: Flights, 
     file.write_text(pelican.model_copy(update={"parameters": narrow}).to_yaml(), encoding="utf-8")
     run = inside("identify", flights.train, "--vehicle", file, "--out", tmp_path, "--json", "-")
     by_name = {p["name"]: p for p in run.data["parameters"]}
-    assert by_name["J_xx"]["status"] == "prior_dominated"
+    assert by_name["J_xx"]["status"] == "unreliable"
     assert any(w.startswith("J_xx = ") and "rests on its bound" in w for w in run.data["warnings"])
