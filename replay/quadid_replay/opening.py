@@ -77,6 +77,8 @@ def _reader(kind: Format) -> Callable[[Path], Recording]:
         from quadid_replay.dataflash_reader import read_dataflash as read
     elif kind == "ulog":
         from quadid_replay.ulog_reader import read_ulog as read
+    elif kind == "blackbox":
+        from quadid_replay.blackbox_reader import read_blackbox as read
     elif kind == "usdlog":
         from quadid_replay.usd_reader import read_usd as read
     else:

@@ -27,7 +27,7 @@ MEMORY, SECONDS = "QUADID_READ_MEMORY_MB", "QUADID_READ_SECONDS"
 """Environment variables that override the limits."""
 LARGEST_MEMORY_MB = 8192
 LEAST_MEMORY_MB, MEMORY_A_MIB = 768.0, 16.0
-LEAST_SECONDS, SECONDS_A_MIB = 10.0, 2.0
+LEAST_SECONDS, SECONDS_A_MIB = 10.0, 4.0
 STANDING = 20.0
 """Times the limit of processor time that a reader may take by the clock: a busy machine is no fault of the log."""
 _MIB = 1 << 20
@@ -42,7 +42,7 @@ class Limits(NamedTuple):
 
 def limits(size: int) -> Limits:
     """Limits for a file of `size` bytes: 768 MiB and 16 times its size, at most half of this machine's memory and
-    8 GiB; 10 s and 2 s a MiB of processor time.
+    8 GiB; 10 s and 4 s a MiB of processor time.
 
     Raises:
         LogError: an environment variable that is no positive number.

@@ -6,18 +6,19 @@ from typing import Literal
 
 from quadid.errors import LogError
 
-Format = Literal["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "csv"]
+Format = Literal["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "blackbox", "csv"]
 HEAD_BYTES = 65536
 """How much of the file is looked at."""
 ALLOWED = (
-    "ROS 2 MCAP and rosbag2 (.db3 or folder), MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, Crazyflie µSD log, "
-    "CSV with a header row and a column t"
+    "ROS 2 MCAP and rosbag2 (.db3 or folder), MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, "
+    "Crazyflie µSD log, Betaflight blackbox, CSV with a header row and a column t"
 )
 
 _MAGIC: tuple[tuple[bytes, Format], ...] = (
     (b"\x89MCAP0\r\n", "mcap"),
     (b"SQLite format 3\x00", "rosbag2"),
     (b"ULog\x01\x12\x35", "ulog"),
+    (b"H Product:Blackbox", "blackbox"),
     (b"\xbc\x02\x00", "usdlog"),
 )
 _FOREIGN: tuple[tuple[bytes, str, str], ...] = (

@@ -1,6 +1,6 @@
 """Files made to harm, or damaged badly: read in time that grows with their size, or refused; never silently wrong.
 
-A file of 4 MiB and more is read in a child that may take 10 s and 2 s a MiB of processor time; what takes longer than
+A file of 4 MiB and more is read in a child that may take 10 s and 4 s a MiB of processor time; what takes longer than
 linear time is refused there, which fails these tests.
 """
 
