@@ -26,7 +26,15 @@ from quadid_node.commands import Commands
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
 from quadid_node.intake import DEPTH, Intake
 from quadid_node.neighbours import Neighbours, Offer
-from quadid_node.node_parameters import PARAMETERS, check_change, descriptor, read_settings, read_vehicle, vehicle_id
+from quadid_node.node_parameters import (
+    PARAMETERS,
+    as_declared,
+    check_change,
+    descriptor,
+    read_settings,
+    read_vehicle,
+    vehicle_id,
+)
 from quadid_node.polling import PollingNode
 from quadid_node.presets import Source, source
 from quadid_node.publication import Output
@@ -119,7 +127,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         return SUCCESS
 
     def _configure(self) -> None:
-        values = {p.name: self.get_parameter(p.name).value for p in PARAMETERS}
+        values = {p.name: as_declared(p, self.get_parameter(p.name).value) for p in PARAMETERS}
         vehicle, settings = read_vehicle(values["vehicle"]), read_settings(values)
         preset = source(values["source"])
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)

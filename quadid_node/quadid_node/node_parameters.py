@@ -58,6 +58,12 @@ PARAMETERS: tuple[NodeParameter, ...] = (
 """Every parameter of the node."""
 
 
+def as_declared(parameter: NodeParameter, value: Any) -> Any:
+    """A value of ROS as the type of the parameter's default: an integer where a number is meant becomes one."""
+    whole = isinstance(parameter.default, float) and isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if whole else value
+
+
 def read_settings(values: dict[str, Any]) -> SessionSettings:
     """Settings of the session from parameter values; raises QuadidError."""
     gate = {n.replace("gate.", "gate_"): v for n, v in values.items() if n.startswith("gate.")}
@@ -99,7 +105,9 @@ def descriptor(parameter: NodeParameter) -> Any:
     """A parameter's description and range as a ROS message."""
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor  # this module needs no ROS
 
-    out = ParameterDescriptor(description=parameter.description)
+    # A number without a point is an integer to ROS: `-p window:=10` must not be an error of types.
+    dynamic = isinstance(parameter.default, float)
+    out = ParameterDescriptor(description=parameter.description, dynamic_typing=dynamic)
     if parameter.span is not None and isinstance(parameter.default, float):
         out.floating_point_range = [FloatingPointRange(from_value=parameter.span[0], to_value=parameter.span[1])]
     elif parameter.span is not None:

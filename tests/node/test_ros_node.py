@@ -222,6 +222,23 @@ def test_no_thread_of_the_middleware_outlives_the_node() -> None:
     assert "dds.ev" not in left
 
 
+@pytest.mark.parametrize("window", ["8", "8.0"])
+def test_a_whole_number_is_a_number(window: str) -> None:
+    import rclpy
+    from quadid_node.node import IdentifyNode
+
+    rclpy.init(args=["--ros-args", "-p", "history:=none", "-p", f"window:={window}", "-p", "gate.step:=1"])
+    try:
+        made = IdentifyNode(lambda: True)
+        made.trigger_configure()
+        assert made._service is not None
+        assert made._service.session.settings.window == 8.0
+        made.trigger_shutdown()
+        made.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
 def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
     """One that it watches outlives its topic, and the node ends by SIGSEGV now and then (ros2/rclpy issue 1644)."""
     import rclpy
