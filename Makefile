@@ -148,7 +148,7 @@ TOO_NARROW := tests/replay/test_reading.py::test_more_memory_than_allowed_is_ref
 # What holds quadid/: the node's tests are waited for by clocks, and bring little to it.
 COVERED_BY := $(filter-out tests/node tests/ros tests/fuzz tests/browser tests/packaging tests/examples tests/docs,$(patsubst %/,%,$(wildcard tests/*/)))
 
-.PHONY: coverage mutation audit pins
+.PHONY: coverage mutation audit sbom pins
 coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into docs/results/coverage.md (10 min)
 	$(BIN)/coverage erase
 	OPENBLAS_NUM_THREADS=1 $(BIN)/coverage run -m pytest -q -n 2 --dist loadgroup -m "not browser and not slow" \
@@ -168,6 +168,11 @@ mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line
 audit: $(QUALITY) ## known holes in what the container installs; fails where the advisories cannot be reached
 	$(BIN)/pip-audit --requirement docker/requirements.txt --strict --require-hashes --disable-pip \
 		--progress-spinner off --timeout 20
+
+sbom: venv ## NOTICE with the licences of what is installed with quadid, and dist/sbom.json (CycloneDX)
+	mkdir -p dist
+	$(BIN)/python tools/sbom.py dist
+	cp dist/NOTICE NOTICE
 
 pins: $(QUALITY) ## exact versions with hashes of what the container installs, into docker/requirements.txt
 	$(BIN)/uv pip compile --quiet --no-config --upgrade --generate-hashes --python-version 3.12 \

@@ -44,7 +44,8 @@ class Outbox:
     def note(self, t: float, phase: Phase, reason: str) -> None:
         """Notes phase and reason, and journals them when they are of a new kind."""
         if (phase, reason.split(":")[0]) != (self.phase, self.reason.split(":")[0]):
-            self.say(t, "info", phase.name.lower(), reason)
+            level = "warning" if phase in (Phase.BLOCKED, Phase.FAILED) else "info"
+            self.say(t, level, phase.name.lower(), reason)
         self.state(phase, reason)
 
     def take(self) -> list[Action]:

@@ -22,6 +22,8 @@ THRUST_KNOWN = (0.5, 2.0)
 """Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
 THRUST_GUESSED = (0.2, 5.0)
 """... and while it is only the vehicle file's guess."""
+RPM_SQUARED = (30.0 / np.pi) ** 2
+"""Thrust that speeds in rpm would give, over that of the same speeds in rad/s."""
 TUMBLED = 0.0
 """Cosine of the tilt [1] below which the vehicle has tumbled or lies on its side."""
 IMPACT = 8.0 * GRAVITY
@@ -86,7 +88,12 @@ def _units(window: Window) -> str:
         if 0.7 < size < 1.3:
             return f"accelerometer reads {size:.2f} on average: it looks like g, wanted m/s^2"
         if mean[2] > 0.5 * GRAVITY and size > 0.7 * GRAVITY:
-            return f"accelerometer reads {mean[2]:+.1f} m/s^2 along z: it looks like z up (FLU), wanted z down (FRD)"
+            return (
+                "accelerometer is upside down: ROS topics want z up (FLU, +9.8 at rest), MAVLink and logs z down "
+                "(FRD, -9.8); on a ROS topic you may have published PX4 frames (FRD)"
+            )
+        if size < 0.3 * GRAVITY:
+            return f"accelerometer reads {size:.1f} m/s^2 on average: gravity is missing, wanted specific force"
     ratio = _rate_ratio(window)
     if ratio is not None and 0.5 * DEGREES < ratio < 2.0 * DEGREES:
         return f"gyro is {ratio:.0f} times what the attitude turns: it looks like deg/s, wanted rad/s"
@@ -120,6 +127,8 @@ def _unloaded(share: FloatArray, dt: float, known: bool) -> str:
     means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
     if not min(means) > low:
         return f"rotors carry {min(means):.0%} of the weight: on the ground"
+    if not max(means) < high and low < float(np.mean(means)) / RPM_SQUARED < high:
+        return "rotor speeds look like rpm, wanted rad/s"
     if not max(means) < high:
         return f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying"
     return ""

@@ -72,7 +72,7 @@ class Decoder:
     """Turns the serialized messages of one topic into samples.
 
     Attributes:
-        failed: messages that could not be decoded.
+        failed: messages that could not be decoded; unstamped: those whose stamp is zero.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Decoder:
         self._kind, self._columns = kind, SignalColumns(kind)
         self._ranks = dict(entry.channels)
         self._chooser, self._rotors = chooser, rotors
-        self.failed = 0
+        self.failed = self.unstamped = 0
 
         self._layout: BlockReader | None = None
         if kind.stamp is None:
@@ -104,6 +104,13 @@ class Decoder:
                 return Read(*stamp(message), kind.blocks(message), kind.extra(message))
 
             self._read = read
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with messages of this topic, or empty."""
+        if self.unstamped:
+            return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
+        return f"{self.failed} messages could not be read" if self.failed else ""
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
@@ -150,7 +157,7 @@ class Decoder:
             return
         ns = message.seconds * 10**9 + message.nanoseconds
         if ns <= 0:
-            self.failed += 1
+            self.unstamped += 1
             return
         t = seconds(ns)
         for name, values in signals:

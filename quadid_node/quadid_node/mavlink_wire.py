@@ -145,6 +145,8 @@ def _check_port(device: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((host, int(port)))
+        except OverflowError as error:
+            raise LinkError(f"UDP port {port}", "1 to 65535") from error
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise LinkError(
@@ -182,7 +184,7 @@ class Wire:
         try:
             options = {"baud": int(baud)} if baud else {}
             self._conn: Any = mavutil.mavlink_connection(device, autoreconnect=True, **options)
-        except (OSError, ValueError, IndexError) as error:
+        except (OSError, ValueError, IndexError, OverflowError) as error:
             raise LinkError(
                 f"cannot open {url} ({error})",
                 "a pymavlink URL",

@@ -271,7 +271,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         speaker.publish("status", fields)
         yield
         notes = dict(self._neighbours.notes)
-        notes |= {t: f"{d.failed} messages could not be read" for t, d in self._intake.decoders.items() if d.failed}
+        notes |= {t: why for t, d in self._intake.decoders.items() if (why := d.trouble)}
         stamp = self.get_clock().now().to_msg()
         now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
         report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)

@@ -113,6 +113,14 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
     assert whole.failed == single.failed == 1
 
 
+def test_messages_without_a_stamp_are_named_as_such(messages: list[Message]) -> None:
+    imu = [data[:4] + bytes(8) + data[12:] for topic, data in messages if topic == "imu"][:5]
+    entry = next(e for e in INPUTS if e.topic == "imu")
+    reader = decoder(entry, Chooser(best_ranks(INPUTS)))
+    assert flat(reader.take(imu)) == []
+    assert "5 messages have no time" in reader.trouble
+
+
 @pytest.mark.parametrize("kind", sorted(SIZES))
 @pytest.mark.parametrize("seed", range(4))
 def test_columns_are_the_signals_of_each_message(kind: str, seed: int) -> None:

@@ -15,7 +15,7 @@ from quadid_node.mavlink_decode import MavlinkDecoder
 from quadid_node.mavlink_link import FRAMES_A_SECOND, MavlinkLink
 from quadid_node.mavlink_peers import JUDGED, Source
 from quadid_node.mavlink_requests import Requests
-from quadid_node.mavlink_wire import SafeMavlink, dialect, frames
+from quadid_node.mavlink_wire import LinkError, SafeMavlink, dialect, frames
 from quadid_replay.tlog_writer import mavlink_messages
 
 from quadid.online.records import Diagnosed, Event, OnlineFinding
@@ -280,6 +280,15 @@ def test_a_refused_message_is_named_and_asked_for_no_more() -> None:
     assert requests.denied == ("ESC_STATUS (MAV_RESULT_DENIED)",)
     assert asked.count("ESC_STATUS") == 1
     assert 1 < asked.count("HIGHRES_IMU") < 5, "not for ever"
+
+
+@pytest.mark.parametrize(
+    "url", ["udpin:127.0.0.1:99999", "udpout:127.0.0.1:port", "tcp:127.0.0.1:99999", "/dev/no_such_port,921600"]
+)
+def test_a_link_that_cannot_be_opened_is_one_line(url: str) -> None:
+    with pytest.raises(LinkError) as refused:
+        MavlinkLink(url, 4)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_signed_link_without_a_key_is_said(port: int) -> None:

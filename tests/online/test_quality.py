@@ -86,11 +86,17 @@ def test_a_saturated_gyro_is_named(happened: Happened) -> None:
     happened(6, "gyro clipped at 60 % of its peak: the window is refused, axis and limit named")
 
 
+def test_rotor_speeds_in_rpm_are_named() -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    assert "rpm" in verdict(changed(window, "rotor_speed", window.rotor_speed * 30.0 / np.pi)).grounded
+
+
 @pytest.mark.parametrize(
     ("name", "factor", "word"),
     [
         ("accel", np.full(3, 1.0 / GRAVITY), "looks like g"),
-        ("accel", np.array([1.0, -1.0, -1.0]), "FLU"),
+        ("accel", np.array([1.0, -1.0, -1.0]), "you may have published PX4 frames"),
+        ("accel", np.array([1.0, 1.0, 0.0]), "gravity is missing"),
         ("gyro", np.full(3, 180.0 / np.pi), "deg/s"),
     ],
 )
