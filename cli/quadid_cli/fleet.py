@@ -97,16 +97,18 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
     from quadid.report.fleet_page import fleet_page
     from quadid.report.fleet_summary import summarise
     from quadid.report.page import render
+    from quadid.workflow.fleet_health import health_trend
     from quadid.workflow.reporting import provenance
     from quadid_cli import output
 
-    logs, parameters, findings = (store.rows(table) for table in ("logs", "parameters", "findings"))
+    logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
     summary = summarise(logs, parameters, findings)
-    page = fleet_page(summary, logs, parameters, provenance([], output.command_line()), "Report of a fleet")
+    health = health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs})
+    page = fleet_page(summary, logs, parameters, provenance([], output.command_line()), "Report of a fleet", health)
     files = [target / "fleet.sqlite", *store.write_parquet(target)]
     return {
         "schema": "quadid.fleet/1", "logs": len(logs), "worked": worked, "seconds": seconds, **summary,
-        "other_files": list(found.others), "files": [str(f) for f in files],
+        "health": health, "other_files": list(found.others), "files": [str(f) for f in files],
         "report": str(output.write_text(target / "fleet.html", render(page))),
     }  # fmt: skip
 

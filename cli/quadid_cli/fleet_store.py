@@ -26,7 +26,11 @@ FINDINGS: dict[str, str] = {
     "log": "TEXT", "effect": "TEXT", "confident": "INTEGER", "parameter": "TEXT", "unit": "TEXT", "value": "REAL",
     "low": "REAL", "high": "REAL", "mse_before": "REAL", "mse_after": "REAL",
 }  # fmt: skip
-TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS}
+TRIMS: dict[str, str] = {"log": "TEXT", "trim": "TEXT"}
+"""Trim of a flight as JSON, for the comparison with other flights of its vehicle."""
+TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS, "trims": TRIMS}
+PARTS = ("parameters", "findings", "trims")
+"""Tables with rows of a log."""
 ENDED = ("done", "refused", "unreadable")
 """Outcomes that the same file would have again."""
 
@@ -40,7 +44,7 @@ class Store:
         for table, columns in TABLES.items():
             listed = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
             self._connection.execute(f"CREATE TABLE IF NOT EXISTS {table} ({listed})")
-        for table in ("parameters", "findings"):
+        for table in PARTS:
             self._connection.execute(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log)")
 
     def ended(self) -> dict[str, tuple[int, int, str]]:
@@ -53,7 +57,7 @@ class Store:
         """Writes one log's outcome in place of an older one."""
         name = row["name"]
         with self._connection:
-            for table in ("parameters", "findings"):
+            for table in PARTS:
                 self._connection.execute(f"DELETE FROM {table} WHERE log = ?", (name,))
                 self._insert(table, [{"log": name, **part} for part in row[table]])
             warnings = json.dumps(row["warnings"], ensure_ascii=False)
@@ -65,7 +69,7 @@ class Store:
         gone = [(n,) for (n,) in self._connection.execute("SELECT name FROM logs") if n not in names]
         with self._connection:
             self._connection.executemany("DELETE FROM logs WHERE name = ?", gone)
-            for table in ("parameters", "findings"):
+            for table in PARTS:
                 self._connection.executemany(f"DELETE FROM {table} WHERE log = ?", gone)
 
     def rows(self, table: str) -> list[Row]:

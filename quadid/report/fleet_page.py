@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadid.report.figures import trace
+from quadid.report.health_page import change_words
 from quadid.report.page import number
 from quadid.report.page import unit as unit_text
 from quadid.report.verdict import Level, Verdict, percent
@@ -26,16 +27,19 @@ MOST_ROWS = 200
 
 def fleet_page(
     summary: JsonDict, logs: Sequence[JsonDict], parameters: Sequence[JsonDict], provenance: Sequence[JsonDict],
-    title: str,
+    title: str, health: Sequence[JsonDict] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """Builds the page from `quadid.report.fleet_summary.summarise` and the rows it was made from."""
+    """Builds the page from `quadid.report.fleet_summary.summarise` and the rows it was made from.
+
+    `health` holds the rows of `quadid.workflow.fleet_health.health_trend`.
+    """
     return {
         "title": title,
         "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
         "verdict": asdict(fleet_verdict(summary)),
         "sections": [s for s in (
-            _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary), _common(summary),
-            _unusable(summary),
+            _health(health), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
+            _common(summary), _unusable(summary),
         ) if s is not None],
         "provenance": provenance,
     }  # fmt: skip
@@ -71,6 +75,48 @@ def fleet_verdict(summary: JsonDict) -> Verdict:
     if not steps:
         steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
     return Verdict(level, headline, tuple(details), tuple(steps))
+
+
+def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
+    """Score of every flight over time, and what changed."""
+    judged = [row for row in rows if not row["baseline"]]
+    if not judged:
+        return None
+    units = sorted({row["unit"] for row in judged})[:MOST_UNITS]
+    data = []
+    for i, unit in enumerate(units):
+        own = [row for row in judged if row["unit"] == unit]
+        score = np.array([row["score"] for row in own])
+        line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=[row["log"] for row in own])
+        data.append({**line, "x": [_date(row["started"]) for row in own]})
+    layout = {
+        "xaxis": {"type": "date"}, "yaxis": {"title": {"text": "healthy spreads"}, "rangemode": "tozero"},
+        "hovermode": "closest", "showlegend": True,
+    }  # fmt: skip
+    views = [{"label": "", "data": data, "layout": layout}]
+    figure = {"id": "fleet-health", "title": "Distance from healthy", "views": views, "height": 280}
+    changed = [row for row in judged if row["verdict"] != "unchanged"]
+    table = {
+        "head": ["Vehicle", "Flight", "Score", "Changed"],
+        "rows": [
+            [
+                row["unit"],
+                row["log"],
+                number(row["score"], 2),
+                "; ".join(map(change_words, row["changes"])) or "unknown",
+            ]
+            for row in changed[-MOST_ROWS:]
+        ],
+    }
+    count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
+    intro = (
+        f"Each flight against the first {min(count.values())} to {max(count.values())} of its vehicle, which are taken for "
+        "healthy. A healthy flight stays below about 3.6."
+    )
+    return {
+        "id": "health", "title": "Health over flights", "intro": intro, "figures": [figure],
+        "tables": [table] if changed else [],
+    }  # fmt: skip
 
 
 def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:

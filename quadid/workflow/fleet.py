@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import dataclass
@@ -53,7 +54,9 @@ def identify_one(job: Job) -> Row:
     begin = time.perf_counter()
     row = blank(job)
     try:
-        row |= {"status": "done", "reason": "", **_identified(job)}
+        log = _opened(job)
+        row |= _seen(log)
+        row |= {"status": "done", "reason": "", **_identified(job, log)}
     except NotIdentifiableError as error:
         row |= {"status": "refused", "reason": _line(error)}
     except (QuadidError, OSError) as error:
@@ -68,25 +71,46 @@ def blank(job: Job) -> Row:
     return {
         "name": job.name, "unit": job.unit, "size": job.size, "modified": job.modified, "key": job.key,
         "sha256": None, "started": 1e-9 * job.modified, "dated_by": "file", "format": None, "seconds": None,
-        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "warnings": [],
+        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "trims": [],
+        "warnings": [],
     }  # fmt: skip
 
 
-def _identified(job: Job) -> Row:
+def _opened(job: Job) -> Log:
     from quadid.vehicle import Vehicle
-    from quadid.workflow.identify import identify
 
     vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
     if Path(job.path).stat().st_size == 0:
         raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
-    log = load(job.path, vehicle, rate=job.rate)
-    result = identify(log, seed=job.seed).result
-    error = result["sets"][0]["mse"]
+    return load(job.path, vehicle, rate=job.rate)
+
+
+def _seen(log: Log) -> Row:
+    """What a flight shows whether or not its parameters can be identified; its trim where it flew steadily."""
+    from quadid.health.stored import flight_to_dict
+    from quadid.health.trims import flight_trim
+
     row: Row = {
-        "vehicle": vehicle.name,
+        "vehicle": log.vehicle.name,
         "sha256": log.recording.sha256,
         "format": log.recording.format,
         "seconds": log.grid.seconds_used,
+        "warnings": log.warnings,
+        **_when(log),
+    }
+    try:
+        trim = flight_trim(log.recording, log.vehicle)
+    except NotIdentifiableError as error:
+        return row | {"warnings": [*log.warnings, f"no trim: {error.found}"]}
+    return row | {"trims": [{"trim": json.dumps(flight_to_dict(trim))}]}
+
+
+def _identified(job: Job, log: Log) -> Row:
+    from quadid.workflow.identify import identify
+
+    result = identify(log, seed=job.seed).result
+    error = result["sets"][0]["mse"]
+    row: Row = {
         "mse_initial": error["initial"],
         "mse_fitted": error["fitted"],
         "parameters": [
@@ -94,8 +118,6 @@ def _identified(job: Job) -> Row:
              "status": p["status"]}
             for p in result["parameters"]
         ],
-        "warnings": log.warnings,
-        **_when(log),
     }  # fmt: skip
     return row | (_diagnosed(job, log) if job.diagnose else {})
 

@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import IO
 
 from quadid.errors import QuadidError
+from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.trims import FlightTrim
 from quadid.online.gate import GateSettings, implausible
 from quadid.online.health_supervisor import MOST_FLIGHTS
@@ -27,7 +28,6 @@ from quadid.online.records import Diagnosed, Event, OnlineSet
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
 from quadid_node.store_file import StoreError, connect, is_damage, make_tables, set_aside
-from quadid_node.vehicle_health import flight_from_dict, flight_to_dict
 
 KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets and decisions never."""

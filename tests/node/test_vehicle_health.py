@@ -12,9 +12,10 @@ import pytest
 from quadid_node.publication import Output
 from quadid_node.service import Service
 from quadid_node.store import Store
-from quadid_node.vehicle_health import flight_from_dict, flight_to_dict, health_message, health_to_dict
+from quadid_node.vehicle_health import health_message, health_to_dict
 from quadid_node.worker import InlineWorker
 
+from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.watch import ENOUGH, HealthReport
 from quadid.online import Event, SessionSettings
 from quadid.online.records import HealthyFlight

@@ -1,0 +1,51 @@
+"""The health of a fleet over its flights: the flight after which a propeller was cut stands out, and is named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from quadid.health import flight_trim
+from quadid.health.stored import flight_to_dict
+from quadid.report.fleet_page import fleet_page
+from quadid.report.fleet_summary import summarise
+from quadid.report.page import render
+from quadid.vehicle import Vehicle
+from quadid.workflow.fleet_health import BASELINE, FEWEST, health_trend
+from tests.health.hover import Wrong, hover
+
+PELICAN_X = Vehicle.shipped("pelican_x")
+
+
+def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
+    logs, trims = [], []
+    for unit, cut_after in (("a", 6), ("b", 99)):
+        for k in range(9):
+            wrong = Wrong({3: 0.25}, {3: 0.25}) if k > cut_after else None
+            name = f"{unit}/{k}.mcap"
+            flown = flight_trim(hover(PELICAN_X, wrong, seed=17 * k + ord(unit)), PELICAN_X)
+            started = 1.7e9 + 86400.0 * k
+            logs.append({"name": name, "unit": unit, "started": started, "status": "refused", "reason": "gentle",
+                         "dated_by": "log", "mse_initial": None, "mse_fitted": None, "verdict": None})  # fmt: skip
+            trims.append({"log": name, "trim": json.dumps(flight_to_dict(flown))})
+    text = PELICAN_X.to_yaml()
+    order = np.random.default_rng(1).permutation(len(logs))
+    rows = health_trend([logs[i] for i in order], trims, {"a": text, "b": text})
+    assert [row["log"] for row in rows] == [log["name"] for log in logs], "by vehicle, in the order of time"
+    assert sum(row["baseline"] for row in rows) == 2 * BASELINE
+    changed = [row for row in rows if not row["baseline"] and row["verdict"] == "changed"]
+    assert [row["log"] for row in changed] == ["a/7.mcap", "a/8.mcap"]
+    assert {row["changes"][0]["parameters"][0]["value"] for row in changed} == {3}
+    page = render(fleet_page(summarise(logs, [], []), logs, [], [], "Fleet", rows))
+    assert "Health over flights" in page
+    assert "a/7.mcap" in page
+
+
+def test_a_vehicle_with_few_flights_has_no_trend() -> None:
+    logs, trims = [], []
+    for k in range(FEWEST):
+        logs.append({"name": str(k), "unit": "a", "started": float(k)})
+        flown = flight_trim(hover(PELICAN_X, seed=k), PELICAN_X)
+        trims.append({"log": str(k), "trim": json.dumps(flight_to_dict(flown))})
+    assert health_trend(logs, trims, {"a": PELICAN_X.to_yaml()}) == []
