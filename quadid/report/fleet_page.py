@@ -110,13 +110,17 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
     }
     count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
     intro = (
-        f"Each flight against the first {min(count.values())} to {max(count.values())} of its vehicle, which are taken for "
-        "healthy. A healthy flight stays below about 3.6."
+        f"Each flight against the first {min(count.values())} to {max(count.values())} of its vehicle, which are taken "
+        "for healthy. A healthy flight stays below about 3.6."
     )
     return {
         "id": "health", "title": "Health over flights", "intro": intro, "figures": [figure],
         "tables": [table] if changed else [],
     }  # fmt: skip
+
+
+def _what_changed(row: JsonDict) -> str:
+    return "; ".join(map(change_words, row["changes"])) or "unknown"
 
 
 def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:
