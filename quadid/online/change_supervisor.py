@@ -58,12 +58,12 @@ class ChangeSupervisor:
         yield
         recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
         yield
-        b = estimator.value("b")
-        if recent.reason or judge(recent.windows, self._vehicle, b, estimator.learned) != Quality():
+        if recent.reason or judge(recent.windows, self._vehicle, estimator.thrust, estimator.learned) != Quality():
             self._detector.restart()
             return None
         yield
-        change = self._detector.look(b, np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")]))
+        inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
+        change = self._detector.look(estimator.value("b"), inertia)
         if change is None:
             return None
         self.seen = Seen(change, self._store.onset(change.time) if change.channel == "thrust" else change.time)
@@ -82,8 +82,8 @@ class ChangeSupervisor:
             return None
         cut = self._store.cut(self.seen.at + 0.1, tick - _EPS)
         return ChangeRequest(
-            number, self._vehicle, cut.windows, self.seen.at, tick, estimator.theta, estimator.z_sigma, estimator.noise,
-            self.seen.change, stamp,
+            number, estimator.model, cut.windows, self.seen.at, tick, estimator.theta, estimator.z_sigma,
+            estimator.noise, self.seen.change, stamp,
         )  # fmt: skip
 
     @staticmethod

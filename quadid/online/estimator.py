@@ -13,12 +13,13 @@ from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.layout import Layout
-from quadid.online.fusion import Fused, Fusion, WindowEstimate
+from quadid.online.fusion import DRIFT, Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case
+from quadid.online.model_vehicle import ThrustModel, secant_share
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
-from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -32,13 +33,23 @@ NOISE_EVERY = 5
 """Every so many windows the sensor noise is measured anew, and pooled."""
 NOISE_POOL = 24
 """Windows whose noise is pooled, newest counting fully."""
+MISFIT = 2.0
+"""Residual variance over sensor noise beyond which the model misses something that has to be found first."""
+YAW = ("d", "J_zz", "J_r")
+"""Parameters that a set may leave at the vehicle file's guess."""
+_YAW_PLACES = [NOMINAL_NAMES.index(n) for n in YAW]
+ANY = 1.0
+"""Difference (log scale) that is allowed where an estimate says nothing."""
 
 
 class Estimator:
     """Estimate of one vehicle.
 
     Attributes:
+        vehicle: of the vehicle file.
+        model: the same with what a diagnosis found; windows are fitted with it.
         fusion: the fused windows.
+        misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
         theta: full parameter vector, the best at hand.
         learned: whether `theta` rests on data.
         excitation: of the newest window, shape (6,); NaN before.
@@ -49,23 +60,50 @@ class Estimator:
 
     def __init__(self, vehicle: Vehicle, memory: float, seed: int) -> None:
         """Starts from the vehicle file."""
-        self._vehicle, self._seed = vehicle, seed
-        self._layout = Layout(vehicle)
-        self._initial = self._layout.initial(vehicle)
+        self.vehicle, self._memory, self._seed = vehicle, memory, seed
+        self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
+        self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
+        self._asked: tuple[Window, ...] = ()
+        self.take_model(vehicle)
+
+    def take_model(self, model: Vehicle) -> None:
+        """Fits later windows with `model`, whose parameters are first guesses; nothing else is kept."""
+        self.model = model
+        self._layout = Layout(model)
+        self._initial = self._layout.initial(model)
         self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
-        prior = prior_of(vehicle)
+        prior = prior_of(model)
         self._prior_sigma = prior.sigma
-        self.fusion = Fusion(np.log(prior.mean), prior.sigma, memory)
+        self.fusion = Fusion(np.log(prior.mean), prior.sigma, self._memory)
         self._noise: NoiseModel | None = None
         self._pool = 0
         self.theta = self._initial
-        self.learned = False
-        self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
-        self.start = math.nan
-        self.rows = 0
-        self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
-        self._search = True
-        self._asked: tuple[Window, ...] = ()
+        self.misfit = np.full(6, np.nan)
+        self.forget()
+
+    @property
+    def extended(self) -> bool:
+        """Whether the model is more than the vehicle file."""
+        return self.model is not self.vehicle
+
+    @property
+    def missed(self) -> float:
+        """How much the model misses, relative to sensor noise, where b, J_xx and J_yy come from; NaN: not measured."""
+        return float(self.misfit[[0, 1, 3, 4, 5]].mean())
+
+    @property
+    def _scatter(self) -> float:
+        fused = self.fusion.estimate()
+        return 1.0 if fused is None else self.fusion.scatter(fused.z)
+
+    @property
+    def _yaw_missed(self) -> bool:
+        return bool(self.misfit.max() > MISFIT)
+
+    @property
+    def thrust(self) -> ThrustModel:
+        """Thrust of the rotors, by the best estimate at hand."""
+        return ThrustModel(self._layout, self.theta)
 
     @property
     def input_hash(self) -> str:
@@ -109,7 +147,7 @@ class Estimator:
         self._asked = windows
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
-            number, self._vehicle, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure
+            number, self.model, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure
         )  # fmt: skip
 
     def take(self, reply: FitReply, trusted: bool) -> None:
@@ -119,6 +157,9 @@ class Estimator:
         if reply.estimate is None or reply.theta is None or not trusted:
             return
         self._pool_noise(reply)
+        if reply.misfit is not None:
+            self.misfit = reply.misfit
+            self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
         for window in self._asked:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
             self.start = window.t0 if math.isnan(self.start) else self.start
@@ -154,23 +195,43 @@ class Estimator:
         if fused is None:
             return None
         theta = self._free.placed(self._initial, fused.z)
-        unc = Uncertainty(fused.covariance, np.ones(len(fused.z)), self._prior_sigma)
+        theta[0] *= secant_share(self.vehicle, self.model, self._layout, theta)
+        covariance = fused.covariance
+        if self._yaw_missed:
+            theta, covariance = self._without_yaw(theta, covariance)
+        unc = Uncertainty(covariance, np.ones(len(fused.z)), self._prior_sigma)
         return parameter_set(self._free, theta, self._initial, unc)
 
+    def _without_yaw(self, theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What couples into yaw alone is as uncertain as before the flight where the model misses it.
+
+        Roll and pitch rest on torque over inertia; d, J_zz and J_r on small couplings, which what is missed outweighs.
+        """
+        theta, covariance, place = theta.copy(), covariance.copy(), _YAW_PLACES
+        theta[place] = self.vehicle.initial[place]
+        flat = theta[NOMINAL_NAMES.index("J_xx")] + theta[NOMINAL_NAMES.index("J_yy")]
+        theta[NOMINAL_NAMES.index("J_zz")] = min(theta[NOMINAL_NAMES.index("J_zz")], flat)
+        covariance[place, :] = covariance[:, place] = 0.0
+        covariance[place, place] = self._prior_sigma[place] ** 2
+        return theta, covariance
+
     def deviance(self, window: WindowEstimate, known: OnlineSet | None) -> float:
-        """Deviance of a set, or of the first guess, in a window."""
-        return window.deviance(self._z(known))
+        """Deviance of a set, or of the first guess, in a window, relative to how windows scatter."""
+        return window.deviance(self._z(known)) / self._scatter
 
     def _z(self, known: OnlineSet | None) -> FloatArray:
         theta = self._initial.copy()
         for p in known.parameters if known is not None else ():
             if p.name in NOMINAL_NAMES:
-                theta[self._layout.entry(p.name).index] = p.value
+                place = self._layout.entry(p.name).index
+                theta[place] = self.theta[place] if p.status is Status.PRIOR_DOMINATED else p.value
+        if known is not None:
+            theta[0] /= secant_share(self.vehicle, self.model, self._layout, self.theta)
         return self._free.scaled(theta[self._free.index])
 
     def case(
         self, parameters: ParameterSet, quality: Quality, reply: FitReply, in_force: OnlineSet | None,
-        baseline: OnlineSet | None, approval: str, most: int, seen: float,
+        baseline: OnlineSet | None, approval: str, most: int, seen: float, unexplained: str,
     ) -> Case:  # fmt: skip
         """What the gate needs to know about the present estimate.
 
@@ -183,15 +244,16 @@ class Estimator:
             approval: as in `Case`.
             most: windows whose agreement is asked for.
             seen: end of the data that the set in force rests on [s]; minus infinity for none of this flight.
+            unexplained: as in `Case`.
         """
         fused = self.fusion.estimate()
         assert fused is not None
         agreeing, disagreement = self._agreement(fused, max(most, 3))
         gains = self._held_out(in_force, seen)
-        ratio = self._thrust_ratio(float(parameters["b"].value))
+        ratio = self._thrust_ratio()
         return Case(
             parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval,
-            self.fusion.counted - seen,
+            self.fusion.counted - seen, unexplained,
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:
@@ -214,7 +276,7 @@ class Estimator:
         return agreeing, ""
 
     def _worst(self, window: WindowEstimate, fused: Fused) -> str:
-        spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + 4e-4)
+        spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.fusion.drift**2)
         j = int(np.argmax(np.abs(window.z - fused.z) / spread))
         return f"{NOMINAL_NAMES[j]} differs by {np.expm1(window.z[j] - fused.z[j]):+.1%} in one of them"
 
@@ -224,17 +286,17 @@ class Estimator:
         for window in self.fusion.disjoint(HELD_OUT_WINDOWS):
             earlier = self.fusion.before(window.start)
             if earlier is not None and window.start >= seen - 1e-6:
-                out.append(window.deviance(reference) - window.deviance(earlier))
+                if self._yaw_missed:
+                    earlier[_YAW_PLACES] = reference[_YAW_PLACES]
+                out.append((window.deviance(reference) - window.deviance(earlier)) / self._scatter)
         return tuple(out)
 
-    def _thrust_ratio(self, b: float) -> float:
-        """Thrust by `b` over what the accelerometer felt, newest window; 1 where the model has other thrust terms."""
-        if set(self._vehicle.effects) & {"thrust_curve", "axial_inflow", "battery_sag", "thrust_drop", "mass_change"}:
-            return 1.0
+    def _thrust_ratio(self) -> float:
+        """Thrust by the model over what the accelerometer felt, newest window."""
         lift = [-w.accel[:, 2] for w in self._asked if w.accel is not None]
         felt = float(np.nanmean(np.concatenate(lift))) if lift else GRAVITY
-        total = float(np.mean(np.concatenate([np.sum(w.rotor_speed**2, axis=1) for w in self._asked])))
-        return b * total / (self._vehicle.mass * max(felt, 1e-3))
+        total = float(np.mean(np.concatenate([self.thrust.total(w.rotor_speed) for w in self._asked])))
+        return total / (self.vehicle.mass * max(felt, 1e-3))
 
 
 def _bytes(window: Window) -> bytes:

@@ -117,6 +117,7 @@ class Fusion:
     Attributes:
         windows: estimates that were taken in, oldest first.
         counted: end of the data taken in [s].
+        drift: honest difference between windows by parameter, log scale, shape (P,).
     """
 
     def __init__(self, mean: FloatArray, sigma: FloatArray, memory: float, drift: float = DRIFT) -> None:
@@ -129,7 +130,8 @@ class Fusion:
             drift: honest difference between windows, log scale.
         """
         self._mean, self._precision = mean, np.diag(1.0 / sigma**2)
-        self._memory, self._drift = memory, drift
+        self._memory = memory
+        self.drift: FloatArray = np.full(len(mean), drift)
         self.windows: deque[WindowEstimate] = deque(maxlen=KEPT_WINDOWS)
         self._sums: deque[_Sum] = deque(maxlen=KEPT_WINDOWS)
         self.counted = -math.inf
@@ -146,7 +148,7 @@ class Fusion:
         if earlier is None:
             return Verdict(0.0, limit, known=False)
         before, own = self._solve(earlier), self._alone(window)
-        spread = before.covariance + own.covariance + self._drift**2 * np.eye(len(self._mean))
+        spread = before.covariance + own.covariance + np.diag(self.drift**2)
         difference = own.z - before.z
         return Verdict(float(difference @ np.linalg.solve(spread, difference)), limit)
 
@@ -203,7 +205,7 @@ class Fusion:
         """Squared Mahalanobis distance of a window's own estimate from `z`, honest drift allowed."""
         own = self._alone(window)
         difference = own.z - z
-        return float(difference @ np.linalg.solve(own.covariance + self._drift**2 * np.eye(len(z)), difference))
+        return float(difference @ np.linalg.solve(own.covariance + np.diag(self.drift**2), difference))
 
     def _before(self, start: float) -> _Sum | None:
         return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)

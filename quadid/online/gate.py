@@ -71,6 +71,7 @@ class Case:
         baseline: the set from which creeping is measured.
         approval: auto or manual, now.
         age: time since the data that the set in force rests on [s].
+        unexplained: what the model misses and why it is not known yet, or empty.
     """
 
     parameters: ParameterSet
@@ -84,6 +85,7 @@ class Case:
     baseline: OnlineSet | None
     approval: str
     age: float = math.inf
+    unexplained: str = ""
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,10 @@ def _flying(case: Case, settings: GateSettings) -> str | None:
 
 def _excitation(case: Case, settings: GateSettings) -> str | None:
     return None if case.excited else "the newest window does not reveal roll and pitch dynamics: move the sticks more"
+
+
+def _model(case: Case, settings: GateSettings) -> str | None:
+    return case.unexplained or None
 
 
 def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
@@ -240,6 +246,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("data_quality", _quality),
     ("flying", _flying),
     ("excitation", _excitation),
+    ("model", _model),
     ("physical_bounds", _bounds),
     ("interval_width", _width),
     ("agreement", _agreement),

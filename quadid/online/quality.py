@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.online.model_vehicle import ThrustModel
 from quadid.resample import median
 from quadid.saturation import at_limit
 from quadid.vehicle import GRAVITY, Vehicle
@@ -18,7 +19,7 @@ FloatArray = NDArray[np.float64]
 STUCK_SECONDS = 1.0
 """A sensor that repeats itself to the bit for longer than this [s] is stuck."""
 DEGREES = 180.0 / np.pi
-THRUST_KNOWN = (0.5, 2.0)
+THRUST_KNOWN = (0.4, 4.0)
 """Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
 THRUST_GUESSED = (0.2, 5.0)
 """... and while it is only the vehicle file's guess."""
@@ -40,24 +41,24 @@ class Quality:
     grounded: str = ""
 
 
-def judge(windows: Sequence[Window], vehicle: Vehicle, b: float, known: bool) -> Quality:
+def judge(windows: Sequence[Window], vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
     """Judges the windows of one fit.
 
     Args:
         windows: stretches on the grid.
         vehicle: the vehicle.
-        b: thrust coefficient [N s^2/rad^2], the best estimate at hand.
-        known: whether `b` was identified or is a guess.
+        thrust: of the rotors, by the best estimate at hand.
+        known: whether it was identified or is a guess.
     """
     # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
     for window in windows:
-        grounded = _unloaded(_weight_share(window, vehicle, b), window.dt, known)
+        grounded = _unloaded(_weight_share(window, vehicle, thrust), window.dt, known)
         if grounded:
             return Quality(grounded=grounded)
         fault = _broken(window) or _units(window)
         if fault:
             return Quality(fault=fault)
-    return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, b))), ""))
+    return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, thrust))), ""))
 
 
 def _broken(window: Window) -> str:
@@ -114,9 +115,9 @@ def _rate_ratio(window: Window) -> float | None:
     return float(np.sqrt(np.mean(size[good] ** 2)) / max(np.sqrt(np.mean(rate[good] ** 2)), 1e-9))
 
 
-def _weight_share(window: Window, vehicle: Vehicle, b: float) -> FloatArray:
+def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:
     """Thrust over weight, shape (n,)."""
-    return np.asarray(b * np.sum(window.rotor_speed**2, axis=1) / (vehicle.mass * GRAVITY))
+    return np.asarray(thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY))
 
 
 def _unloaded(share: FloatArray, dt: float, known: bool) -> str:
@@ -134,7 +135,7 @@ def _unloaded(share: FloatArray, dt: float, known: bool) -> str:
     return ""
 
 
-def _not_flying(window: Window, vehicle: Vehicle, b: float) -> str:
+def _not_flying(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> str:
     """Says why a window with turning rotors is not flight, or returns an empty string.
 
     A flying vehicle is upright, and its specific force follows its thrust; on the ground the floor carries the rest and
@@ -148,7 +149,7 @@ def _not_flying(window: Window, vehicle: Vehicle, b: float) -> str:
         return ""
     if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:
         return f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
-    return _floor(window, _weight_share(window, vehicle, b))
+    return _floor(window, _weight_share(window, vehicle, thrust))
 
 
 def _floor(window: Window, thrust: FloatArray) -> str:

@@ -15,6 +15,7 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -86,6 +87,7 @@ class Session:
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
         self._land: Callable[[Any], Iterator[None]] = iter
+        self._refits = deque[float]()
         self._outdated = 0
         self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
         self._work: Iterator[None] | None = None
@@ -123,6 +125,7 @@ class Session:
         answer = self.active_set.roll_back(self._outbox.stamp(self._now), by)
         if answer.done:
             self._outdated, self._work = self._number, None
+            self._refits.clear()
             self._change_supervisor.restart()
             self._supervisor.relearn(self._now, f"rolled back by {by}")
             self._outbox.act(*answer.actions)
@@ -150,7 +153,7 @@ class Session:
         """Whether there is a piece of work that waits for nothing."""
         if self._work is None and self._waiting is not None:
             return self._reply is not None
-        return self._work is not None or self._tick_due or self.resampler.busy
+        return self._work is not None or bool(self._refits) or self._tick_due or self.resampler.busy
 
     def poll(self, most: int | None = None) -> list[Action]:
         """Works through what has arrived and returns what to do, in order.
@@ -204,6 +207,8 @@ class Session:
         if self._work is None:
             if self._waiting is not None:
                 self._work = self._apply()
+            elif self._refits:
+                self._work = self._fit(self._refits.popleft())
             elif self._tick_due:
                 tick, self._tick_at = self._tick_at, self._tick_at + self._tick
                 self._work = self._at(tick)
@@ -218,6 +223,7 @@ class Session:
         if rows.fresh:
             first = float(rows.t[0])
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
+            self._refits.clear()
             self._supervisor.interrupted(first)
             self._change_supervisor.restart()
             self._outbox.say(first, "info", "stream", "a stream of data begins")
@@ -232,25 +238,36 @@ class Session:
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
             self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
         self._health.look(tick)
-        self._study(tick)
+        if self._study(tick):
+            return
         yield
         if self._change_supervisor.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
             yield from self._fit(tick)
 
-    def _study(self, tick: float) -> None:
-        """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
-        since = self._supervisor.learn_from
-        told = self._diagnosis.answer(tick, since, self._outbox.stamp)
-        if told is not None:
-            self._outbox.act(told)
-        moving = self._estimator.learned and is_excited(self._estimator.excitation)
-        if moving and self._change_supervisor.seen is None and self._supervisor.quality == Quality():
-            request = self._diagnosis.ask(self._number + 1, tick, since)
+    def _study(self, tick: float) -> bool:
+        """Uses what a diagnosis brought, and asks for the next one when the vehicle is known and moves.
+
+        Returns:
+            The model was extended, and what was flown since is fitted again.
+        """
+        estimator, supervisor = self._estimator, self._supervisor
+        answered = self._diagnosis.answer(tick, supervisor.learn_from)
+        first = estimator.start
+        if answered is not None and supervisor.diagnosed(tick, *answered, self._diagnosis):
+            count = math.floor((tick - first + _EPS) / self.settings.window)
+            self._refits.extend(tick - k * self.settings.window for k in reversed(range(max(count, 1))))
+            return True
+        supervisor.waits = self._diagnosis.waits(tick, first)
+        moving = estimator.learned and is_excited(estimator.excitation)
+        if moving and self._change_supervisor.seen is None and supervisor.quality == Quality():
+            since = max(supervisor.learn_from, first)
+            request = self._diagnosis.ask(self._number + 1, tick, since, bool(supervisor.unexplained))
             if request is not None:
                 self._number = request.number
                 self._outbox.act(request)
+        return False
 
     def _explain(self, tick: float) -> None:
         assert self._change_supervisor.seen is not None
@@ -273,7 +290,8 @@ class Session:
             self._incomplete(tick, start)
             return
         yield
-        quality = judge(self._cut.windows, self._vehicle, self._estimator.value("b"), self._estimator.learned)
+        estimator = self._estimator
+        quality = judge(self._cut.windows, self._vehicle, estimator.thrust, estimator.learned)
         self._supervisor.quality = quality
         if quality != Quality():
             phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
@@ -283,7 +301,7 @@ class Session:
         self._last_fit = tick
         start = max(start, tick - self.settings.window)
         request = self._estimator.request(self._number + 1, self._cut.windows, start, tick)
-        self._await(request, partial(self._supervisor.fitted, request))
+        self._await(request, partial(self._supervisor.fitted, request, last=not self._refits))
         self._outbox.act(request)
 
     def _incomplete(self, tick: float, start: float) -> None:
@@ -301,6 +319,7 @@ class Session:
         yield from self._land(reply)
 
     def _changed(self, request: ChangeRequest, reply: ChangeReply) -> Iterator[None]:
+        self._refits.clear()
         self._change_supervisor.restart()
         self._supervisor.changed(request, reply)
         yield

@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator
 
 from quadid.online.active_set import ActiveSet
-from quadid.online.estimator import Estimator
+from quadid.online.background_diagnosis import BackgroundDiagnosis, DiagnosisReply, DiagnosisRequest
+from quadid.online.estimator import MISFIT, Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
+from quadid.online.model_vehicle import extended
 from quadid.online.outbox import Outbox
 from quadid.online.quality import Quality
 from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
@@ -25,6 +27,7 @@ class Supervisor:
         learn_from: nothing before this time is learned from [s].
         quality: of the newest window.
         fits, rejected: fits done, and those the gate refused.
+        waits: why the cause of a misfit is not known yet.
     """
 
     def __init__(self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings) -> None:
@@ -33,6 +36,7 @@ class Supervisor:
         self.learn_from = -math.inf
         self.quality = Quality()
         self.fits = self.rejected = 0
+        self.waits = ""
         self._odd_since: float | None = None
 
     def interrupted(self, t: float) -> None:
@@ -56,8 +60,38 @@ class Supervisor:
         outbox.say(request.stop, "warning", "finding", text)
         self.relearn(request.start + 0.1, "the vehicle has changed")
 
-    def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
-        """Takes in the fit of a window, piece by piece."""
+    @property
+    def unexplained(self) -> str:
+        """What the model misses, and why it is not known yet; empty where it misses nothing or was extended."""
+        missed = self._estimator.missed
+        if self._estimator.extended or not missed > MISFIT:
+            return ""
+        return f"the model misses this flight (residuals {missed:.0f} times the sensor noise): {self.waits}"
+
+    def diagnosed(
+        self, tick: float, asked: DiagnosisRequest, reply: DiagnosisReply, diagnosis: BackgroundDiagnosis
+    ) -> bool:
+        """Publishes a diagnosis; extends the model by it where the present one misses the flight.
+
+        Returns:
+            The model was extended: what was flown since has to be fitted again.
+        """
+        told = diagnosis.news(asked, reply, self._outbox.stamp)
+        if told is not None:
+            self._outbox.act(told)
+        if not self._estimator.missed > MISFIT or reply.extended is None:
+            return False
+        model = extended(self._estimator.vehicle, reply.extended)
+        self._estimator.take_model(model)
+        self._odd_since = None
+        names = ", ".join(n for n in model.effects if n not in self._estimator.vehicle.effects)
+        self._outbox.say(
+            tick, "info", "model", f"the model takes in {names}; the flight so far is fitted again with it"
+        )
+        return True
+
+    def fitted(self, request: FitRequest, reply: FitReply, last: bool = True) -> Iterator[None]:
+        """Takes in the fit of a window, piece by piece; the gate is asked after the `last` one only."""
         if reply.problem:
             self._outbox.note(request.stop, Phase.FAILED, reply.problem)
             return
@@ -72,16 +106,22 @@ class Supervisor:
             self._outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
         if not self._estimator.fusion.judge(reply.estimate).agrees:
-            self._odd(request)
+            self._odd(request, reply)
             return
         self._odd_since = None
         self._estimator.take(reply, trusted=True)
         yield
-        if not self._taken_back(reply):
+        if last and not self._taken_back(reply):
             self._judge(request, reply)
 
-    def _odd(self, request: FitRequest) -> None:
-        """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed."""
+    def _odd(self, request: FitRequest, reply: FitReply) -> None:
+        """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed.
+
+        Windows of a model that misses the flight disagree without any change.
+        """
+        if self.unexplained:
+            self._outbox.note(request.stop, Phase.CANDIDATE, self.unexplained)
+            return
         if self._odd_since is None:
             self._odd_since = request.stop
         self._outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
@@ -115,7 +155,7 @@ class Supervisor:
         active_set, outbox = self._active_set, self._outbox
         case = self._estimator.case(
             parameters, self.quality, reply, active_set.in_force, active_set.baseline, active_set.approval,
-            self._gate.windows, active_set.seen,
+            self._gate.windows, active_set.seen, self.unexplained,
         )  # fmt: skip
         decision = decide(case, self._gate)
         mse, unseen = self._estimator.scores()

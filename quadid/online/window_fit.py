@@ -42,6 +42,8 @@ INFLATED = 9.0
 """Noise whose variance is above this multiple of the usual in some channel may have been taken from bad data."""
 RATED = ("J_xx", "J_yy")
 """Parameters whose bound decides on excitation."""
+INERTIAL = (0, 1, 2, 6, 7, 8)
+"""Residual channels of gyro and accelerometer: their noise is the sensor's own, no estimator's."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,11 @@ class FitReply(JobReply):
         excited: whether they suffice.
         estimate: quadratic model at the optimum.
         theta: full parameter vector there.
-        noise: noise it was weighted with: the request's, or one that had to be found anew.
+        noise: noise it was weighted with: the request's, or one that had to be found anew; what the model misses over a
+            segment counts as noise.
         measured: noise measured in this window, when that was asked for.
+        misfit: variance of gyro (x, y, z) and accelerometer residuals over that of the sensors' own noise, shape (6,):
+            1 where the model misses nothing; with `measured`, or where noise was found anew.
     """
 
     excitation: FloatArray | None = None
@@ -97,6 +102,7 @@ class FitReply(JobReply):
     theta: FloatArray | None = None
     noise: NoiseModel | None = None
     measured: NoiseModel | None = None
+    misfit: FloatArray | None = None
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
@@ -129,8 +135,10 @@ def _fit(request: FitRequest) -> FitReply:
     drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)
     if not is_excited(bounds) and not drowned:
         return FitReply(request.number, excitation=bounds)
+    sensor = None
     if request.search or noise is None or drowned:
-        theta, noise = _search(replace(request, noise=None) if drowned else request, layout)
+        theta, sensor = _search(replace(request, noise=None) if drowned else request, layout)
+        noise = _missed(request, layout, theta, sensor)
         shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
         if drowned and not is_excited(bounds := _bounds(shooting, theta, free)):
             return FitReply(request.number, excitation=bounds)
@@ -143,8 +151,12 @@ def _fit(request: FitRequest) -> FitReply:
         request.start, request.stop, free.scaled(result.theta[free.index]), information, lin.grad.sum(axis=0),
         float(lin.cost.sum()), float(lin.rows.sum()),
     )  # fmt: skip
-    measured = _measure_noise(request, layout, result.theta, noise) if request.measure else None
-    return FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured)
+    measured = None
+    if request.measure:
+        measured = residual_noise(shooting, result)
+        sensor = _sensor_noise(request, layout, result.theta, noise)
+    misfit = None if sensor is None else ((measured or noise).variance / sensor.variance)[list(INERTIAL)]
+    return FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured, misfit)
 
 
 def is_excited(bounds: FloatArray) -> bool:
@@ -177,7 +189,13 @@ def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel
     return result.theta, residual_noise(short, result)
 
 
-def _measure_noise(request: FitRequest, layout: Layout, theta: FloatArray, noise: NoiseModel) -> NoiseModel:
+def _missed(request: FitRequest, layout: Layout, theta: FloatArray, sensor: NoiseModel) -> NoiseModel:
+    """What sensors and model together miss over the segments of the fit."""
+    long = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, sensor, layout)
+    return residual_noise(long, polish(long, theta, long.free(list(NOMINAL_NAMES)), iterations=8))
+
+
+def _sensor_noise(request: FitRequest, layout: Layout, theta: FloatArray, noise: NoiseModel) -> NoiseModel:
     """Sensor noise of this window, from short segments around the optimum."""
     short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, noise, layout)
     return residual_noise(short, polish(short, theta, short.free(list(NOMINAL_NAMES)), iterations=3))

@@ -14,6 +14,7 @@ from quadid.saturation import at_limit
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
+from tests.online.test_quality import thrust_of
 
 PELICAN = Vehicle.shipped("pelican")
 
@@ -29,7 +30,7 @@ def test_three_places_agree_on_a_saturated_sensor(share: float, happened: Happen
     window = replace(made.window, gyro=np.clip(made.window.gyro, -top, top))
     assert any(end.axis == 1 for end in at_limit(clipped))
     assert any("saturated" in c.name for c in inspect(recording, PELICAN).checks)
-    assert "saturated" in judge([window], PELICAN, 2.33e-5, True).fault
+    assert "saturated" in judge([window], PELICAN, thrust_of(2.33e-5), True).fault
     assert [f for f in data_faults([window]) if f.kind == "saturated"]
     happened(6, f"gyro clipped at {share:.0%} of its peak: inspection, online window and diagnosis name it by one rule")
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.model.layout import Layout
+from quadid.online.model_vehicle import ThrustModel
 from quadid.online.quality import Quality, judge
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -17,8 +19,15 @@ PELICAN = Vehicle.shipped("pelican")
 B = 2.33e-5
 
 
+def thrust_of(b: float) -> ThrustModel:
+    layout = Layout(PELICAN)
+    theta = layout.initial(PELICAN)
+    theta[0] = b
+    return ThrustModel(layout, theta)
+
+
 def verdict(window: Window, known: bool = True) -> Quality:
-    return judge([window], PELICAN, B, known)
+    return judge([window], PELICAN, thrust_of(B), known)
 
 
 def changed(window: Window, name: str, values: np.ndarray) -> Window:
