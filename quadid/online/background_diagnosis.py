@@ -165,8 +165,6 @@ class BackgroundDiagnosis:
 
     def waits(self, tick: float, since: float) -> str:
         """Why the cause of a misfit is not known yet."""
-        if not self._every:
-            return "diagnosis is switched off"
         if self._asked is not None:
             return f"the diagnosis of {self._asked.stop - self._asked.start:.0f} s of flight is running"
         if self.outcome:

@@ -18,7 +18,7 @@ from quadid.online.gate import Case
 from quadid.online.model_vehicle import ThrustModel, secant_share
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
-from quadid.online.window_fit import FitReply, FitRequest, prior_of
+from quadid.online.window_fit import FitReply, FitRequest, LackOfFit, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -33,8 +33,8 @@ NOISE_EVERY = 5
 """Every so many windows the sensor noise is measured anew, and pooled."""
 NOISE_POOL = 24
 """Windows whose noise is pooled, newest counting fully."""
-MISFIT = 2.0
-"""Residual variance over sensor noise beyond which the model misses something that has to be found first."""
+YAW_MISFIT = 2.0
+"""Residual variance over sensor noise beyond which the small couplings that yaw parameters rest on are outweighed."""
 YAW = ("d", "J_zz", "J_r")
 """Parameters that a set may leave at the vehicle file's guess."""
 _YAW_PLACES = [NOMINAL_NAMES.index(n) for n in YAW]
@@ -49,6 +49,7 @@ class Estimator:
         vehicle: of the vehicle file.
         model: the same with what a diagnosis found; windows are fitted with it.
         fusion: the fused windows.
+        lack: what effects outside the model would explain, of all windows that were looked at.
         misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
         theta: full parameter vector, the best at hand.
         learned: whether `theta` rests on data.
@@ -58,8 +59,9 @@ class Estimator:
         input_hash: SHA-256 over seed and windows learned from.
     """
 
-    def __init__(self, vehicle: Vehicle, memory: float, seed: int) -> None:
-        """Starts from the vehicle file."""
+    def __init__(self, vehicle: Vehicle, memory: float, seed: int, looks: bool = True) -> None:
+        """Starts from the vehicle file; `looks`: what the model lacks is looked for, and held against it till found."""
+        self._looks = looks
         self.vehicle, self._memory, self._seed = vehicle, memory, seed
         self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
@@ -78,7 +80,7 @@ class Estimator:
         self._noise: NoiseModel | None = None
         self._pool = 0
         self.theta = self._initial
-        self.misfit = np.full(6, np.nan)
+        self.misfit, self.lack = np.full(6, np.nan), LackOfFit()
         self.forget()
 
     @property
@@ -87,9 +89,9 @@ class Estimator:
         return self.model is not self.vehicle
 
     @property
-    def missed(self) -> float:
-        """How much the model misses, relative to sensor noise, where b, J_xx and J_yy come from; NaN: not measured."""
-        return float(self.misfit[[0, 1, 3, 4, 5]].mean())
+    def misses(self) -> bool:
+        """Whether the model misses what effects of the catalogue would explain."""
+        return self._looks and self.lack.significant
 
     @property
     def _scatter(self) -> float:
@@ -98,7 +100,7 @@ class Estimator:
 
     @property
     def _yaw_missed(self) -> bool:
-        return bool(self.misfit.max() > MISFIT)
+        return self.misses or bool(self.misfit.max() > YAW_MISFIT)
 
     @property
     def thrust(self) -> ThrustModel:
@@ -124,7 +126,7 @@ class Estimator:
     @property
     def mass(self) -> float:
         """Mass of the vehicle file, on which every parameter rests [kg]."""
-        return self._vehicle.mass
+        return self.vehicle.mass
 
     def value(self, name: str) -> float:
         """A nominal parameter, the best at hand."""
@@ -158,7 +160,7 @@ class Estimator:
             return
         self._pool_noise(reply)
         if reply.misfit is not None:
-            self.misfit = reply.misfit
+            self.misfit, self.lack = reply.misfit, self.lack + (reply.lack or LackOfFit())
             self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
         for window in self._asked:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()

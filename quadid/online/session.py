@@ -81,7 +81,7 @@ class Session:
         self._change_supervisor = ChangeSupervisor(vehicle, self._store)
         self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
         self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
-        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
+        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed, self.settings.diagnose > 0.0)
         self._supervisor = Supervisor(self._estimator, self.active_set, self._outbox, self.settings.gate)
         self._cut = Cut((), 0.0, 0)
         self._waiting: Job | None = None

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from quadid.online.active_set import ActiveSet
 from quadid.online.background_diagnosis import BackgroundDiagnosis, DiagnosisReply, DiagnosisRequest
-from quadid.online.estimator import MISFIT, Estimator
+from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
 from quadid.online.model_vehicle import extended
@@ -62,11 +62,11 @@ class Supervisor:
 
     @property
     def unexplained(self) -> str:
-        """What the model misses, and why it is not known yet; empty where it misses nothing or was extended."""
-        missed = self._estimator.missed
-        if self._estimator.extended or not missed > MISFIT:
+        """What the model misses and why the cause is not known; empty where it misses nothing or was extended."""
+        if self._estimator.extended or not self._estimator.misses:
             return ""
-        return f"the model misses this flight (residuals {missed:.0f} times the sensor noise): {self.waits}"
+        share = self._estimator.lack.share
+        return f"effects that the model lacks explain {share:.0%} of its residuals: {self.waits}"
 
     def diagnosed(
         self, tick: float, asked: DiagnosisRequest, reply: DiagnosisReply, diagnosis: BackgroundDiagnosis
@@ -79,7 +79,7 @@ class Supervisor:
         told = diagnosis.news(asked, reply, self._outbox.stamp)
         if told is not None:
             self._outbox.act(told)
-        if not self._estimator.missed > MISFIT or reply.extended is None:
+        if not self._estimator.misses or reply.extended is None:
             return False
         model = extended(self._estimator.vehicle, reply.extended)
         self._estimator.take_model(model)

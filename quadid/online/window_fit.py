@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.effects import effect_of
 from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import Polished, Prior, polish, robust_weights
 from quadid.identify.global_search import swarm_search
-from quadid.identify.noise_estimation import residual_noise, reweighted_fit
+from quadid.identify.noise_estimation import flexible_names, residual_noise, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.shooting import Free, Shooting
@@ -42,6 +44,14 @@ INFLATED = 9.0
 """Noise whose variance is above this multiple of the usual in some channel may have been taken from bad data."""
 RATED = ("J_xx", "J_yy")
 """Parameters whose bound decides on excitation."""
+TRIFLE = 0.01
+"""Share of the residuals that effects of the catalogue may explain without being looked for,"""
+LACKING = 6.0
+"""... and the standard deviations by which it must exceed what noise gives."""
+FEWEST_SEGMENTS = 5
+"""Fewer segments do not give the noise well enough to say what is more than noise."""
+EFFECT_WIDTH = 3.0
+"""Prior width of an effect in the score test, in its typical size."""
 INERTIAL = (0, 1, 2, 6, 7, 8)
 """Residual channels of gyro and accelerometer: their noise is the sensor's own, no estimator's."""
 
@@ -81,6 +91,36 @@ class FitRequest(Job):
 
 
 @dataclass(frozen=True)
+class LackOfFit:
+    """What the effects of the catalogue would take from the residuals, all freed at once; windows add up.
+
+    Attributes:
+        drop: of the deviance, in units of the residuals' own level.
+        freedom: numbers freed: what noise alone would give.
+        rows: independent residuals.
+    """
+
+    drop: float = 0.0
+    freedom: int = 0
+    rows: float = 0.0
+
+    def __add__(self, other: LackOfFit) -> LackOfFit:
+        """That of both windows."""
+        return LackOfFit(self.drop + other.drop, self.freedom + other.freedom, self.rows + other.rows)
+
+    @property
+    def share(self) -> float:
+        """Share of the residuals, beyond what noise gives."""
+        return (self.drop - self.freedom) / max(self.rows, 1.0)
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than a trifle, and more than noise gives."""
+        errors = (self.drop - self.freedom) / math.sqrt(2.0 * max(self.freedom, 1))
+        return self.share > TRIFLE and errors > LACKING
+
+
+@dataclass(frozen=True)
 class FitReply(JobReply):
     """Answer to a request.
 
@@ -94,6 +134,7 @@ class FitReply(JobReply):
         measured: noise measured in this window, when that was asked for.
         misfit: variance of gyro (x, y, z) and accelerometer residuals over that of the sensors' own noise, shape (6,):
             1 where the model misses nothing; with `measured`, or where noise was found anew.
+        lack: what effects of the catalogue would explain; with `misfit`.
     """
 
     excitation: FloatArray | None = None
@@ -103,6 +144,7 @@ class FitReply(JobReply):
     noise: NoiseModel | None = None
     measured: NoiseModel | None = None
     misfit: FloatArray | None = None
+    lack: LackOfFit | None = None
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
@@ -155,8 +197,33 @@ def _fit(request: FitRequest) -> FitReply:
     if request.measure:
         measured = residual_noise(shooting, result)
         sensor = _sensor_noise(request, layout, result.theta, noise)
-    misfit = None if sensor is None else ((measured or noise).variance / sensor.variance)[list(INERTIAL)]
-    return FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured, misfit)
+    reply = FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured)
+    if sensor is None:
+        return reply
+    misfit = ((measured or noise).variance / sensor.variance)[list(INERTIAL)]
+    return replace(reply, misfit=misfit, lack=_lack_of_fit(shooting, result, layout))
+
+
+def _moves(name: str) -> bool:
+    effect = effect_of(name)
+    return effect is None or effect.acts != "sensor" or effect.name == "imu_lag"
+
+
+def _lack_of_fit(problem: Shooting, result: Polished, layout: Layout) -> LackOfFit:
+    """Score test of everything that moves the vehicle, and of the IMU filter, freed at once.
+
+    Errors of sensors are left out: with them a slow error of the AHRS would look like a lack.
+    """
+    if problem.count < FEWEST_SEGMENTS:
+        return LackOfFit()
+    moving = [n for n in flexible_names(layout, problem) if _moves(n)]
+    free = problem.free(moving)
+    lin = problem.linearise(result.theta, free)
+    gram, score = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
+    weight = np.where(free.is_log, 0.0, 1.0 / EFFECT_WIDTH**2) + 1e-9
+    drop = float(score @ np.linalg.solve(gram + np.diag(weight), score))
+    cost = float(lin.cost.sum())
+    return LackOfFit(drop * float(lin.rows.sum()) / max(cost, 1.0), len(score), float(lin.rows.sum()))
 
 
 def is_excited(bounds: FloatArray) -> bool:

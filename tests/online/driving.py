@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 from quadid.flight import Flight, fly
-from quadid.online import Session
+from quadid.online import Job, JobReply, Session
 from quadid.online.outbox import Action
 from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Sample
 
+Background = Callable[[Job], JobReply | None]
 EPOCH = 1_700_000_000.0
 
 
@@ -36,24 +37,36 @@ def samples(recording: Recording, shift: float = 0.0) -> list[Sample]:
     return sorted(out, key=lambda s: s.t)
 
 
-def answer(session: Session) -> list[Action]:
-    """Polls until the session needs more samples, doing every fit at once."""
+def run(job: Job) -> JobReply | None:
+    """Runs a job at once."""
+    return job.run()
+
+
+def unanswered(job: Job) -> None:
+    """Leaves a job to the caller."""
+
+
+def answer(session: Session, diagnose: Background = run) -> list[Action]:
+    """Polls until the session needs more samples, doing every fit at once, and diagnoses as told."""
     out: list[Action] = []
     while True:
-        out.extend(session.poll())
+        for action in session.poll():
+            out.append(action)
+            if isinstance(action, Job) and action.background and (reply := diagnose(action)) is not None:
+                session.deliver(reply)
         request = session.running
         if request is None:
             return out
         session.deliver(request.run())
 
 
-def drive(session: Session, stream: Sequence[Sample], chunk: int = 40) -> list[Action]:
+def drive(session: Session, stream: Sequence[Sample], chunk: int = 40, diagnose: Background = run) -> list[Action]:
     """Pushes all samples, polling after every `chunk` of them."""
     out: list[Action] = []
     for start in range(0, len(stream), chunk):
         for sample in stream[start : start + chunk]:
             session.push(sample)
-        out.extend(answer(session))
+        out.extend(answer(session, diagnose))
     return out
 
 

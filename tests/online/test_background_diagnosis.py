@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.online import Diagnosed, Session, SessionSettings
-from quadid.online.background_diagnosis import ANSWER_AFTER, DIAGNOSED_SECONDS, DiagnosisReply, DiagnosisRequest
+from quadid.online import Job, JobReply, Session, SessionSettings
+from quadid.online.background_diagnosis import ANSWER_AFTER, DIAGNOSED_SECONDS, SOON, DiagnosisReply, DiagnosisRequest
 from quadid.online.outbox import Action
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
-from tests.online.driving import EPOCH, diagnosed, drive, flight, samples
+from tests.online.driving import EPOCH, diagnosed, drive, events, flight, published, samples, unanswered
 
 PELICAN = Vehicle.shipped("pelican")
-QUICK = SessionSettings(window=5.0, refit=5.0)
+QUICK = SessionSettings(refit=5.0)
 DRAG = OnlineFinding("rotor_drag", {"k_x": 0.3}, {"k_x": 0.02}, {"k_x": "1/s"}, 1.4, 1.0, 1e-6, (), "seen")
 
 
@@ -27,16 +27,23 @@ def studies(actions: list[Action]) -> list[DiagnosisRequest]:
     return [a for a in actions if isinstance(a, DiagnosisRequest)]
 
 
+def before(stream: list[Sample], t: float) -> list[Sample]:
+    return [s for s in stream if s.t < EPOCH + t]
+
+
+DRAGGED = (("rotor_drag", "k_x", 0.35), ("rotor_drag", "k_y", 0.35))
+
+
 def test_it_is_asked_for_after_a_minute_of_flight_and_told_later() -> None:
     session, stream = fly(160.0)
-    early = drive(session, [s for s in stream if s.t < EPOCH + 80.0])
-    (request,) = studies(early)
+    (request,) = studies(drive(session, before(stream, 80.0), diagnose=unanswered))
     assert request.stop - request.start == pytest.approx(DIAGNOSED_SECONDS)
     assert sum(len(w) for w in request.windows) * 0.02 == pytest.approx(DIAGNOSED_SECONDS, abs=0.1)
     session.deliver(DiagnosisReply(request.number, "", (DRAG,), "explained"))
     session.deliver(DiagnosisReply(99, "", (), "unknown"))
-    assert not diagnosed(drive(session, [s for s in stream if EPOCH + 80.0 <= s.t < EPOCH + 88.0]))
-    rest = drive(session, [s for s in stream if s.t >= EPOCH + 88.0])
+    between = [s for s in stream if EPOCH + 80.0 <= s.t < EPOCH + 88.0]
+    assert not diagnosed(drive(session, between, diagnose=unanswered))
+    rest = drive(session, [s for s in stream if s.t >= EPOCH + 88.0], diagnose=unanswered)
     (told,) = diagnosed(rest)
     assert (told.verdict, told.findings) == ("explained", (DRAG,))
     assert told.t - EPOCH == pytest.approx(request.stop - request.start, abs=6.0)
@@ -44,18 +51,28 @@ def test_it_is_asked_for_after_a_minute_of_flight_and_told_later() -> None:
     assert again.stop >= request.stop + ANSWER_AFTER
 
 
+def test_where_the_model_misses_the_flight_it_is_asked_for_soon_and_nothing_is_published_meanwhile() -> None:
+    session = Session(PELICAN, QUICK)
+    actions = drive(session, samples(flight(60.0, 11, effects=DRAGGED).recording, EPOCH), diagnose=unanswered)
+    request = studies(actions)[0]
+    assert SOON <= request.stop - request.start <= SOON + QUICK.refit
+    assert not published(actions)
+    reasons = [s.reason for s in published(actions, "candidate") if s.check == "model"]
+    assert "waits for a diagnosis" in reasons[0]
+    assert "running" in reasons[-1]
+    assert not [e for e in events(actions) if e.level == "warning"], "a model that misses is no change of the vehicle"
+
+
 def test_what_was_told_is_not_told_again_but_news_are() -> None:
     session, stream = fly(160.0, QUICK.model_copy(update={"diagnose": 1.0}))
     moved = replace(DRAG, values={"k_x": 0.5})
     replies = iter([(DRAG,), (replace(DRAG, values={"k_x": 0.31}),), (moved,)])
-    told: list[Diagnosed] = []
-    for sample in stream:
-        actions = drive(session, [sample])
-        told += diagnosed(actions)
-        for request in studies(actions):
-            session.deliver(DiagnosisReply(request.number, "", next(replies, (moved,)), "explained"))
-    assert [d.findings for d in told][:1] == [(DRAG,)]
-    assert (replace(DRAG, values={"k_x": 0.31}),) not in [d.findings for d in told]
+
+    def made_up(job: Job) -> JobReply:
+        return DiagnosisReply(job.number, "", next(replies, (moved,)), "explained")
+
+    told = diagnosed(drive(session, stream, diagnose=made_up))
+    assert [d.findings for d in told] == [(DRAG,), (moved,)]
 
 
 def test_zero_never_asks() -> None:
@@ -65,16 +82,16 @@ def test_zero_never_asks() -> None:
 
 def test_an_answer_from_before_a_change_is_not_told() -> None:
     session, stream = fly(100.0)
-    (request,) = studies(drive(session, [s for s in stream if s.t < EPOCH + 70.0]))
+    (request,) = studies(drive(session, before(stream, 70.0), diagnose=unanswered))
     session.deliver(DiagnosisReply(request.number, "", (DRAG,), "explained"))
     late = [Sample(s.t + 400.0, s.channel, s.values) for s in stream]  # a break in the stream: another flight perhaps
-    assert not diagnosed(drive(session, late[:8000]))
+    assert not diagnosed(drive(session, late[:8000], diagnose=unanswered))
 
 
 def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
-    made = flight(61.5, 11, "excited", (("rotor_drag", "k_x", 0.35), ("rotor_drag", "k_y", 0.35)))
+    made = flight(31.5, 11, effects=DRAGGED)
     session = Session(PELICAN, QUICK)
-    (request,) = studies(drive(session, samples(made.recording)))
+    (request,) = studies(drive(session, samples(made.recording), diagnose=unanswered))
     reply = request.run()
     assert isinstance(reply, DiagnosisReply)
     assert not reply.problem

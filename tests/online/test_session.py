@@ -125,10 +125,10 @@ def test_a_restored_set_is_published_stale_and_confirmed_by_flight() -> None:
     (first, *_) = published(drive(Session(PELICAN, QUICK), stream))
     session = Session(PELICAN, QUICK, restored=first, next_sequence=first.sequence + 1)
     (stale,) = published(session.poll())
-    assert (stale.state, stale.sequence) == (SetState.STALE, first.sequence)
+    assert (stale.state, stale.sequence) == (SetState.STALE, first.sequence + 1)
     assert session.status().stale
     sets = published(drive(session, stream))
-    assert (sets[0].state, sets[0].sequence) == (SetState.ACCEPTED, first.sequence + 1)
+    assert (sets[0].state, sets[0].sequence) == (SetState.ACCEPTED, first.sequence + 2)
     assert not session.status().stale
 
 
