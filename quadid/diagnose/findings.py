@@ -77,10 +77,12 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
         high = 1.0 / (value - half) if value > half else math.inf
         return (FoundParameter("cutoff", "Hz", 1.0 / max(value, 1e-9), (low, high)),)
     out = []
+    values = shooting.layout.read_effect(model.theta, cause.effect)
     for p in spec.parameters:
-        entry = shooting.layout.entry(f"{cause.effect}.{p.name}")
-        value = float(model.theta[entry.index])
-        half = Z95 * _sigma(p.name, sigma.get(entry.name, 0.0))
+        if p.name not in values:  # an optional number that was not freed
+            continue
+        value = values[p.name]
+        half = Z95 * _sigma(p.name, sigma.get(f"{cause.effect}.{p.entry or p.name}", 0.0))
         out.append(FoundParameter(p.name, p.unit, value, (value - half, value + half)))
     return tuple(out)
 
