@@ -86,7 +86,7 @@ class Refit:
 def _refit(shooting: Shooting, model: Model, candidate: Candidate, tests: int) -> Refit:
     """Refits one candidate as the selection does it."""
     extended = extend(shooting, model, candidate, tried=float(tests))
-    alike = rule.calibration([model, extended])
+    alike = rule.calibration(model, extended)
     likely = rule.log_evidence(extended, alike) > rule.log_evidence(model, alike)
     return Refit(paired_gain(model.held_out, extended.held_out), likely)
 

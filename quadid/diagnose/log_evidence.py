@@ -10,17 +10,11 @@ divided by the ratio of the scores' true variance to that which the model counts
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
 from quadid.diagnose.cross_validation import paired_gain
 from quadid.diagnose.model import Model
-from quadid.identify.covariance import score_products
-
-FloatArray = NDArray[np.float64]
 
 FALSE_ALARM = 1e-3
 """Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
@@ -29,11 +23,15 @@ RELEVANT = 0.002
 time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
 
 
-def calibration(models: Sequence[Model]) -> float:
-    """By how much the scores of the best-fitting of `models` vary more than its deviance counts on, at least 1."""
-    best = min(models, key=lambda m: m.deviance)
-    covariance = np.linalg.inv(best.lin.gram.sum(axis=0) + np.diag(best.precision))
-    return max(float(np.mean(np.diag(covariance @ score_products(best.lin)[0]))), 1.0)
+def better(b: Model, a: Model) -> bool:
+    """Whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
+    more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
+    if more < less:
+        return not better(a, b)
+    if less < more and not relevant(a, b):
+        return False
+    alike = calibration(a, b)
+    return log_evidence(b, alike) > log_evidence(a, alike)
 
 
 def log_evidence(model: Model, calibration: float) -> float:
@@ -41,7 +39,7 @@ def log_evidence(model: Model, calibration: float) -> float:
 
     Args:
         model: fitted; its deviance holds the quadratic part of its prior.
-        calibration: `calibration` of the models compared.
+        calibration: `calibration` of the two models compared.
     """
     gram = model.lin.gram.sum(axis=0) / np.sqrt(np.outer(model.precision, model.precision))
     occam = float(np.linalg.slogdet(np.eye(len(gram)) + gram / calibration)[1])
@@ -49,20 +47,21 @@ def log_evidence(model: Model, calibration: float) -> float:
     return -model.deviance / calibration - occam - float(prior)
 
 
+def calibration(a: Model, b: Model) -> float:
+    """By how much scores of the parameters in which two models differ vary more than their deviance counts on, or 1."""
+    ratios = [1.0]
+    for model, other in ((a, b), (b, a)):
+        own = [n not in other.free.names for n in model.free.names]
+        if any(own):
+            ratios.append(float(np.mean(model.inflation[own])))
+    return max(ratios)
+
+
 def relevant(small: Model, large: Model) -> bool:
     """Whether what `large` has more gains enough on unseen blocks, and half of that without the best of them."""
     gain = paired_gain(small.held_out, large.held_out)
-    return min(gain.total, 2.0 * (gain.total - float(np.max(gain.blocks)))) > RELEVANT * small.rows
-
-
-def better(b: Model, a: Model, calibration: float) -> bool:
-    """Whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
-    more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
-    if more < less:
-        return not better(a, b, calibration)
-    if less < more and not relevant(a, b):
-        return False
-    return log_evidence(b, calibration) > log_evidence(a, calibration)
+    least = min(gain.total, 2.0 * (gain.total - float(np.max(gain.blocks))))
+    return least > RELEVANT * small.rows
 
 
 def worth_a_refit(tests: int, rows: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,14 +76,21 @@ class Model:
         """Of the prior on each scaled parameter, shape (P,)."""
         return np.asarray(self.prior.sigma**-2.0)
 
+    @cached_property
+    def inflation(self) -> FloatArray:
+        """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""
+        covariance = self._model_covariance
+        return np.asarray(np.diag(covariance @ score_products(self.lin)[0] @ covariance) / np.diag(covariance))
+
+    @cached_property
+    def _model_covariance(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision)))
+
     @property
     def covariance(self) -> FloatArray:
         """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
-        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision))
-        meat, _ = score_products(self.lin)
-        ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
-        widen = np.sqrt(np.maximum(ratio, 1.0))
-        return np.asarray(covariance * np.outer(widen, widen))
+        widen = np.sqrt(np.maximum(self.inflation, 1.0))
+        return np.asarray(self._model_covariance * np.outer(widen, widen))
 
     @property
     def sigma(self) -> FloatArray:

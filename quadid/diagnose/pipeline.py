@@ -15,19 +15,21 @@ from quadid.diagnose.findings import describe
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names
 from quadid.diagnose.plausibility import impossible_causes
-from quadid.diagnose.prediction import POOR, learn_prediction
+from quadid.diagnose.prediction import POOR, Prediction, learn_prediction
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
-from quadid.diagnose.segment_schedule import is_long
-from quadid.diagnose.selection import Search, pruned, select
+from quadid.diagnose.segment_schedule import LINEAR_MISFIT, is_long
+from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.errors import NotIdentifiableError
+from quadid.identify.covariance import parameter_set, uncertainty
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
-from quadid.parameters import NOMINAL_NAMES
+from quadid.model.layout import Layout
+from quadid.parameters import NOMINAL_NAMES, Parameter
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -38,8 +40,6 @@ DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (`climb.USUAL_SECONDS` says when the longest may), longest first; below them
 only the short ones of the first fit."""
 FEWEST_SEGMENTS = 5
-FAR = 4.0
-"""Deviance per row of the nominal fit, under typical noise, above which it tells neither noise nor parameters."""
 FAR_ITERATIONS = 10
 NOISE_ROUNDS = 2
 NOISE_FELL = 0.7
@@ -111,21 +111,43 @@ def diagnose(
     alike = {c.family for c in search.model.causes if c.label in doubts}
     believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
     findings = describe(decisive, search, per_finding, believed)
+    warnings = [
+        *(f.text for f in faults),
+        *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
+    ]
     text = extended_vehicle(vehicle, decisive.layout, Fitted.of(search.model))
-    prediction, said = None, []
+    prediction = None
     if search.model.reduced_chi_square > POOR:
         report("prediction", 0.0)
-        try:
-            prediction = learn_prediction(windows, Vehicle.from_yaml(text), validation)
-        except NotIdentifiableError as error:
-            said.append(f"no residual terms could be learnt: {error}")
-    if prediction is not None:
-        said.append(prediction.sentence)
-    name = "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)])
+        prediction = _prediction(windows, text, validation, warnings)
+    result = Diagnosis(
+        verdict, findings, outcome, left, _nominal_parameters(vehicle, search.model), text,
+        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
+    )  # fmt: skip
     report("done", 1.0)
-    warnings = (*(f.text for f in faults), *doubts.values(), *said)
-    result = Diagnosis(verdict, findings, outcome, left, text, name, warnings, prediction)
     return result, Workings(search, begun.short, decisive, left)
+
+
+def _prediction(
+    windows: Sequence[Window], physical: str, validation: Sequence[Window], warnings: list[str]
+) -> Prediction | None:
+    """Residual terms beside unchanged physics, where they predict better; says so in `warnings`."""
+    try:
+        out = learn_prediction(windows, Vehicle.from_yaml(physical), validation)
+    except NotIdentifiableError as error:
+        warnings.append(f"no residual terms could be learnt: {error}")
+        return None
+    warnings += [] if out is None else [out.sentence]
+    return out
+
+
+def _nominal_parameters(vehicle: Vehicle, model: Model) -> tuple[Parameter, ...]:
+    """The nominal six beside the findings, as an identification gives them."""
+    initial = Layout(vehicle).initial(vehicle)
+    everything = parameter_set(
+        model.free, model.theta, initial, uncertainty(model.lin, model.free, model.prior, model.theta)
+    )
+    return tuple(p for p in everything if p.name in NOMINAL_NAMES)
 
 
 @dataclass(frozen=True)
@@ -157,7 +179,7 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
         start, _ = swarm_search(short, start, free, settings, swarm.particles, swarm.seed, report)
     report("fit", 0.0)
     first = polish(short, start, free, iterations=8)
-    far = first.cost > FAR * float(first.lin.rows.sum())
+    far = first.cost > LINEAR_MISFIT * float(first.lin.rows.sum())
     typical, short = short.noise, short.with_noise(residual_noise(short, first))
     first = polish(short, first.theta, free, states=first.states, iterations=8)
     report("noise floor", 0.0)
@@ -178,6 +200,11 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
     """Selects causes, and again when they show the noise to be less."""
     search = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere)
+    if search.model.reduced_chi_square > LINEAR_MISFIT:
+        # One by one led nowhere; from everything at once it may.
+        general = from_everything(begun.short, begun.flexible, begun.listed)
+        other = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere, general)
+        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
     for _ in range(NOISE_ROUNDS):
         if not search.model.causes:
             break

@@ -8,7 +8,9 @@ from typing import Any
 
 from quadid.diagnose.prediction import Prediction
 from quadid.diagnose.residual_tests import Remainder
+from quadid.identify.result import parameter_entry
 from quadid.jsonable import jsonable
+from quadid.parameters import Parameter
 
 
 class Verdict(StrEnum):
@@ -126,13 +128,15 @@ class Validation:
 class Diagnosis:
     """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name.
 
-    The vehicle file holds physical values; `prediction` is what predicts better, if anything does.
+    `parameters` are the nominal six beside the findings.  The vehicle file holds physical
+    values; `prediction` is what predicts better, if anything does.
     """
 
     verdict: Verdict
     findings: tuple[Finding, ...]
     validation: Validation
     remainder: Remainder
+    parameters: tuple[Parameter, ...]
     vehicle_yaml: str
     vehicle_name: str
     warnings: tuple[str, ...] = field(default_factory=tuple)
@@ -157,6 +161,7 @@ class Diagnosis:
             "schema": "quadid.diagnose/1",
             "verdict": self.verdict.value,
             "statement": self.verdict.sentence,
+            "parameters": [parameter_entry(p) for p in self.parameters],
             "findings": [f.to_dict() for f in self.findings],
             "validation": {
                 "mse_nominal": self.validation.nominal,

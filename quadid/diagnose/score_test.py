@@ -127,6 +127,34 @@ class Everything:
         return replace(self.lin, grad=self.lin.grad + moved), risen
 
 
+def missed(model: Model, least: float) -> tuple[Candidate, ...]:
+    """Causes of `model` whose loss, one after the other, the rest could not make up for: at least `least` of deviance.
+
+    Half of them at most are let go: the linear picture does not hold for all at once.
+    """
+    h = model.lin.gram.sum(axis=0) + np.diag(model.precision)
+    z, place = model.free.from_neutral(model.theta), {n: i for i, n in enumerate(model.free.names)}
+    kept, alive = list(model.causes), np.ones(len(place), dtype=bool)
+    for _ in range(max(len(kept) // 2, 1)):
+        losses = []
+        for cause in kept:
+            if any(c.requires == cause.effect for c in kept):
+                continue
+            mine = np.array([place[n] for n in cause.names])
+            rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))
+            cross = h[np.ix_(rest, mine)]
+            schur = h[np.ix_(mine, mine)] - cross.T @ np.linalg.solve(h[np.ix_(rest, rest)], cross)
+            losses.append((float(z[mine] @ schur @ z[mine]), cause, mine))
+        if not losses:
+            break
+        loss, cause, mine = min(losses, key=lambda item: item[0])
+        if loss > least:
+            break
+        kept.remove(cause)
+        alive[mine] = False
+    return tuple(kept)
+
+
 def screen(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> list[Score]:
     """Scores all candidates not yet in the model, best first."""
     return Everything.of(shooting, model, listed).scores(listed)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate
-from quadid.diagnose.log_evidence import better, calibration, log_evidence, worth_a_refit
+from quadid.diagnose.log_evidence import better, worth_a_refit
 from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, thinned, without
 from quadid.diagnose.plausibility import impossible_causes
-from quadid.diagnose.score_test import Everything, Score
+from quadid.diagnose.score_test import Everything, Score, missed
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT, Stage
+from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.shooting import MEASURED, Shooting
+from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]
 
@@ -25,8 +27,6 @@ ALIKE = 0.8
 """Share of what is lost that a cause of another family should regain by the linear prediction to be looked at."""
 FEWEST_REFITS, MOST_REFITS = 3, 7
 """Fewest and most causes refitted in one round: the prediction is linear, the effects are not."""
-MOST_ROUNDS = 40
-"""Moves after which the selection ends anyhow."""
 FAR_SEGMENTS = 60
 """Segments on which causes are compared while the misfit is large, and so any difference shows on a few."""
 
@@ -83,24 +83,55 @@ def select(
     """
     stage = Stage.begin(schedule, theta, known)
     rounds: list[Round] = []
-    while len(rounds) < MOST_ROUNDS:
+    seen = {_key(stage.shooting, stage.model)}
+    while True:
         report("search", len(rounds) / (len(rounds) + 2.0))
-        rounds.append(_round(stage.shooting, stage.model, listed, elsewhere))
+        rounds.append(_round(stage.shooting, stage.model, listed, elsewhere, seen))
         if rounds[-1].accepted is None:
             # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
             far = None if stage.model.causes else stage.longest()
             airborne = [] if far is None else [c for c in listed if far.shooting.finds_velocity(c.names)]
             if far is None or not airborne:
                 break
-            rounds.append(_round(far.shooting, far.model, airborne, elsewhere))
+            rounds.append(_round(far.shooting, far.model, airborne, elsewhere, seen))
             if rounds[-1].accepted is None:
                 break
             stage = far
         accepted = rounds[-1].accepted
         assert accepted is not None
         stage = replace(stage, model=accepted.model).continued()
+        seen.add(_key(stage.shooting, stage.model))
     nominal = fit_model(stage.shooting, theta, ()) if stage.model.causes else stage.model
     return Search(stage.shooting, nominal, stage.model, tuple(rounds), len(listed))
+
+
+def _key(shooting: Shooting, model: Model) -> tuple[int, frozenset[str]]:
+    """Length of segments and causes: what the search has visited once it never comes back to."""
+    return shooting.length, frozenset(c.label for c in model.causes)
+
+
+def from_everything(shooting: Shooting, theta: FloatArray, listed: Sequence[Candidate]) -> Model:
+    """A start of its own: everything at once at `theta`, the flexible fit, less what is not missed.
+
+    When several causes act at once and strongly, none of them alone leads out of the basin that the nominal fit fell
+    into; the flexible model is outside of it.
+    """
+    allowed = set(flexible_names(shooting.layout, shooting))
+    kept = tuple(c for c in listed if c.timed is None and not c.split and set(c.names) <= allowed)
+    model, before = fit_model(shooting, _only(shooting, theta, kept), kept, iterations=8), -1
+    while len(model.causes) != before:
+        before, kept = len(model.causes), missed(model, worth_a_refit(len(listed), model.rows))
+        if len(kept) < before:
+            model = fit_model(shooting, _only(shooting, model.theta, kept), kept, model.states, iterations=8)
+    return replace(model, tried={c.label: float(len(listed)) for c in kept})
+
+
+def _only(shooting: Shooting, theta: FloatArray, causes: Sequence[Candidate]) -> FloatArray:
+    """The vector with all effects at neutral but those of `causes`."""
+    out = shooting.layout.initial(shooting.vehicle)
+    kept = shooting.free([*NOMINAL_NAMES, *(n for c in causes for n in c.names)]).index
+    out[kept] = theta[kept]
+    return out
 
 
 def pruned(shooting: Shooting, model: Model) -> Model:
@@ -113,18 +144,31 @@ def pruned(shooting: Shooting, model: Model) -> Model:
         model = best.model
 
 
-def _round(shooting: Shooting, model: Model, listed: Sequence[Candidate], elsewhere: Sequence[FloatArray]) -> Round:
+def _round(
+    shooting: Shooting, model: Model, listed: Sequence[Candidate], elsewhere: Sequence[FloatArray],
+    seen: Collection[tuple[int, frozenset[str]]],
+) -> Round:  # fmt: skip
     """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
     trials: list[Trial] = []
     for moves in (_adds_and_drops, _swaps):
-        trials += moves(shooting, everything, listed, least, elsewhere)
+        new = moves(shooting, everything, listed, least, elsewhere)
+        trials += [t for t in new if _key(shooting, t.model) not in seen]
         best = _best(model, trials)
         if best is not None:
             return Round(model, tuple(trials), best)
-    best = _possible(shooting, model, trials)
-    return Round(model, tuple(trials), best)
+    return Round(model, tuple(trials), _possible(shooting, model, trials))
+
+
+def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
+    """The best of the trials that are better than `model`; those with impossible numbers only where no other is."""
+    good = [t for t in trials if better(t.model, model)]
+    best = None
+    for t in [t for t in good if not impossible_causes(t.model)] or good:
+        if best is None or better(t.model, best.model):
+            best = t
+    return best
 
 
 def _possible(shooting: Shooting, model: Model, trials: Sequence[Trial]) -> Trial | None:
@@ -133,21 +177,12 @@ def _possible(shooting: Shooting, model: Model, trials: Sequence[Trial]) -> Tria
     What no vehicle has stands for something else, and a true cause need not fit as well as a stand-in of any sign: a
     lag that the model lacks comes out as damping that drives the rotation.
     """
-    told = impossible_causes(model)
-    for cause in _removable(model):
-        mine = [t for t in trials if t.gone is cause and t.candidate and not impossible_causes(t.model)]
-        if cause.label in told and mine and (best := _best(without(shooting, model, cause), mine)):
+    for label in impossible_causes(model):
+        cause = next(c for c in model.causes if c.label == label)
+        mine = [t for t in trials if t.gone is cause and not impossible_causes(t.model)]
+        if mine and (best := _best(without(shooting, model, cause), mine)):
             return best
     return None
-
-
-def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
-    """The most likely of the trials that are better than `model`, before all others those with possible numbers."""
-    if not trials:
-        return None
-    alike = calibration([model, *(t.model for t in trials)])
-    good = [t for t in trials if better(t.model, model, alike)]
-    return max(good, key=lambda t: (not impossible_causes(t.model), log_evidence(t.model, alike)), default=None)
 
 
 def _adds_and_drops(

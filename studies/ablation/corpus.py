@@ -104,18 +104,18 @@ def load(flight: Flight, cache: Path | None = None) -> tuple[list[Window], list[
     """
     kept = None if cache is None else cache / f"{flight.name.replace(' ', '-').replace('/', '-')}.pickle"
     if kept is not None and kept.exists():
-        out: tuple[list[Window], list[Window], Vehicle] = pickle.loads(kept.read_bytes())
-        return out
+        train, held, text = pickle.loads(kept.read_bytes())
+        return train, held, Vehicle.from_yaml(text)
     if flight.case is not None:
-        train, held, vehicle = flown(flight.case)
-        out = [train], [held], vehicle
+        one, other, vehicle = flown(flight.case)
+        train, held = [one], [other]
     else:
         vehicle = load_vehicle(str(DATA / flight.vehicle))
-        out = _windows(flight.train, vehicle), _windows(flight.held, vehicle), vehicle
+        train, held = _windows(flight.train, vehicle), _windows(flight.held, vehicle)
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_bytes(pickle.dumps(out))
-    return out
+        kept.write_bytes(pickle.dumps((train, held, vehicle.to_yaml())))
+    return train, held, vehicle
 
 
 def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:

@@ -33,6 +33,11 @@ def test_an_effect_missing_from_the_catalogue_is_not_found(name: str, monkeypatc
         require_named(case, found)
 
 
+def few(layout: Layout, has_velocity: bool, has_position: bool) -> list[Candidate]:
+    """Two causes, so that a spoilt search ends."""
+    return [c for c in candidates(layout, has_velocity, has_position) if c.effect in ("motor_lag", "gyro_bias")]
+
+
 def inverted(*arguments: Any) -> bool:
     """The one comparison the wrong way round."""
     return not better(*arguments)
@@ -40,7 +45,7 @@ def inverted(*arguments: Any) -> bool:
 
 def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selection, "better", inverted)
-    monkeypatch.setattr(selection, "MOST_ROUNDS", 3)
+    monkeypatch.setattr(pipeline, "candidates", few)
     case = single("motor_lag")
     found, _ = answer(case)
     with pytest.raises(AssertionError):
@@ -50,8 +55,8 @@ def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch:
 def test_with_the_decision_inverted_a_null_is_given_causes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only causes that promise something are refitted; on a null none does, so that check is taken out as well."""
     monkeypatch.setattr(selection, "better", inverted)
+    monkeypatch.setattr(pipeline, "candidates", few)
     monkeypatch.setattr(selection, "worth_a_refit", lambda *_: -1e9)
-    monkeypatch.setattr(selection, "MOST_ROUNDS", 2)
     monkeypatch.setattr(pipeline, "pruned", lambda shooting, model: model)
     found, _ = answer(of_class("null", 0))
     assert found.findings

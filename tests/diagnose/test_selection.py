@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import pytest
 
-from quadid.diagnose.log_evidence import better, calibration, relevant
+from quadid.diagnose.log_evidence import better, relevant
 from quadid.diagnose.model import Model, extend, without
 from quadid.diagnose.score_test import Everything
 from quadid.diagnose.selection import pruned, select
@@ -32,7 +33,7 @@ def named(*labels: str) -> Model:
 
 
 def answer(a: Model, b: Model) -> bool:
-    return better(b, a, calibration([a, b]))
+    return better(b, a)
 
 
 def selected(known: Model | None) -> Model:
@@ -58,8 +59,6 @@ def test_what_gains_in_a_single_block_is_not_relevant() -> None:
     held_out = named().held_out.copy()
     held_out[1:] = lag.held_out[1:]
     held_out[0] += 1e6
-    from dataclasses import replace
-
     assert not relevant(replace(named(), held_out=held_out), lag)
 
 

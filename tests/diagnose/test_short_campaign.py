@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from quadid.flight import OUTSIDE
+from quadid.parameters import NOMINAL_NAMES
 from tests.diagnose.hidden import SECONDS, answer, confident, number, of_class, require_named, require_nothing, single
 
 QUICK = (
@@ -83,6 +84,7 @@ def test_a_flight_without_effects_is_left_alone() -> None:
     found, workings = answer(of_class("null", 0))
     require_nothing(found)
     assert found.validation.extended == found.validation.nominal == pytest.approx(1.0, abs=0.1)
+    assert [p["name"] for p in found.to_dict()["parameters"]] == list(NOMINAL_NAMES)
     assert not workings.remainder.followed
 
 
