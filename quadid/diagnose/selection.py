@@ -27,6 +27,8 @@ ALIKE = 0.8
 """Share of what is lost that a cause of another family should regain by the linear prediction to be looked at."""
 FEWEST_REFITS, MOST_REFITS = 3, 7
 """Fewest and most causes refitted in one round: the prediction is linear, the effects are not."""
+MOST_ROUNDS = 24
+"""Moves after which the search ends: where the catalogue lacks the cause, stand-ins take turns for long."""
 FAR_SEGMENTS = 60
 """Segments on which causes are compared while the misfit is large, and so any difference shows on a few."""
 
@@ -84,7 +86,7 @@ def select(
     stage = Stage.begin(schedule, theta, known)
     rounds: list[Round] = []
     seen = {_key(stage.shooting, stage.model)}
-    while True:
+    while len(rounds) < MOST_ROUNDS:
         report("search", len(rounds) / (len(rounds) + 2.0))
         rounds.append(_round(stage.shooting, stage.model, listed, elsewhere, seen))
         if rounds[-1].accepted is None:
