@@ -72,7 +72,7 @@ def channel_figures(
         labels: what the two simulations are called.
     """
     series = scored.fitted.series
-    share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + DETAIL_POINTS)))
+    share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + 2 * DETAIL_POINTS)))
     whole = thinned(series.measured, int(share * WHOLE_POINTS))
     detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
     out = []
@@ -84,12 +84,16 @@ def channel_figures(
                 {"label": "Whole log", **_stack(scored, whole, here, labels)},
             ]
             shown = views if len(whole) > len(detail) else views[1:]
+            residual = {"label": "Residual, every sample", **_stack(scored, detail, here, labels, residual=True)}
+            shown = [*shown, residual]
             out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
     return out
 
 
-def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], labels: tuple[str, str]) -> JsonDict:
-    """Channels above each other with one time axis."""
+def _stack(
+    scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], labels: tuple[str, str], residual: bool = False
+) -> JsonDict:
+    """Channels above each other with one time axis; with `residual`: measured less simulated."""
     after, before = scored.fitted.series, scored.initial.series
     t = after.t[rows] - after.t[0]
     data, layout = [], dict[str, Any]()
@@ -97,12 +101,16 @@ def _stack(scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], l
         axis = "" if i == 0 else str(i + 1)
         where = {"xaxis": "x", "yaxis": f"y{axis}", "showlegend": i == 0}
         name, measured = CHANNEL_NAMES[c], after.measured[rows, c]
-        low, high = _focus(measured)
-        for role, label, y in (
-            ("measured", "measured", measured),
+        lines = [
             ("before", labels[0], before.simulated[rows, c]),
             ("after", labels[1], after.simulated[rows, c]),
-        ):
+        ]
+        if residual:
+            lines = [(role, label, measured - y) for role, label, y in lines]
+        else:
+            lines.insert(0, ("measured", "measured", measured))
+        low, high = _focus(lines[-1][2] if residual else measured)
+        for role, label, y in lines:
             # A poor first guess may run far away; what leaves the picture need not be kept.
             inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
             line = trace(role, label, None, inside, legendgroup=role, **where)

@@ -6,11 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.parameters import ParameterSet
 from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure
 from quadid.report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth
+from quadid.report.words import parameter_name, status_words
 
 JsonDict = Mapping[str, Any]
 FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
@@ -59,6 +63,8 @@ def parameter_row(
     row = {
         "relative_to": None,
         **parameter,
+        "title": parameter_name(parameter["name"]),
+        "status_words": status_words(parameter),
         "margin": percent(relative_halfwidth(parameter)).replace(" ", "\u00a0"),
         "reason": reason(parameter, stuck).replace(" %", "\u00a0%"),
     }
@@ -84,3 +90,21 @@ def noise_rows(noise: NoiseModel) -> list[dict[str, Any]]:
         {"name": name, "unit": unit, "white": float(white), "slow": float(slow)}
         for name, unit, white, slow in zip(CHANNEL_NAMES, CHANNEL_UNITS, noise.white, noise.slow, strict=False)
     ]
+
+
+def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
+    """Correlations of the parameters: near 1 or -1, the flight hardly separates two of them."""
+    covariance = np.asarray(parameters.covariance)
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.where(sigma > 0.0, sigma, np.inf)
+    correlation = covariance / np.outer(scale, scale)
+    names = list(parameters.names)
+    rows = [
+        [name, *(f"{correlation[i, j]:+.2f}" if i != j else "1" for j in range(len(names)))]
+        for i, name in enumerate(names)
+    ]
+    intro = "Near +1 or -1 the flight hardly separates two parameters: fly what moves one of them alone."
+    return {
+        "id": "correlations", "title": "Correlations", "intro": intro, "figures": [],
+        "tables": [{"head": ["", *names], "rows": rows}],
+    }  # fmt: skip

@@ -92,10 +92,14 @@ class Diagnosed(Outcome):
         return diagnose_verdict(self.result)
 
     def tables(self) -> list[TextTable]:
-        """The findings; none, no table."""
-        from quadid.report.result_tables import finding_table
+        """The findings, then the parameters beside them."""
+        from quadid.report.result_tables import finding_table, parameter_table
 
-        return [finding_table(self.result["findings"])] if self.result["findings"] else []
+        findings, parameters = self.result["findings"], self.result.get("parameters")
+        return [
+            *([finding_table(findings)] if findings else []),
+            *([parameter_table(parameters)] if parameters else []),
+        ]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a finding."""

@@ -28,7 +28,7 @@ _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 def identify_html(done: Identified, truth: Mapping[str, float] | None = None, command: str = LIBRARY) -> str:
     """The HTML report of an identification; `truth` where a simulation knows it."""
-    from quadid.report.identify_page import identify_page
+    from quadid.report.identify_page import correlation_section, identify_page
     from quadid.report.page import render
 
     result, fit = done.result, done.fit
@@ -39,10 +39,17 @@ def identify_html(done: Identified, truth: Mapping[str, float] | None = None, co
             "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
         },
         {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
+        {"name": "taken as known", "value": known(fit.vehicle)},
     ]
     page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows, truth)
+    page["sections"] = [correlation_section(fit.parameters)]
     page["excitation"] = told(fit, [log for log, s in zip(done.logs, done.sets, strict=True) if s.role == "train"])
     return render(page)
+
+
+def known(vehicle: Vehicle) -> str:
+    """Mass and geometry that the result rests on."""
+    return f"mass {vehicle.mass:g} kg, {len(vehicle.rotors)} rotors {vehicle.arm:.3g} m from the centre"
 
 
 def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:

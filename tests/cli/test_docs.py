@@ -25,10 +25,17 @@ def test_the_tutorial_runs_as_written(
     quadid: Cli, repository: Path, tmp_path: Path
 ) -> None:  # fmt: skip
     found = commands(repository / "docs" / "tutorial.md")
-    assert len(found) == 9
+    assert len(found) == 10
+    said = []
     for arguments in found:
         run = quadid(*arguments, cwd=tmp_path)
         assert run.code == 0, (arguments, run.err)
+        said.append(run.out)
+    red, _, green, poor, good = said[4:9]
+    assert "Not to be used yet" in red
+    assert "All 6 parameters identified; the simulation matches a flight it has not seen" in green
+    assert "Not to be used" in poor
+    assert "near what sensor noise alone makes" in good
     for file in ("report.html", "diagnosis.html", "pelican+weak_rotor+rotor_drag.yaml"):
         assert (tmp_path / file).is_file()
 

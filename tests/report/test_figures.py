@@ -29,9 +29,20 @@ def test_rounding_keeps_a_two_thousandth_of_the_range() -> None:
 def test_thinning_keeps_the_peak_of_the_liveliest_channel() -> None:
     log = scored("long", rows=25_000)
     log.fitted.series.measured[12_345, 1] = 40.0
-    whole = next(f for f in channel_figures(log, "x") if f["id"] == "x-rates")["views"][-1]
+    views = {v["label"]: v for f in channel_figures(log, "x") if f["id"] == "x-rates" for v in f["views"]}
+    whole = views["Whole log"]
     assert len(whole["x"]) <= WHOLE_POINTS
     assert max(v for v in whole["data"][3]["y"] if v is not None) == pytest.approx(40.0, abs=0.05)
+
+
+def test_residuals_are_measured_less_simulated() -> None:
+    log = scored("small", rows=100)
+    view = channel_figures(log, "x")[0]["views"][-1]
+    assert view["label"].startswith("Residual")
+    assert [line["role"] for line in view["data"][:2]] == ["before", "after"]
+    after = log.fitted.series
+    expected = after.measured[:, 0] - after.simulated[:, 0]
+    assert np.asarray(view["data"][1]["y"], dtype=float) == pytest.approx(expected, abs=0.01)
 
 
 def test_a_runaway_guess_is_clipped_but_marked_by_leaving_the_picture() -> None:

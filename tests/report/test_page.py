@@ -181,7 +181,7 @@ def test_headline_parameters_units_and_advice_are_there(read: Reader) -> None:
         "4 of 6 parameters identified",
         "quick yaw doublets",
         "kg\u00a0m²",
-        "ratio only to J_zz",
+        "only its ratio to J_zz",
         "Truth",
         "1.05",
     ):
