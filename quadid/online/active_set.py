@@ -89,6 +89,13 @@ class ActiveSet:
             Event(t, "info", "accepted", f"set {accepted.sequence} in force: {accepted.reason}"),
         ]
 
+    def withdraw(self, why: str) -> list[Action]:
+        """Says of the set in force that it is known to be out of date; it stays what there is until the next one."""
+        if self.in_force is None or self.in_force.outdated:
+            return []
+        self.in_force = replace(self.in_force, sequence=self._number(), outdated=why)
+        return [Publish("parameters", self.in_force)]
+
     def hold(self, item: OnlineSet, stop: float) -> OnlineSet:
         """Keeps a set for approval, under a number that stands for it and no other; `stop` as in `accept`."""
         held = replace(item, sequence=self._number(), state=SetState.PENDING)

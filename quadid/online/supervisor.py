@@ -58,6 +58,7 @@ class Supervisor:
         outbox.act(Diagnosed(stop, start, stop, (finding,) if finding is not None else (), verdict))
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
         outbox.say(request.stop, "warning", "finding", text)
+        self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start + 0.1, "the vehicle has changed")
 
     @property
@@ -131,6 +132,7 @@ class Supervisor:
         self._outbox.act(Diagnosed(stop, start, stop, (), "unknown"))
         text = "windows disagree with what was known, for as long as a window: learning anew"
         self._outbox.say(request.stop, "warning", "change", text)
+        self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start, "the vehicle has changed")
 
     def _taken_back(self, reply: FitReply) -> bool:

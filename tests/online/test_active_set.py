@@ -211,3 +211,19 @@ class Machine(RuleBasedStateMachine):
 
 Machine.TestCase.settings = settings(max_examples=60, stateful_step_count=30)
 TestMachine = Machine.TestCase
+
+
+def test_a_set_known_to_be_out_of_date_says_so_once_under_a_number_of_its_own() -> None:
+    sets = ActiveSet("manual")
+    assert sets.withdraw("mass changed") == [], "there is nothing to withdraw"
+    sets.accept(online_set(TRUE), "ann", 1.0, 1.0)
+    before = sets.in_force
+    assert before is not None
+    (action,) = sets.withdraw("mass changed")
+    assert isinstance(action, Publish)
+    assert (action.item.outdated, action.item.state) == ("mass changed", SetState.ACCEPTED)
+    assert action.item.sequence > before.sequence
+    assert sets.withdraw("again") == []
+    sets.accept(online_set(TRUE), "ann", 2.0, 2.0)
+    assert sets.in_force is not None
+    assert not sets.in_force.outdated
