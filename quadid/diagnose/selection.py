@@ -101,6 +101,7 @@ def select(
             stage = far
         accepted = rounds[-1].accepted
         assert accepted is not None
+        seen.add(_key(stage.shooting, accepted.model))
         stage = replace(stage, model=accepted.model).continued()
         seen.add(_key(stage.shooting, stage.model))
     nominal = fit_model(stage.shooting, theta, ()) if stage.model.causes else stage.model
