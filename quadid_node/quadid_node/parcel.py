@@ -86,7 +86,7 @@ def _encoded(value: Any, kind: Any) -> Any:
     if value is None:
         return None
     if kind is Vehicle:
-        return value.model_dump_json()
+        return value.model_dump_json(exclude_unset=True)  # a default that is given is more than a default
     if _is_array(kind):
         array = np.ascontiguousarray(value, dtype="<f8")
         return [list(array.shape), array.tobytes(), bool(value.flags.writeable)]

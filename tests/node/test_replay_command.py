@@ -71,7 +71,7 @@ def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: C
     names = {topic.name: topic.type for topic in file.topics.values()}
     assert names == {
         "quadid/parameters": "quadid_msgs/msg/ParameterSet", "quadid/candidate": "quadid_msgs/msg/ParameterSet",
-        "quadid/diagnosis": "quadid_msgs/msg/Diagnosis",
+        "quadid/diagnosis": "quadid_msgs/msg/Diagnosis", "quadid/health": "quadid_msgs/msg/Health",
     }  # fmt: skip
     stamps = [ns for _, ns, _ in file.messages(file.topics.keys())]
     assert min(stamps) >= 1_700_000_010 * 10**9

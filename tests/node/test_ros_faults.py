@@ -119,7 +119,8 @@ def test_a_power_cut_in_flight_and_signals_while_it_starts(
     with node(history) as restarted:
         assert ear.until(lambda: sets and sets[-1].state == ParameterSet.STATE_STALE, 90.0), restarted.text
         assert restarted.end(signal.SIGTERM)[0] == 0
-    assert (sets[-1].sequence, list(sets[-1].values)) == (last.sequence, list(last.values))
+    assert sets[-1].sequence > last.sequence
+    assert list(sets[-1].values) == list(last.values)
     times = ", ".join(f"{s:.1f}" for s in spent)
     happened(
         13, f"SIGTERM or SIGINT 0.7, 1.5, 3 s after the start: gone after {times} s (measured beside other programs)"
