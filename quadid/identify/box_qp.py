@@ -6,9 +6,8 @@ The library's own solver does the same, but its import takes longer than a short
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 FLAT = 1e-14
 """Curvature, relative to the largest, below which a direction is flat: no step is made along it."""

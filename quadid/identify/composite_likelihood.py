@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, scaled_difference
 from quadid.identify.shooting import Free, Shooting
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Places = list[NDArray[np.intp]]
 
 FEWEST_SEGMENTS = 10

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.attitude_controller import GAIN_NAMES
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 EXPLAINED = 0.9
 """Least share of the variance of every command that the law must explain to be believed."""

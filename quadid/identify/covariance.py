@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.identify.gauss_newton import Prior, prior_terms
 from quadid.identify.shooting import Free, Linearised
 from quadid.parameters import Parameter, ParameterSet, Status, at_bound
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LAG_SECONDS = 2.0
 """Scores of segments up to this far apart may be correlated."""

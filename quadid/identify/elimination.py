@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model.simd import TILE_ROWS
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 VELOCITY = 6
 """Place of the velocity among the directions of an initial state."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.identify.elimination import VELOCITY, Reduced, StatePrior, Whitening
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.simd import (
@@ -23,8 +24,6 @@ from quadid.model.simd import (
 )  # fmt: skip
 
 # isort: on
-
-FloatArray = NDArray[np.float64]
 
 
 def reduce_segments(

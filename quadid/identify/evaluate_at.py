@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.covariance import parameter_set, uncertainty
 from quadid.identify.fit import FIT_SECONDS, Fit
@@ -14,10 +13,9 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 def fit_at(

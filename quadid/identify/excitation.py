@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.identify.answer import final_answer
@@ -26,10 +25,9 @@ from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0

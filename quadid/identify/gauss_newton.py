@@ -6,14 +6,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.box_qp import least_within
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray as FloatArray
 
 PRIOR_SIGMA_LINEAR = 10.0
 """Weak prior of an effect parameter: this many typical sizes."""

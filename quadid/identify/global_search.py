@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.shooting import RIDGE, Free, Shooting
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 RESOLUTION = 0.5

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout, Segments
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 LEAK_SECONDS = 8.0
 """Time in which dead-reckoned velocity is forgotten."""

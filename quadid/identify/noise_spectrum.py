@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LOWEST = 3.0
 """Frequency [Hz] below which residual power is not counted as noise."""

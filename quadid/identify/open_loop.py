@@ -17,10 +17,10 @@ from quadid.identify.initial_states import retract
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES, N_STATE
 from quadid.model.rollout import Rollout, Segments
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}

@@ -8,12 +8,10 @@ Experiments* (1972).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.errors import ParameterError
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 def d_optimal(information: FloatArray, known: FloatArray, blocks: int) -> list[int]:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.controller_gains import Autopilot
@@ -18,10 +17,9 @@ from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import euler
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 OUTPUT_NAMES = ("phi", "theta", "psi", "p", "q", "r", "a_x", "a_y", "a_z")
 """The paper's outputs."""

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from quadid.model.layout import Entry
 from quadid.parameters import NOMINAL_NAMES
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,10 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 class Stop(StrEnum):

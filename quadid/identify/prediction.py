@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identify.open_loop import QUANTITIES, OpenLoop, lengths
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 HORIZONS = (1, 10, 50)
 SUM_TO = 50

@@ -11,13 +11,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.open_loop import QUANTITIES
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 ORDER = 4
 """Differences of this order leave white noise and take smooth motion away."""
 MEAN_LENGTH = math.sqrt(8.0 / math.pi)

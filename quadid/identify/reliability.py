@@ -20,8 +20,7 @@ from quadid.identify.gauss_newton import Polished, Prior, bounded_step, default_
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.shooting import Free, Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 BLOCKS = 6
 """Blocks of time that are compared; enough that their spread is known to a third."""

@@ -13,15 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.run_errors import STAGES, RunErrors
 from quadid.model.layout import Layout
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SIZES = (6, 15, 30, 60)
 """Numbers of terms that are tried."""

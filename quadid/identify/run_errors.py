@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 STAGES = ((0.1,), (0.1, 0.2, 0.3), (0.1, 0.2, 0.3, 0.4, 0.5))
 """Times after the start [s] at which errors count, near ones first: there even a poor start is nearly linear."""

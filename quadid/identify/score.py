@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.initial_states import InitialStates
@@ -18,10 +17,9 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SCORE_SECONDS = 1.0
 """Length of the simulated stretches that a set is scored on [s], whatever the fit used."""

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.identify.initial_states import InitialStates
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 _LONGEST_STEP = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)
 """Longest step of an initial state: rad, rad/s, m/s, m."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.types import FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,9 @@ from quadid.model.kernel import LANES
 from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout, Segments, shared_rollout
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 LEAD_SECONDS = 0.2
 """Stretch before a segment in which filters and delays settle."""

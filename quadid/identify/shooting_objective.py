@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.shooting import Shooting
 from quadid.model.kernel import LANES
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SEGMENTS = 400
 """Most segments, spread evenly."""

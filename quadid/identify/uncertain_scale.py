@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.covariance import Uncertainty
 from quadid.identify.gauss_newton import Prior, scaled_difference
 from quadid.identify.shooting import Free
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 
 def with_uncertain_scale(
