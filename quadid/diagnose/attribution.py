@@ -45,7 +45,7 @@ _ITERATIONS = 4
 
 def untidy_names(listed: Sequence[Candidate]) -> list[str]:
     """Entries of the catalogue that may be a little off on any vehicle; changes at a moment are events, not clutter."""
-    return all_names([c for c in listed if c.timed is None and not EFFECTS[c.effect].needs])
+    return all_names([c for c in listed if c.timed is None and not c.refines and not EFFECTS[c.effect].needs])
 
 
 def without_in_clutter(

@@ -14,6 +14,7 @@ from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
 from quadid.identify.covariance import uncertainty
 from quadid.identify.shooting import Shooting
+from quadid.model.layout import Entry
 
 MOST_ALTERNATIVES = 4
 STEP_SIGMA = 3e-4
@@ -28,7 +29,7 @@ def describe(
 ) -> tuple[Finding, ...]:
     """Findings in the order of their worth; those `believed` are confident."""
     sigma = _sigmas(search.model)
-    return tuple(_finding(shooting, search, w, sigma, w.cause in believed) for w in worth)
+    return tuple(_finding(shooting, search, w, sigma, w.cause in believed) for w in worth if not w.cause.refines)
 
 
 def _sigmas(model: Model) -> dict[str, float]:
@@ -69,6 +70,7 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
         return (
             FoundParameter("rotor", "", rotor, (rotor, rotor)),
             FoundParameter("loss", "", value, (value - half, value + half)),
+            *_drag_loss(shooting, model, entry, sigma),
         )
     if cause.effect == "imu_lag":
         entry = shooting.layout.entry(cause.names[0])
@@ -76,22 +78,34 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
         low = 1.0 / (value + half)
         high = 1.0 / (value - half) if value > half else math.inf
         return (FoundParameter("cutoff", "Hz", 1.0 / max(value, 1e-9), (low, high)),)
-    out = []
-    values = shooting.layout.read_effect(model.theta, cause.effect)
+    out: list[FoundParameter] = []
     for p in spec.parameters:
-        if p.name not in values:  # an optional number that was not freed
+        entry = shooting.layout.entry(f"{cause.effect}.{p.entry or p.name}")
+        if p.optional and entry.name not in sigma:
             continue
-        value = values[p.name]
-        half = Z95 * _sigma(p.name, sigma.get(f"{cause.effect}.{p.entry or p.name}", 0.0))
+        base = next((f for f in out if f.name == p.beside), None)
+        value = float(model.theta[entry.index]) + (base.value if base else 0.0)
+        spread = math.hypot(sigma.get(entry.name, 0.0), sigma[f"{cause.effect}.{p.beside}"] if base else 0.0)
+        half = Z95 * _sigma(p.name, spread)
         out.append(FoundParameter(p.name, p.unit, value, (value - half, value + half)))
     return tuple(out)
+
+
+def _drag_loss(shooting: Shooting, model: Model, loss: Entry, sigma: Mapping[str, float]) -> tuple[FoundParameter, ...]:
+    """What a weak rotor's drag torque lost by itself, where the data asked for it."""
+    extra = shooting.layout.entry(loss.name.replace("loss", "extra"))
+    if extra.name not in sigma:
+        return ()
+    value = float(model.theta[loss.index] + model.theta[extra.index])
+    half = Z95 * math.hypot(sigma[loss.name], sigma[extra.name])
+    return (FoundParameter("drag_loss", "", value, (value - half, value + half)),)
 
 
 def _sigma(name: str, from_data: float) -> float:
     """Standard deviation of a number: of the scan for a moment, widened by the steps of real loops for a lag."""
     if name == "time":
         return TIME_SIGMA
-    return math.hypot(from_data, STEP_SIGMA) if name in ("tau", "delay") else from_data
+    return math.hypot(from_data, STEP_SIGMA) if name in ("tau", "tau_down", "delay") else from_data
 
 
 def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[Alternative, ...]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import EFFECTS, NEVER
+from quadid.effects import EFFECTS, NEVER, Effect
 from quadid.model.layout import Layout, places
 
 FloatArray = NDArray[np.float64]
@@ -22,10 +22,11 @@ class Candidate:
         effect: name of the effect.
         names: entries it frees.
         starts: non-neutral starting values of those entries, for causes that cannot be linearised at neutral.
-        requires: effect that must be in the model first.
+        requires: effect, or label of a cause, that must be in the model first.
         timed: index of its time entry, when it begins at an unknown moment.
         label: tells candidates of one effect apart.
         split: for causes that show only together (drag in wind): what it stands for once accepted.
+        refines: it frees optional numbers of an effect that is in the model, and shares its finding.
     """
 
     effect: str
@@ -35,6 +36,7 @@ class Candidate:
     timed: int | None = None
     label: str = field(default="")
     split: tuple[Candidate, ...] = ()
+    refines: bool = False
 
     @property
     def family(self) -> str:
@@ -47,28 +49,46 @@ class Candidate:
             object.__setattr__(self, "label", self.effect)
 
 
-def candidates(layout: Layout, has_velocity: bool, has_position: bool) -> list[Candidate]:
+def candidates(
+    layout: Layout, has_velocity: bool, has_position: bool, rotors: Collection[str] = ("commands",)
+) -> list[Candidate]:
     """All causes that these data could show.
 
     Args:
         layout: parameter vector of the vehicle.
         has_velocity: velocity is measured.
         has_position: position is measured.
+        rotors: what their columns are, commands or readings, and battery where the supply voltage is known.
     """
     out = []
+    known = {*rotors, *(["velocity"] if has_velocity else []), *(["position"] if has_position else [])}
     for spec in EFFECTS.values():
         effect = spec.name
-        if ("velocity" in spec.needs and not has_velocity) or ("position" in spec.needs and not has_position):
+        if not known.issuperset(spec.needs):
             continue
         if effect == "weak_rotor":
             for i in range(layout.rotors):
-                out.append(Candidate(effect, (f"{effect}.loss_{i + 1}",), label=f"{effect} {i + 1}"))
+                label = f"{effect} {i + 1}"
+                out.append(Candidate(effect, (f"{effect}.loss_{i + 1}",), label=label))
+                torque = f"{label} drag torque"
+                out.append(Candidate(effect, (f"{effect}.extra_{i + 1}",), requires=label, label=torque, refines=True))
             continue
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
         out.append(Candidate(effect, spec.entries, spec.starts, spec.requires, timed))
+        out += _refinements(spec)
     if has_velocity:
         out.append(_in_wind(out))
     return out
+
+
+def _refinements(spec: Effect) -> list[Candidate]:
+    """Optional numbers of an effect, once it is in the model: those of a payload together, others each alone."""
+    together = [spec.refinements] if spec.timed else [(name,) for name in spec.refinements]
+    return [
+        Candidate(spec.name, names, requires=spec.name, label=f"{spec.name} {names[0].split('.')[1]}", refines=True)
+        for names in together
+        if names
+    ]
 
 
 def _in_wind(listed: list[Candidate]) -> Candidate:

@@ -248,6 +248,11 @@ def extend(
     return replace(fitted, tried={**model.tried, **{c.label: tried for c in new}})
 
 
+def taken_out_causes(causes: Sequence[Candidate], cause: Candidate) -> tuple[Candidate, ...]:
+    """`causes` without `cause` and what requires it."""
+    return tuple(c for c in causes if c.label != cause.label and c.requires not in (cause.effect, cause.label))
+
+
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """Refits `model` without `cause` and what requires it."""
     left = taken_out(shooting, model, cause)
@@ -258,7 +263,7 @@ def taken_out(shooting: Shooting, model: Model, cause: Candidate | None) -> Mode
     """`model` with `cause` and what requires it at neutral, nothing refitted: its deviance stays that of `model`."""
     if cause is None:
         return model
-    left = tuple(c for c in model.causes if c.label != cause.label and c.requires != cause.effect)
+    left = taken_out_causes(model.causes, cause)
     theta = model.theta.copy()
     for c in model.causes:
         if c not in left:

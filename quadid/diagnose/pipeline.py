@@ -29,6 +29,7 @@ from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
+from quadid.model.supply import with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, Parameter
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -95,6 +96,7 @@ def diagnose(
     check_windows(windows)
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
+    vehicle = with_reference_voltage(vehicle, windows)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     begun, search = _select(windows, begun, report)
     decisive = search.shooting
@@ -192,9 +194,16 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     schedule = [*(s for s in schedule if s.count >= FEWEST_SEGMENTS), short]
     elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
-    listed = candidates(short.layout, short.has_velocity, short.channels >= 15)
+    listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
     return _Begun(short, schedule, first.theta, flexible.theta, elsewhere, listed)
+
+
+def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
+    """What rotor columns are, and whether the voltage that scales commands is known."""
+    readings = vehicle.command.sampling == "instant"
+    known = vehicle.reference_voltage is not None and all(w.battery is not None for w in windows)
+    return ["readings" if readings else "commands", *(["battery"] if known else [])]
 
 
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
-from quadid.diagnose.model import Model, settled_states
+from quadid.diagnose.model import Model, settled_states, taken_out_causes
 from quadid.identify.shooting import Linearised, Shooting
 
 FloatArray = NDArray[np.float64]
@@ -58,6 +58,12 @@ class _Own(NamedTuple):
         return float(self.g @ np.linalg.solve(self.h, self.g))
 
 
+def _open(model: Model, listed: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates but for refinements of what is not in the model."""
+    there = {c.label for c in model.causes}
+    return [c for c in listed if not c.refines or c.requires in there]
+
+
 @dataclass(frozen=True)
 class Everything:
     """The current model linearised with every candidate's entries free.
@@ -73,7 +79,7 @@ class Everything:
     @classmethod
     def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Everything:
         """Linearises `model` with all of `listed` free."""
-        names = list(dict.fromkeys([*model.free.names, *all_names(listed)]))
+        names = list(dict.fromkeys([*model.free.names, *all_names(_open(model, listed))]))
         theta = unset_times(model.theta, model.effects)
         lin = shooting.linearise(theta, shooting.free(names), settled_states(shooting, model))
         return cls(model, lin, {n: i for i, n in enumerate(names)})
@@ -87,13 +93,13 @@ class Everything:
         """What each of `listed` that is not in the model would do, in the place of `gone` if given; best first."""
         lin, own, risen = self._left(gone)
         present = {c.label for c in self.model.causes}
-        effects = {c.effect for c in self.model.causes} - {gone.effect if gone else ""}
+        there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
         out = []
-        for candidate in listed:
+        for candidate in _open(self.model, listed):
             if (
                 candidate.label in present
                 or any(c.label in present for c in candidate.split)
-                or (candidate.requires and candidate.requires not in effects)
+                or (candidate.requires and candidate.requires not in there)
             ):
                 continue
             mine = np.array([self.place[n] for n in candidate.names])
@@ -104,9 +110,7 @@ class Everything:
     def _left(self, gone: Candidate | None) -> tuple[Linearised, _Own, float]:
         """The quadratic, the model's parameters and the rise of the deviance where `gone` is neutral."""
         model = self.model
-        leaving = (
-            [] if gone is None else [c for c in model.causes if c.label == gone.label or c.requires == gone.effect]
-        )
+        leaving = [] if gone is None else [c for c in model.causes if c not in taken_out_causes(model.causes, gone)]
         lost = [n for n in model.free.names if any(n in c.names for c in leaving)]
         kept = [(self.place[n], p) for n, p in zip(model.free.names, model.precision, strict=True) if n not in lost]
         place = np.array([i for i, _ in kept])

@@ -230,7 +230,7 @@ def _rivals(candidate: Candidate, cause: Candidate, alike: bool) -> bool:
 
 
 def _removable(model: Model) -> list[Candidate]:
-    return [c for c in model.causes if not any(x.requires == c.effect for x in model.causes)]
+    return [c for c in model.causes if not any(x.requires in (c.effect, c.label) and x is not c for x in model.causes)]
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class Effect:
         shows: residuals that show it, ``channel: against``; ``channel'`` is the residual's rate of change.
         family: look-alikes, which are compared with each other; default none but itself.
         requires: effect without which it cannot be seen.
-        needs: measured channels without which it cannot be seen.
+        needs: measured channels without which it cannot be seen; rotor columns that are commands, or readings.
         per_log: its values belong to a flight and not to the vehicle.
         memory: it needs a stretch before a segment in which it settles.
         flexible: whether it is free in the model that is to leave only noise; not what doubles another effect or needs
@@ -103,6 +103,11 @@ class Effect:
     def timed(self) -> bool:
         """Whether it begins at an unknown moment."""
         return any(p.name == "time" for p in self.parameters)
+
+    @property
+    def refinements(self) -> tuple[str, ...]:
+        """Names in the parameter vector of its optional numbers."""
+        return tuple(f"{self.name}.{p.entry or p.name}" for p in self.parameters if p.optional)
 
     @property
     def entries(self) -> tuple[str, ...]:

@@ -66,11 +66,22 @@ TABLE: tuple[Effect, ...] = (
         family="drag", stand_in=True, shows=_DRAGS,
     ),
     Effect(
-        "parasitic_drag", "air", (P("c", "1/m", 0.0, 0.0, 0.5, 0.03, start=0.03),),
+        "parasitic_drag", "air",
+        (
+            P("c", "1/m", 0.0, 0.0, 0.5, 0.03, start=0.03),
+            P("c_z", "1/m", 0.0, -0.5, 1.0, 0.03, optional=True, entry="beside_z", beside="c"),
+        ),
         summary="The frame has air drag.",
         sentence="the frame's air drag grows with the square of speed, {c:.3f} 1/m",
         advice="Usual at speed; leaving it out makes a simulated vehicle too fast.",
         family="drag", flexible="with_velocity", shows=(*_DRAGS, "a_z: v_z"),
+    ),
+    Effect(
+        "translational_lift", "air", (P("k", "1/m", 0.0, 0.0, 0.3, 0.02, start=0.02),),
+        summary="Thrust rises in sideways flight.",
+        sentence="thrust rises by {k:.3f} m/s^2 for each (m/s)^2 of sideways speed",
+        advice="Usual at speed: the rotors meet fresh air; leaving it out makes a simulated vehicle sink.",
+        flexible="with_velocity", shows=("a_z: v_x", "a_z: v_y"),
     ),
     Effect(
         "rotor_drag_moment", "air", _axes("h_x h_y", "m", 0.3, 0.02, scale="arm", factor=1e3),
@@ -162,14 +173,14 @@ TABLE: tuple[Effect, ...] = (
         summary="The rotors turn slower as the battery empties.",
         sentence="rotor speed goes with the supply voltage to the power of {exponent:.2f}",
         advice="Compensate commands for voltage, or log measured rotor speeds.",
-        family="step", needs=("battery",), flexible="never", shows=("a_z: time",),
+        family="step", needs=("battery", "commands"), flexible="never", shows=("a_z: time",),
     ),
     Effect(
         "rotor_telemetry_delay", "command", (P("delay", "s", 0.0, 0.0, 0.06, 0.01, start=0.005, factor=1e3),),
         summary="Measured rotor speeds are reported late.",
         sentence="measured rotor speeds are reported {delay:.0f} ms late",
         advice="Look for buffering between the speed controllers and the log.",
-        family="late", flexible="never", shows=_TURNS,
+        family="late", needs=("readings",), flexible="never", shows=_TURNS,
     ),
     Effect(
         "drag_torque_curve", "rotor", (P("growth", "", 0.0, -2.0, 3.0, 0.5),),

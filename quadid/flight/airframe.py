@@ -71,7 +71,8 @@ class Air(NamedTuple):
 
     Attributes:
         drag_x, drag_y: k_x, k_y of rotor_drag [1/s].
-        parasitic: c [1/m].
+        parasitic, parasitic_z: c, c_z [1/m].
+        lift: k of translational_lift [1/m].
         moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the hubs.
         damping_p, damping_q, damping_r: l_p, m_q, n_r [1/s].
         axial: k_z [1/s].
@@ -83,6 +84,8 @@ class Air(NamedTuple):
     drag_x: float
     drag_y: float
     parasitic: float
+    parasitic_z: float
+    lift: float
     moment_x: float
     moment_y: float
     damping_p: float
@@ -249,11 +252,12 @@ def derivative(
         at_hubs = hub_forces(omega, (u, v, w), (p, q, r), changed, body, air)
         force_x, force_y, force_z = at_hubs[0], at_hubs[1], at_hubs[2] - thrust
         roll, pitch, yaw = roll + at_hubs[3], pitch + at_hubs[4], yaw + at_hubs[5]
-    if air.parasitic != 0.0:
-        flat_plate = body.mass * air.parasitic * np.sqrt(u * u + v * v + w * w)
-        force_x -= flat_plate * u
-        force_y -= flat_plate * v
-        force_z -= flat_plate * w
+    force_z -= body.mass * air.lift * (u * u + v * v)
+    if air.parasitic != 0.0 or air.parasitic_z != 0.0:
+        pressure = body.mass * np.sqrt(u * u + v * v + w * w)
+        force_x -= pressure * air.parasitic * u
+        force_y -= pressure * air.parasitic * v
+        force_z -= pressure * air.parasitic_z * w
 
     mass = body.mass * mass_factor
     # specific force, body axes

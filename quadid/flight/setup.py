@@ -116,6 +116,10 @@ class _Lookup:
             return self.effects[effect][parameter]
         return EFFECTS[effect].parameter(parameter).neutral
 
+    def beside(self, effect: str, parameter: str, base: str) -> float:
+        """Value of a parameter that is another one's unless it is given."""
+        return self.effects.get(effect, {}).get(parameter, self(effect, base))
+
     def vector(self, effect: str, names: str) -> FloatArray:
         return np.array([self(effect, name) for name in names.split()])
 
@@ -171,6 +175,8 @@ def _air(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Air:
         drag_x=value("rotor_drag", "k_x"),
         drag_y=value("rotor_drag", "k_y"),
         parasitic=value("parasitic_drag", "c"),
+        parasitic_z=value.beside("parasitic_drag", "c_z", "c"),
+        lift=value("translational_lift", "k"),
         moment_x=value("rotor_drag_moment", "h_x"),
         moment_y=value("rotor_drag_moment", "h_y"),
         damping_p=value("rate_damping", "l_p"),
@@ -227,7 +233,6 @@ def prepare(
     n = len(vehicle.rotors)
     complete = check_effects(effects, n)
     value = _Lookup(complete)
-    lag = complete.get("motor_lag", {})
     weak = complete.get("weak_rotor", {})
     efficiency = 1.0 - np.column_stack([rotor_losses(weak, n), rotor_drag_losses(weak, n)])
     mounting = small_rotation(value.vector("imu_misalignment", "x y z"))
@@ -247,7 +252,7 @@ def prepare(
         effects=complete,
         body=_body(vehicle, truth, value),
         air=_air(vehicle, truth, value),
-        drive=Drive(tau=lag.get("tau", 0.0), tau_down=lag.get("tau_down", lag.get("tau", 0.0)), ramp=ramp),
+        drive=Drive(tau=value("motor_lag", "tau"), tau_down=value.beside("motor_lag", "tau_down", "tau"), ramp=ramp),
         events=_events(value, last),
         on_board=on_board,
         efficiency=efficiency,

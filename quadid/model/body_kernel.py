@@ -18,10 +18,11 @@ from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
 # isort: off
 from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
-    C_CGX, C_CGY, C_CPAR, C_D, C_GROUND, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR,
-    C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY,
-    C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q,
-    S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_GROUND, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ,
+    C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ,
+    C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY,
+    S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD,
+    X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -81,12 +82,10 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
             sx, sy = fx * s[C_INVM + lane], fy * s[C_INVM + lane]
         sz = (fz - thrust) * s[C_INVM + lane]
         if rare:
-            speed = s[C_CPAR + lane] * math.sqrt(u * u + v * v + w * w)
-            sx, sy, sz = (
-                sx - speed * u + s[L_FX + lane],
-                sy - speed * v + s[L_FY + lane],
-                sz - speed * w + s[L_FZ + lane],
-            )
+            speed = math.sqrt(u * u + v * v + w * w)
+            flat, tall = s[C_CPAR + lane] * speed, s[C_CPAR_Z + lane] * speed
+            sx, sy = sx - flat * u + s[L_FX + lane], sy - flat * v + s[L_FY + lane]
+            sz += s[L_FZ + lane] - tall * w - s[C_LIFT + lane] * (u * u + v * v)
         if solid:
             sx, sy, sz = sx * im, sy * im, sz * im
         if air:

@@ -39,7 +39,8 @@ Air at each hub: (u_i, v_i, w_i) = (u, v, w) + nu x r_i, r_i from the CG to the 
                         flapping).  Mahony, Kumar & Corke 2012, doi:10.1109/MRA.2012.2206474.
 
 Air at the CG
-    parasitic_drag      force -m c |(u, v, w)| (u, v, w).
+    parasitic_drag      force -m |(u, v, w)| (c u, c v, c_z w).
+    translational_lift  force -m k (0, 0, u^2 + v^2).  Svacha et al. 2017, doi:10.1109/ICUAS.2017.7991501.
     rate_damping        p' -= l_p p,  q' -= m_q q,  r' -= n_r r, beyond what the hubs give.
     wind                (north, east, 0), subtracted from v wherever the air matters.
     ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z in

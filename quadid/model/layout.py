@@ -41,7 +41,7 @@ def places(*effects: str) -> tuple[int, ...]:
 (IMU_PERIOD,) = places("imu_lag")
 (ATT_DELAY,) = places("attitude_delay")
 KX, KY = places("rotor_drag")
-(CPAR,) = places("parasitic_drag")
+(CPAR,) = places("parasitic_drag.c")
 HX, HY = places("rotor_drag_moment")
 LP, MQ, NR = places("rate_damping")
 (KZ,) = places("axial_inflow")

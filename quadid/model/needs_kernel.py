@@ -53,7 +53,7 @@ class Needs(NamedTuple):
 
 
 HUB_ENTRIES = places("rotor_drag", "axial_inflow")
-RARE_ENTRIES = places("parasitic_drag", "ground_effect")
+RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift")
 PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
 FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
 SOLID_ENTRIES = places(

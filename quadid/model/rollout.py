@@ -25,6 +25,7 @@ from quadid.model.rollout_kernel import N_TANGENT, roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
 from quadid.model.simd import LANES, aligned
+from quadid.model.supply import relative_voltage
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -349,25 +350,6 @@ def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
     if found is None:
         found = _SHARED[key] = Rollout(window, vehicle)
     return found
-
-
-def relative_voltage(window: Window, vehicle: Vehicle) -> FloatArray:
-    """Logarithm of the supply voltage over the vehicle's reference at each row; 0 where either is not known.
-
-    Raises:
-        WindowError: the vehicle's rotors follow the voltage, and it is not known.
-    """
-    volts = np.ravel(window.battery) if window.battery is not None else np.empty(0)
-    good = np.flatnonzero(np.isfinite(volts) & (volts > 0.0))
-    if vehicle.reference_voltage is not None and len(good):
-        return np.asarray(np.log(np.interp(np.arange(len(volts)), good, volts[good]) / vehicle.reference_voltage))
-    if vehicle.effects.get("supply_voltage", {}).get("exponent"):
-        raise WindowError(
-            f"{window.name or 'window'}: no supply voltage, which scales this vehicle's commands (supply_voltage)",
-            "battery voltage in the log and reference_voltage in the vehicle file",
-            "log the battery, or leave supply_voltage out",
-        )  # fmt: skip
-    return np.zeros(len(window))
 
 
 def _measured(window: Window, channels: int) -> tuple[FloatArray, NDArray[np.bool_]]:

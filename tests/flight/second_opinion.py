@@ -100,7 +100,9 @@ class SecondOpinion:
             spin_dot += rotor.spin * omega_dot[i]
         torque += p.J_r * spin_sum * np.cross(nu, DOWN)
         torque += self.get("rotor_spin_up", "J") * spin_dot * DOWN
-        drag = -p.mass * self.get("parasitic_drag", "c") * np.linalg.norm(v_body) * v_body
+        c = self.get("parasitic_drag", "c")
+        drag = -p.mass * np.linalg.norm(v_body) * v_body * [c, c, self.get("parasitic_drag", "c_z", c)]
+        drag -= p.mass * self.get("translational_lift", "k") * float(v_body[:2] @ v_body[:2]) * DOWN
         return force + drag, torque
 
     def rhs(self, t: float, s: FloatArray, now: float) -> FloatArray:

@@ -151,7 +151,10 @@ class Independent:
             hub = -self.m / self.n * k * (v_air + cross(nu, arm)) * speed / self.hover
             force = force + hub
             torque += cross(arm, hub) + higher * hub[[1, 0, 2]]
-        return force - self.m * self["parasitic_drag.c"] * np.linalg.norm(v_air) * v_air, torque
+        c = self["parasitic_drag.c"]
+        drag = np.array([c, c, c + self["parasitic_drag.beside_z"]]) * np.linalg.norm(v_air) * v_air
+        lift = self["translational_lift.k"] * float(v_air[:2] @ v_air[:2]) * DOWN
+        return force - self.m * (drag + lift), torque
 
     def loaded(self, t: float) -> bool:
         """Whether the payload has been taken up at time t."""

@@ -21,6 +21,8 @@ EFFECTS: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "command_delay of a lagging motor": ({"motor_lag.tau": 0.03}, {"command_delay.delay": 0.053}),
     "rotor_drag": ({}, DRAG),
     "parasitic_drag": ({}, {"parasitic_drag.c": 0.05}),
+    "parasitic_drag beside z": ({"parasitic_drag.c": 0.05}, {"parasitic_drag.beside_z": 0.03}),
+    "translational_lift": ({}, {"translational_lift.k": 0.02}),
     "rotor_drag_moment": (DRAG, {"rotor_drag_moment.h_x": 0.03, "rotor_drag_moment.h_y": 0.02}),
     "rate_damping": ({}, {"rate_damping.l_p": 2.0, "rate_damping.m_q": 1.0, "rate_damping.n_r": 0.7}),
     "axial_inflow": ({}, {"axial_inflow.k_z": 0.3}),
