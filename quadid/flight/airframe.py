@@ -178,9 +178,11 @@ def hub_forces(
     for i in range(omega.shape[0]):
         x, y, z = body.arms[changed, i, 0], body.arms[changed, i, 1], body.arms[changed, i, 2]
         weight = body.mass * omega[i] / air.hover_sum
-        along = -weight * air.drag_x * (velocity[0] + rates[1] * z - rates[2] * y)
-        across = -weight * air.drag_y * (velocity[1] + rates[2] * x - rates[0] * z)
+        ahead = velocity[0] + rates[1] * z - rates[2] * y
+        aside = velocity[1] + rates[2] * x - rates[0] * z
+        along, across = -weight * air.drag_x * ahead, -weight * air.drag_y * aside
         lost = -weight * air.axial * (velocity[2] + rates[0] * y - rates[1] * x)
+        lost -= body.mass / omega.shape[0] * air.lift * (ahead * ahead + aside * aside)
         fx += along
         fy += across
         fz += lost
@@ -248,11 +250,10 @@ def derivative(
 
     force_x = force_y = 0.0
     force_z = -thrust
-    if air.drag_x != 0.0 or air.drag_y != 0.0 or air.axial != 0.0:
+    if air.drag_x != 0.0 or air.drag_y != 0.0 or air.axial != 0.0 or air.lift != 0.0:
         at_hubs = hub_forces(omega, (u, v, w), (p, q, r), changed, body, air)
         force_x, force_y, force_z = at_hubs[0], at_hubs[1], at_hubs[2] - thrust
         roll, pitch, yaw = roll + at_hubs[3], pitch + at_hubs[4], yaw + at_hubs[5]
-    force_z -= body.mass * air.lift * (u * u + v * v)
     if air.parasitic != 0.0 or air.parasitic_z != 0.0:
         pressure = body.mass * np.sqrt(u * u + v * v + w * w)
         force_x -= pressure * air.parasitic * u

@@ -18,11 +18,11 @@ from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
 # isort: off
 from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
-    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_GROUND, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ,
-    C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ,
-    C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY,
-    S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD,
-    X_VE, X_VN,
+    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HUB, C_HX, C_HY, C_INVM,
+    C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY,
+    C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX,
+    L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW,
+    X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -50,7 +50,7 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
         # Specific force of the unloaded mass; im scales all of it when mass is taken up.
         thrust = b * s2
         sx, sy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0
-        fx, fy, fz, mx, my, mz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        fx, fy, fz, mx, my, mz, u1, v1, cx, cy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if air:
             # Velocity relative to the air, in body axes.  This form of the rotation matrix keeps the heading of the
             # world's axes out of the motion even at the inner stages, where the quaternion is not of unit length.
@@ -65,7 +65,7 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
         if hub:
             # Air at each hub, v + nu x r_i: sums over rotors of omega_i times products of their places, about the
             # middle of the hubs at (cx, cy, cz) from the CG.
-            cx, cy, cz = 0.0, 0.0, s[C_HUB + lane]
+            cz = s[C_HUB + lane]
             if solid:
                 cx, cy = -s[C_CGX + lane], -s[C_CGY + lane]
             u1, v1, w1 = u + q * cz - r * cy, v + r * cx - p * cz, w + p * cy - q * cx
@@ -85,7 +85,14 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
             speed = math.sqrt(u * u + v * v + w * w)
             flat, tall = s[C_CPAR + lane] * speed, s[C_CPAR_Z + lane] * speed
             sx, sy = sx - flat * u + s[L_FX + lane], sy - flat * v + s[L_FY + lane]
-            sz += s[L_FZ + lane] - tall * w - s[C_LIFT + lane] * (u * u + v * v)
+            sz += s[L_FZ + lane] - tall * w
+            # Lift of each hub's own sideways speed, u1 - r y and v1 + r x: means over the hubs of its products.
+            gx, gy, gxx = s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane]
+            gyy, gxy, k, square = s[C_GYY + lane], s[C_GXY + lane], s[C_LIFT + lane], u1 * u1 + v1 * v1
+            up = k * (square + 2.0 * r * (v1 * gx - u1 * gy) + r * r * (gxx + gyy))
+            mx -= k * (square * gy + 2.0 * r * (v1 * gxy - u1 * gyy)) + cy * up
+            my += k * (square * gx + 2.0 * r * (v1 * gxx - u1 * gxy)) + cx * up
+            sz -= up * s[C_INVM + lane]
         if solid:
             sx, sy, sz = sx * im, sy * im, sz * im
         if air:

@@ -35,12 +35,13 @@ Air at each hub: (u_i, v_i, w_i) = (u, v, w) + nu x r_i, r_i from the CG to the 
     axial_inflow        force -(m / N) k_z (0, 0, w_i) omega_i / omega_h at the hub: what momentum theory takes from
                         thrust in climb, to first order.
                         Both with moment r_i x force; omega_h carries the weight: b (omega_h - dead_speed)^2 + offset.
+    translational_lift  force -(m / N) k (0, 0, u_i^2 + v_i^2) at the hub, with its moment.  Svacha et al. 2017,
+                        doi:10.1109/ICUAS.2017.7991501.
     rotor_drag_moment   the force in the rotor plane acts h above the hub: tau_x += h_y F_y, tau_y -= h_x F_x (blade
                         flapping).  Mahony, Kumar & Corke 2012, doi:10.1109/MRA.2012.2206474.
 
 Air at the CG
     parasitic_drag      force -m |(u, v, w)| (c u, c v, c_z w).
-    translational_lift  force -m k (0, 0, u^2 + v^2).  Svacha et al. 2017, doi:10.1109/ICUAS.2017.7991501.
     rate_damping        p' -= l_p p,  q' -= m_q q,  r' -= n_r r, beyond what the hubs give.
     wind                (north, east, 0), subtracted from v wherever the air matters.
     ground_effect       f_i / (1 - (radius_scale r / 4 h)^2), r half the smallest distance of two rotors, h = -z in

@@ -24,11 +24,11 @@ from quadid.model.layout import places
 # isort: off
 from quadid.model.rows import (
     ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_DROP,
-    C_DROP_TIME, C_GROUND, C_HOVER, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR,
-    C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST,
-    C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z,
-    F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ,
-    S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
+    C_DROP_TIME, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ,
+    C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOAD,
+    C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN, F0_X, F0_Y,
+    F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ, S_P, S_Q,
+    S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
 )  # fmt: skip
 
 # isort: on
@@ -56,6 +56,7 @@ class Flight(NamedTuple):
         mass: of the vehicle [kg].
         reach: half the smallest distance between rotors [m], scales ground effect.
         hub: mean z of the hubs [m].
+        plan: means of x, y, x^2, y^2, xy of the hubs.
         t0, dt: of the grid [s].
         span0, span1: first and last time of the log [s].
     """
@@ -63,6 +64,7 @@ class Flight(NamedTuple):
     mass: float
     reach: float
     hub: float
+    plan: tuple[float, float, float, float, float]
     t0: float
     dt: float
     span0: float
@@ -111,7 +113,9 @@ def body_constants(theta: FloatArray, flight: Flight, rotors: int, s: FloatArray
         each = flight.mass * hover
         s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane] = each * th[ix.KX], each * th[ix.KY], each * th[ix.KZ]
         s[C_CPAR + lane], s[C_CPAR_Z + lane] = th[ix.CPAR], th[ix.CPAR] + th[BESIDE_Z]
-        s[C_HX + lane], s[C_HY + lane], s[C_LIFT + lane] = th[ix.HX], th[ix.HY], th[LIFT]
+        s[C_HX + lane], s[C_HY + lane], s[C_LIFT + lane] = th[ix.HX], th[ix.HY], flight.mass * th[LIFT]
+        s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane] = flight.plan[0], flight.plan[1], flight.plan[2]
+        s[C_GYY + lane], s[C_GXY + lane] = flight.plan[3], flight.plan[4]
         s[C_LP + lane], s[C_MQ + lane], s[C_NR + lane] = th[ix.LP], th[ix.MQ], th[ix.NR]
         s[C_TURNING + lane] = 1.0 - th[UNCOUPLED]
         s[C_WN + lane], s[C_WE + lane] = th[ix.WN], th[ix.WE]

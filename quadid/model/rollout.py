@@ -127,7 +127,8 @@ class Rollout:
         self.window, self.vehicle = window, vehicle
         self.mass = vehicle.mass
         positions = vehicle.rotor_positions
-        hub = float(positions[:, 2].mean())
+        hub, (x, y) = float(positions[:, 2].mean()), positions[:, :2].T
+        plan = (float(x.mean()), float(y.mean()), float(x @ x) / rotors, float(y @ y) / rotors, float(x @ y) / rotors)
         self.geometry = np.column_stack([positions[:, :2], vehicle.spins, positions[:, 2] - hub])
         gaps = [float(np.linalg.norm(a - b)) for i, a in enumerate(positions) for b in positions[:i]]
         self.reach = 0.5 * min(gaps)
@@ -142,7 +143,7 @@ class Rollout:
             window.dt,
         )  # fmt: skip
         self._mask = self.valid.astype(np.float64)
-        self.flight = Flight(self.mass, self.reach, hub, window.t0, window.dt, *window.log_span)
+        self.flight = Flight(self.mass, self.reach, hub, plan, window.t0, window.dt, *window.log_span)
         self._tables: OrderedDict[tuple[bytes, float, bool], FloatArray] = OrderedDict()
 
     def __len__(self) -> int:

@@ -89,7 +89,9 @@ class SecondOpinion:
             lifting = p.b * max(omega[i] - self.get("thrust_curve", "dead_speed"), 0.0) ** 2
             thrust = power * (1.0 - loss * weak) * lift * (lifting + self.get("thrust_curve", "offset"))
             arm = np.array(rotor.position) - cg
-            air = -p.mass / self.n * k * (v_body + np.cross(nu, arm)) * omega[i] / self.omega_h
+            at_hub = v_body + np.cross(nu, arm)
+            air = -p.mass / self.n * k * at_hub * omega[i] / self.omega_h
+            air[2] -= p.mass / self.n * self.get("translational_lift", "k") * float(at_hub[:2] @ at_hub[:2])
             pull = air + [0.0, 0.0, -thrust]
             force += pull
             torque += np.cross(arm, pull) + [h_y * air[1], -h_x * air[0], 0.0]
@@ -102,7 +104,6 @@ class SecondOpinion:
         torque += self.get("rotor_spin_up", "J") * spin_dot * DOWN
         c = self.get("parasitic_drag", "c")
         drag = -p.mass * np.linalg.norm(v_body) * v_body * [c, c, self.get("parasitic_drag", "c_z", c)]
-        drag -= p.mass * self.get("translational_lift", "k") * float(v_body[:2] @ v_body[:2]) * DOWN
         return force + drag, torque
 
     def rhs(self, t: float, s: FloatArray, now: float) -> FloatArray:

@@ -148,13 +148,14 @@ class Independent:
         k = np.array([self["rotor_drag.k_x"], self["rotor_drag.k_y"], self["axial_inflow.k_z"]])
         higher = np.array([self["rotor_drag_moment.h_y"], -self["rotor_drag_moment.h_x"], 0.0])
         for arm, speed in zip(arms, omega, strict=True):
-            hub = -self.m / self.n * k * (v_air + cross(nu, arm)) * speed / self.hover
+            wind = v_air + cross(nu, arm)
+            hub = -self.m / self.n * (k * wind * speed / self.hover)
+            hub[2] -= self.m / self.n * self["translational_lift.k"] * float(wind[:2] @ wind[:2])
             force = force + hub
             torque += cross(arm, hub) + higher * hub[[1, 0, 2]]
         c = self["parasitic_drag.c"]
         drag = np.array([c, c, c + self["parasitic_drag.beside_z"]]) * np.linalg.norm(v_air) * v_air
-        lift = self["translational_lift.k"] * float(v_air[:2] @ v_air[:2]) * DOWN
-        return force - self.m * (drag + lift), torque
+        return force - self.m * drag, torque
 
     def loaded(self, t: float) -> bool:
         """Whether the payload has been taken up at time t."""
