@@ -28,7 +28,7 @@ def check_nominal(fitted: dict[str, float], truth: dict[str, float]) -> None:
 
 def test_aerodynamics_at_the_hubs_and_a_lag_are_named_with_the_numbers_of_the_simulator() -> None:
     truth = hummingbird(tau_m=0.045)
-    findings, fitted, result = diagnosed(fly(truth, SECONDS, seed=1))
+    findings, fitted, result = diagnosed(fly(truth, SECONDS, seed=1, reach=1.4))
     check_nominal(fitted, truth)
     m = truth["mass"]
     hover = 4.0 * np.sqrt(m * GRAVITY / (4.0 * truth["k_eta"]))
