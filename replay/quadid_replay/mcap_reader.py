@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,8 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
         notes.append(f"{failed} messages could not be decoded and were dropped")
     if stamps.base_ns:
         notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
-    return assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
+    recording = assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
+    return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
 
 
 def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
