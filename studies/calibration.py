@@ -97,7 +97,12 @@ def _errors(case: Case, found: Diagnosis) -> dict[str, dict[str, float]]:
     for finding in found.findings:
         truth = case.hidden.get(finding.effect)
         for p in finding.parameters:
-            if truth is None or p.name == "rotor" or (finding.effect == "weak_rotor" and _other(finding, truth)):
+            if (
+                truth is None
+                or p.name not in truth
+                or p.name == "rotor"
+                or (finding.effect == "weak_rotor" and _other(finding, truth))
+            ):
                 continue
             name = f"{finding.effect}.{p.name}"
             scaled[name] = _standardised(p, truth[p.name])

@@ -42,7 +42,7 @@ def names_of(answer: dict[str, Any]) -> list[str]:
         if effect == "weak_rotor":
             out.append(f"weak_rotor.loss_{answer['truth'][effect]['rotor']}")
         else:
-            out += [f"{effect}.{p.name}" for p in EFFECTS[effect].parameters]
+            out += EFFECTS[effect].entries
     return out
 
 

@@ -110,14 +110,7 @@ def _cause(listed: list[Candidate], effect: str, values: dict[str, float]) -> Ca
 def _near_truth(shooting: Shooting, model: Model, effect: str, values: dict[str, float]) -> np.ndarray:
     """Start of the oracle: the true effect, nominal parameters of the vehicle file."""
     theta = np.asarray(model.theta).copy()
-    for name, value in values.items():
-        if effect == "weak_rotor":
-            if name == "loss":
-                theta[shooting.layout.entry(f"weak_rotor.loss_{round(values['rotor'])}").index] = value
-        elif effect == "imu_lag":
-            theta[shooting.layout.entry("imu_lag.period").index] = 1.0 / value
-        else:
-            theta[shooting.layout.entry(f"{effect}.{name}").index] = value
+    shooting.layout.write_effects(theta, {effect: values})
     return theta
 
 
