@@ -60,8 +60,8 @@ def test_each_log_reads_as_it_did(data_dir: Path, name: str) -> None:
     [
         ("nanodrone/random_run1.csv", "nanodrone/vehicle.yaml", None, 1, 59.98),
         ("nanodrone/random_run1.csv", "nanodrone/vehicle.yaml", 50.0, 1, 59.82),
-        ("crazyflie_rpm/figure8_20.csv", "crazyflie_rpm/vehicle.yaml", None, 3, 6.96),
-        ("crazyflie_rpm/figure8_20.csv", "crazyflie_rpm/vehicle.yaml", 50.0, 2, 6.64),
+        ("crazyflie_rpm/figure8_20.csv", "crazyflie_rpm/vehicle.yaml", None, 2, 6.99),
+        ("crazyflie_rpm/figure8_20.csv", "crazyflie_rpm/vehicle.yaml", 50.0, 1, 6.82),
         ("crazyflie_rpm/figure8_17_pwm.csv", "crazyflie_rpm/vehicle_pwm.yaml", 50.0, 1, 6.8),
         ("cases/case_010/train.csv", "cases/case_010/vehicle.yaml", 50.0, 1, 119.98),
         ("mcap/crazyflie_figure8_35.mcap", "crazyflie_rpm/vehicle.yaml", 50.0, 1, 5.16),
