@@ -20,8 +20,10 @@ def dragged() -> tuple[Problem, Model]:
     """A flight with rotor drag and its moment, and the model that says so."""
     hidden = {"rotor_drag": {"k_x": 0.3, "k_y": 0.25}, "rotor_drag_moment": {"h_x": 0.03, "h_y": 0.03}}
     problem = fitted(window_with(hidden), clean().shooting.noise)
-    model = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), iterations=12)
-    return problem, extend(problem.shooting, model, cause(problem, "rotor_drag_moment"), iterations=12)
+    start = problem.nominal.theta.copy()
+    start[[problem.shooting.layout.entry(f"rotor_drag.{k}").index for k in ("k_x", "k_y")]] = 0.25
+    model = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), start, iterations=1)
+    return problem, extend(problem.shooting, model, cause(problem, "rotor_drag_moment"), start, iterations=20)
 
 
 def doubts(model: Model) -> list[str]:
