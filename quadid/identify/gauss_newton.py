@@ -130,7 +130,7 @@ def polish(
     states = states or MEASURED
     settled = settled and shooting.start_of(theta, free)[0] in states.starts
     first = _descend(shooting, theta, free, prior, states, iterations, robust, tolerance, settled)
-    if first.outcome is not Convergence.ASTRAY:
+    if first.outcome is not Convergence.ASTRAY and not (states and _worse_than_measured(shooting, free, first)):
         return first
     again = _descend(shooting, first.theta, free, prior, MEASURED, iterations, robust, tolerance, False)
     best = min(again, first, key=lambda p: p.cost)
@@ -186,6 +186,13 @@ def _descend(
             lin = shooting.linearise(theta, free, lin.states)
             spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
+
+
+def _worse_than_measured(shooting: Shooting, free: Free, found: Polished) -> bool:
+    """Whether the states of an unfinished descent cost more than twice what measured ones would."""
+    if found.outcome is Convergence.CONVERGED:
+        return False
+    return 2.0 * float(shooting.linearise(found.theta, free).cost.sum()) < float(found.lin.cost.sum())
 
 
 def _leads_on(lin: Linearised) -> bool:
