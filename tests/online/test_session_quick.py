@@ -246,7 +246,7 @@ def test_a_failed_fit_is_told_once_and_the_next_windows_are_learned_from() -> No
     actions = works(session, between(FLIGHT, 0.0, 6.7), lambda r: FitReply(r.number, problem="the worker died"))
     assert len(fits(actions)) == 3
     (event,) = events(actions, "failed")
-    assert (event.t, event.level, event.text) == (4.0, "info", "the worker died")
+    assert (event.t, event.level, event.text) == (4.0, "warning", "the worker died")
     assert (session.status().phase, session.status().reason) == (Phase.FAILED, "the worker died")
     assert session.status().fits == 0
     assert published(works(session, between(FLIGHT, 6.7, 16.0), tells()))
