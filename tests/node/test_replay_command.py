@@ -62,7 +62,7 @@ def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: C
     assert done.returncode == 0, done.stderr
     result: dict[str, Any] = json.loads(done.stdout)
     assert result["schema"] == "quadid.replay/1"
-    assert [s["state"] for s in result["published"]] == ["accepted"]
+    assert [(s["state"], bool(s["outdated"])) for s in result["published"]] == [("accepted", False), ("accepted", True)]
     (diagnosis,) = result["diagnoses"]
     assert diagnosis["findings"][0]["effect"] == "mass_change"
     when = next(p["value"] for p in diagnosis["findings"][0]["parameters"] if p["name"] == "time")
