@@ -25,6 +25,7 @@ class EffectParameter:
         scale: what its size goes with on other airframes.
         factor: to the unit of the sentence.
         optional: stays at neutral until data ask for it beside the effect's other numbers.
+        flexible: free in the model that is to leave only noise, where its effect is; not what doubles d and J_zz there.
         entry: its name in the parameter vector, where that holds another form of it.
         beside: parameter of the same effect which it replaces in part; it is that one's value plus its vector entry,
             and that one's value where a vehicle file leaves it out.
@@ -41,6 +42,7 @@ class EffectParameter:
     scale: Scale = ""
     factor: float = 1.0
     optional: bool = False
+    flexible: bool = True
     entry: str = ""
     beside: str = ""
 
@@ -113,6 +115,12 @@ class Effect:
     def entries(self) -> tuple[str, ...]:
         """Its names in the parameter vector, times and optional ones left out."""
         return tuple(f"{self.name}.{p.entry or p.name}" for p in self.parameters if p.name != "time" and not p.optional)
+
+    @property
+    def flexible_entries(self) -> tuple[str, ...]:
+        """Those of `entries` that are free in the model that is to leave only noise."""
+        rigid = {f"{self.name}.{p.entry or p.name}" for p in self.parameters if not p.flexible}
+        return tuple(name for name in self.entries if name not in rigid)
 
     @property
     def starts(self) -> tuple[tuple[float, ...], ...]:

@@ -93,7 +93,8 @@ TABLE: tuple[Effect, ...] = (
         requires="rotor_drag", stand_in=True, shows=("q': v_x", "p': v_y", "p': time", "q': time"),
     ),
     Effect(
-        "rate_damping", "body", _axes("l_p m_q n_r", "1/s", 30.0, 1.0, sign=1),
+        "rate_damping", "body",
+        (*_axes("l_p m_q", "1/s", 30.0, 1.0, sign=1), *_axes("n_r", "1/s", 30.0, 1.0, sign=1, flexible=False)),
         summary="Rotation is damped, by more than the air at each hub.",
         sentence="roll, pitch and yaw rotation is damped by {l_p:.2f}, {m_q:.2f} and {n_r:.2f} 1/s beyond what the "
         "rotors give",

@@ -75,7 +75,7 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     """Everything the catalogue can free at once on these data: the model that leaves only noise."""
     kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
     effects = [e for e in EFFECTS.values() if e.flexible in kinds]
-    out = [*NOMINAL_NAMES, *(n for e in effects for n in e.entries)]
+    out = [*NOMINAL_NAMES, *(n for e in effects for n in e.flexible_entries)]
     losses = [n for n in layout.entries if n.startswith("weak_rotor.loss_")]
     return out + losses[1:]
 
