@@ -69,11 +69,10 @@ TABLE: tuple[Effect, ...] = (
         "parasitic_drag", "air",
         (
             P("c", "1/m", 0.0, 0.0, 0.5, 0.03, start=0.03),
-            P("c_z", "1/m", 0.0, -0.5, 1.0, 0.03, entry="beside_z", beside="c"),
+            P("c_z", "1/m", 0.0, -0.5, 1.0, 0.03, optional=True, entry="beside_z", beside="c"),
         ),
         summary="The frame has air drag.",
-        sentence="the frame's air drag grows with the square of speed, {c:.3f} 1/m in the plane of the rotors and "
-        "{c_z:.3f} across it",
+        sentence="the frame's air drag grows with the square of speed, {c:.3f} 1/m",
         advice="Usual at speed; leaving it out makes a simulated vehicle too fast.",
         family="drag", flexible="with_velocity", shows=(*_DRAGS, "a_z: v_z"),
     ),

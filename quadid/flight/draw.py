@@ -16,7 +16,7 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "imu_lag": {"cutoff": (4.0, 12.0)},
     "attitude_delay": {"delay": (0.015, 0.06)},
     "rotor_drag": {"k_x": (0.12, 0.45), "k_y": (0.12, 0.45)},
-    "parasitic_drag": {"c": (0.01, 0.06), "c_z": (0.01, 0.06)},
+    "parasitic_drag": {"c": (0.01, 0.06)},
     "translational_lift": {"k": (0.005, 0.03)},
     "rotor_drag_moment": {"h_x": (0.01, 0.05), "h_y": (0.01, 0.05)},
     "rate_damping": {"l_p": (0.3, 2.0), "m_q": (0.3, 2.0), "n_r": (0.1, 0.6)},
