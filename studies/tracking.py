@@ -159,12 +159,12 @@ def track(
         for _ in range(EVERY):
             for i in range(rotors):
                 omega[i] = u[i] + keep * (omega[i] - u[i])
-            rotor_wrench(omega, efficiency, body, wrench)
+            rotor_wrench(omega, efficiency, 0, body, wrench)
             for stage in range(4):
                 dy[:] = 0.0
                 reach = (0.0, 0.5, 0.5, 1.0)[stage] * DT
                 at = y + reach * stages[stage - 1] if stage > 0 else y
-                derivative(at, wrench, 1.0, 1.0, 0, push, body, air, odd, dy)
+                derivative(at, omega, wrench, 1.0, 1.0, 0, push, body, air, odd, dy)
                 stages[stage] = dy
             y += DT / 6.0 * (stages[0] + 2.0 * stages[1] + 2.0 * stages[2] + stages[3])
             orthonormalise(y, 6)

@@ -75,6 +75,8 @@ def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
     flown = any(w.velocity is not None for w in windows)
     wide = vehicle.model_copy(update={"residual": candidate_terms(flown)})
     folds = _folds(windows)
+    if len(folds) < 2:  # too short for a part to learn from and another to judge
+        return ResidualFit((), {})
     unseen: dict[int, list[float]] = {}
     for held in range(len(folds)):
         judge = RunErrors(folds[held], wide, STAGES[-1], MOST_RUNS)
@@ -116,7 +118,7 @@ def _folds(windows: Sequence[Window]) -> list[list[Window]]:
     groups: list[list[Window]] = [[], []]
     for flight in sorted(flights.values(), key=lambda part: -sum(map(len, part))):
         min(groups, key=lambda group: sum(map(len, group))).extend(flight)
-    return groups
+    return [group for group in groups if group]
 
 
 def _path(windows: Sequence[Window], vehicle: Vehicle, most: int) -> list[tuple[int, FloatArray, list[int]]]:

@@ -67,8 +67,9 @@ class Diagnosed(Outcome):
         """The same physics with residual terms, where those predict better; else None."""
         if self.found.prediction is None:
             return None
+        wiser = self.vehicle.model_copy(update={"residual": self.found.prediction.terms})
         remark = "Residual terms predict better; the physical values are those of the other file."
-        return self.found.prediction.vehicle.with_remark(f"{origin_remark(self._train)}\n{remark}")
+        return wiser.with_remark(f"{origin_remark(self._train)}\n{remark}")
 
     @property
     def prediction_file_name(self) -> str:

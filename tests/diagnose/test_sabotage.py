@@ -10,15 +10,14 @@ import pytest
 from quadid.diagnose import pipeline, selection
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.log_evidence import better
-from quadid.model.layout import Layout
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
 
 
-def without_entry(name: str) -> Callable[[Layout, bool, bool], list[Candidate]]:
+def without_entry(name: str) -> Callable[..., list[Candidate]]:
     """The catalogue less one effect."""
 
-    def fewer(layout: Layout, has_velocity: bool, has_position: bool) -> list[Candidate]:
-        return [c for c in candidates(layout, has_velocity, has_position) if c.effect != name]
+    def fewer(*given: Any) -> list[Candidate]:
+        return [c for c in candidates(*given) if c.effect != name]
 
     return fewer
 
@@ -33,9 +32,9 @@ def test_an_effect_missing_from_the_catalogue_is_not_found(name: str, monkeypatc
         require_named(case, found)
 
 
-def few(layout: Layout, has_velocity: bool, has_position: bool) -> list[Candidate]:
+def few(*given: Any) -> list[Candidate]:
     """Two causes, so that a spoilt search ends."""
-    return [c for c in candidates(layout, has_velocity, has_position) if c.effect in ("motor_lag", "gyro_bias")]
+    return [c for c in candidates(*given) if c.effect in ("motor_lag", "gyro_bias")]
 
 
 def inverted(*arguments: Any) -> bool:

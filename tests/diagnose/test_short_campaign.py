@@ -52,7 +52,7 @@ def test_both_effects_of_a_pair_are_named() -> None:
 
 
 def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
-    """Mass dropped in flight while the battery fades: inflow wins the first round, before the battery is known."""
+    """Mass dropped in flight while the battery fades: together they look like inflow, or drag across the rotors."""
     case = of_class("look_alike", 15)
     assert set(case.expected) == {"mass_change", "battery_sag"}
     found, workings = answer(case)
@@ -60,7 +60,7 @@ def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
     first = workings.search.rounds[0].accepted
     assert first is not None
     assert first.candidate is not None
-    assert first.candidate.label == "axial_inflow", "this case no longer asks for a swap"
+    assert first.candidate.effect not in case.expected, "this case no longer asks for a swap"
 
 
 def test_inflow_too_small_for_segments_of_a_second_is_found_on_longer_ones() -> None:
@@ -68,9 +68,7 @@ def test_inflow_too_small_for_segments_of_a_second_is_found_on_longer_ones() -> 
     assert case.expected == ("axial_inflow",)
     found, workings = answer(case)
     require_named(case, found)
-    first, second, *_ = workings.search.rounds
-    assert first.accepted is None, "this case no longer asks for a look on longer segments"
-    assert second.accepted is not None
+    assert workings.search.shooting.seconds > 1.0, "longer segments decide"
     assert abs(number(found, "axial_inflow", "k_z") - case.hidden["axial_inflow"]["k_z"]) < 0.03
 
 

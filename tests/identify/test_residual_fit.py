@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,11 @@ def test_physics_stay_as_they_are_and_every_candidate_has_a_formula(damped: tupl
     np.testing.assert_array_equal(Layout(wide).initial(wide)[:6], wide.initial)
 
 
-def test_a_flight_too_short_for_one_run_is_refused(damped: tuple[Flight, Flight]) -> None:
+def test_from_a_flight_too_short_to_judge_by_nothing_is_learnt(damped: tuple[Flight, Flight]) -> None:
+    assert fit_residual([damped[0].window.slice(0, 300)], PELICAN).terms == ()
+
+
+def test_flights_without_one_run_of_half_a_second_are_refused(damped: tuple[Flight, Flight]) -> None:
+    first, other = (replace(flight.window.slice(0, 12), name=name) for flight, name in zip(damped, "ab", strict=True))
     with pytest.raises(NotIdentifiableError, match="run"):
-        fit_residual([damped[0].window.slice(0, 12)], PELICAN)
+        fit_residual([first, other], PELICAN)
