@@ -181,7 +181,7 @@ def _padded(window: Window) -> Window:
         accel=None,
         velocity=extended(window.velocity),
         position=extended(window.position),
-        battery=None,
+        battery=extended(window.battery, None),
         attitude_reference=None,
         sampling="held",
     )

@@ -58,6 +58,16 @@ def test_physics_stay_as_they_are_and_every_candidate_has_a_formula(damped: tupl
     np.testing.assert_array_equal(Layout(wide).initial(wide)[:6], wide.initial)
 
 
+def test_runs_of_a_vehicle_whose_rotors_follow_the_battery_know_its_voltage(damped: tuple[Flight, Flight]) -> None:
+    window = damped[0].window.slice(0, 400)
+    sagging = replace(window, battery=np.linspace(12.6, 11.0, len(window))[:, None])
+    known = true_vehicle(damped[0]).model_copy(update={"reference_voltage": 12.0})
+    follows = known.model_copy(update={"effects": {"supply_voltage": {"exponent": 1.0}}})
+    errors = [mean_errors([sagging], v, Layout(v).initial(v), 25)["velocity"] for v in (known, follows)]
+    assert errors[1] > 1.05 * errors[0]  # these rotors did not follow it
+    assert np.isfinite(errors[1])
+
+
 def test_from_a_flight_too_short_to_judge_by_nothing_is_learnt(damped: tuple[Flight, Flight]) -> None:
     assert fit_residual([damped[0].window.slice(0, 300)], PELICAN).terms == ()
 
