@@ -20,6 +20,8 @@ from quadid.vehicle import ParameterPrior, Vehicle
 
 JsonDict = dict[str, Any]
 
+NOTHING_NEW = 0.9
+"""Share of the information that the prior brings, above which the data say nothing."""
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 
@@ -114,8 +116,11 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
 
 
 def answered(parameters: ParameterSet) -> bool:
-    """True when the data say anything beyond the vehicle file about at least one parameter."""
-    return any(p.status is not Status.PRIOR_DOMINATED for p in parameters)
+    """True when the data say anything beyond the vehicle file about at least one parameter.
+
+    A sharp prior may decide a value about which the data say much, too.
+    """
+    return any(p.status is not Status.PRIOR_DOMINATED or p.prior_share < NOTHING_NEW for p in parameters)
 
 
 def fitted_vehicle(fit: Fit) -> Vehicle:
