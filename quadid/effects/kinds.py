@@ -67,7 +67,6 @@ class Effect:
         memory: it needs a stretch before a segment in which it settles.
         flexible: whether it is free in the model that is to leave only noise; not what doubles another effect or needs
             a time.
-        stand_in: may stand for forces and moments outside the catalogue.
         sized: a data sheet bounds it.
         constant_on: kind of channel on which it claims a constant offset.
     """
@@ -85,7 +84,6 @@ class Effect:
     per_log: bool = False
     memory: bool = False
     flexible: Literal["always", "with_velocity", "never"] = "always"
-    stand_in: bool = False
     sized: bool = False
     constant_on: str = ""
 

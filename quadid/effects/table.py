@@ -34,7 +34,7 @@ TABLE: tuple[Effect, ...] = (
         summary="The rotors follow their command with a lag.",
         sentence="the rotors need {tau:.0f} ms to follow a command (first-order lag), seen as late rotation and thrust",
         advice="Usual for real motors; a controller that knows it can lead it.",
-        family="late", stand_in=True, shows=(*_TURNS, "a_z: thrust_rate"),
+        family="late", shows=(*_TURNS, "a_z: thrust_rate"),
     ),
     Effect(
         "command_delay", "command", (P("delay", "s", 0.0, 0.0, 0.12, 0.02, start=0.015, factor=1e3),),
@@ -63,7 +63,7 @@ TABLE: tuple[Effect, ...] = (
         summary="The turning rotors drag against sideways flight.",
         sentence="the rotors drag against sideways flight by {k_x:.2f} and {k_y:.2f} m/s^2 for each m/s",
         advice="Usual; leaving it out makes a simulated vehicle glide too far.",
-        family="drag", stand_in=True, shows=_DRAGS,
+        family="drag", shows=_DRAGS,
     ),
     Effect(
         "parasitic_drag", "air",
@@ -89,7 +89,7 @@ TABLE: tuple[Effect, ...] = (
         sentence="rotor drag acts {h_x:.1f} and {h_y:.1f} mm off the centre of gravity and tilts the vehicle in "
         "sideways flight",
         advice="The rotors sit above or below the centre of gravity; moving the battery changes it.",
-        requires="rotor_drag", stand_in=True, shows=("q': v_x", "p': v_y", "p': time", "q': time"),
+        requires="rotor_drag", shows=("q': v_x", "p': v_y", "p': time", "q': time"),
     ),
     Effect(
         "rate_damping", "body",
@@ -98,14 +98,14 @@ TABLE: tuple[Effect, ...] = (
         sentence="roll, pitch and yaw rotation is damped by {l_p:.2f}, {m_q:.2f} and {n_r:.2f} 1/s beyond what the "
         "rotors give",
         advice="Usual for a large frame; beyond that look for an unmodelled lag.",
-        stand_in=True, shows=("p': p", "q': q", "r': r"),
+        shows=("p': p", "q': q", "r': r"),
     ),
     Effect(
         "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1),),
         summary="Thrust falls when climbing.",
         sentence="thrust falls by {k_z:.2f} m/s^2 for each m/s of climb",
         advice="Usual; matters for climbs and descents.",
-        stand_in=True, shows=("a_z: v_z", "a_z: thrust", "a_z: time"),
+        shows=("a_z: v_z", "a_z: thrust", "a_z: time"),
     ),
     Effect(
         "wind", "air", _axes("north east", "m/s", 30.0, 3.0),
@@ -132,7 +132,7 @@ TABLE: tuple[Effect, ...] = (
         summary="The centre of gravity is off centre.",
         sentence="the centre of gravity lies {x:.1f} mm forward and {y:.1f} mm to the right of the geometric centre",
         advice="Move the battery or the payload, or tell the controller.",
-        family="corner", stand_in=True, shows=_CORNER,
+        family="corner", shows=_CORNER,
     ),
     Effect(
         "mass_change", "flight", _change(
@@ -209,7 +209,7 @@ TABLE: tuple[Effect, ...] = (
         summary="Speeding up the rotors turns the vehicle in yaw.",
         sentence="speeding the rotors up or down turns the vehicle in yaw (rotor inertia {J:.2e} kg m^2)",
         advice="Usual; it makes yaw quicker than drag torque alone would.",
-        stand_in=True, shows=("r': spin_rate",),
+        shows=("r': spin_rate",),
     ),
     Effect(
         "gyro_bias", "sensor", _axes("x y z", "rad/s", 0.5, 0.02),
