@@ -74,7 +74,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: health health-hours truth cases campaign foreign real-logs paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: health health-hours truth cases campaign foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -86,9 +86,6 @@ foreign: venv ## vehicles and logs of others: truth, answers, predictions beside
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results
-
-real-logs: venv ## every recorded flight, identified and set beside what is known
-	$(STUDY) studies.real_logs --out docs/results
 
 health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
 	$(STUDY) studies.health.hours --out docs/results

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -10,7 +11,7 @@ class FlightSet:
     """Flights of one vehicle.
 
     Attributes:
-        vehicle: vehicle file, in the data folder.
+        vehicle: vehicle file, in the data folder, or a path of its own.
         train, unseen: logs, in the data folder; spans as ``log@start:stop``.
         truth: parameters known from elsewhere, each with the interval [low, high] in which the truth lies.
         source: where the truth comes from.
@@ -27,6 +28,7 @@ def _near(value: float, share: float = 0.0) -> tuple[float, float]:
     return value * (1.0 - share), value * (1.0 + share)
 
 
+_VEHICLES = Path(__file__).parents[1] / "vehicles"
 _SQ = {"b": _near(1.983e-5), "J_xx": _near(0.018), "J_yy": _near(0.024), "J_zz": _near(0.036)}
 _X = {"J_xx": _near(0.02297), "J_yy": _near(0.02297), "J_zz": _near(0.04594)}
 _BRUSHED = {"b": _near(2.02e-8, 0.03), "J_xx": (1.5e-5, 2.3e-5), "J_yy": (1.5e-5, 2.3e-5)}
@@ -70,4 +72,8 @@ SETS: dict[str, FlightSet] = {
         ("nanodrone/random_run1.csv", "nanodrone/random_run2.csv", "nanodrone/chirp_run1.csv"),
         ("nanodrone/random_run3.csv",), _NANO, "its authors; others on the same airframe",
     ),
+    "ardupilot log171": FlightSet(
+        f"{_VEHICLES}/log171.yaml", ("ardupilot/log171.bin@76:146",), ("ardupilot/log171.bin@146:216",),
+    ),
+    "px4 ascend": FlightSet(f"{_VEHICLES}/ascend.yaml", ("px4/ascend_cubeorange_test.ulg",), ()),
 }  # fmt: skip

@@ -91,37 +91,35 @@ class Collector:
 
 
 def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[str], command: str) -> str:
-    """Markdown of the whole page: date, command, the table, and what failed or was skipped."""
+    """Markdown of the whole page: command, one row a fault, and what failed or was skipped."""
     rows: Mapping[int, list[Evidence]] = {n: [e for e in evidence if e.row == n] for n in FAULTS}
     green = sum(1 for said in rows.values() if said)
     lines = [
         "# Faults, what is promised, what happened",
         "",
-        f"Written by `{command}`: tests with the real thing failing (`tests/faults` and the tests named below). A "
-        "sentence stands here only when its test passed, with the day; a later run of some of the tests replaces what "
-        "these said.",
+        f"Written by `{command}`: tests with the real thing failing. A sentence stands here only when its test passed; "
+        "of tests of one file the first is quoted. All sentences, with test and day: `faults.json` beside this page.",
         "",
         f"{green} of {len(FAULTS)} rows have evidence.",
         "",
-        "| # | fault | promise | what happened | test | passed |",
+        "| # | fault | promise | what happened | tests | passed |",
         "|---|---|---|---|---|---|",
+        *(_row(number, *FAULTS[number], rows[number]) for number in FAULTS),
     ]
-    for number, (fault, promise) in FAULTS.items():
-        lines += _rows(number, fault, promise, rows[number])
     for title, names in (("Failed", failed), ("Skipped", skipped)):
         if names:
             lines += ["", f"{title}: " + ", ".join(f"`{name}`" for name in sorted(set(names))) + "."]
     return "\n".join(lines) + "\n"
 
 
-def _rows(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> list[str]:
+def _row(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> str:
+    left = f"| {number} | {_cell(fault)} | {_cell(promise)} |"
     if not said:
-        return [f"| {number} | {_cell(fault)} | {_cell(promise)} | **no test of this row passed** | | |"]
-    lines, left = [], (str(number), _cell(fault), _cell(promise))
-    for e in sorted(said, key=lambda e: e.test):
-        lines.append(f"| {' | '.join(left)} | {_cell(e.text)} | `{e.test}` | {e.date} |")
-        left = ("", "", "")
-    return lines
+        return f"{left} **no test of this row passed** | | |"
+    first = {e.test.partition("::")[0]: e for e in sorted(said, key=lambda e: e.test, reverse=True)}
+    quoted = "; ".join(_cell(first[file].text) for file in sorted(first))
+    days = sorted({e.date for e in said})
+    return f"{left} {quoted} | {len({e.test for e in said})} | {' … '.join(dict.fromkeys((days[0], days[-1])))} |"
 
 
 def _cell(text: str) -> str:
