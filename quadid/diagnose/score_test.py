@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
 from quadid.diagnose.model import Model, settled_states, taken_out_causes
+from quadid.identify.gauss_newton import prior_terms
 from quadid.identify.shooting import Linearised, Shooting
 
 FloatArray = NDArray[np.float64]
@@ -43,9 +44,10 @@ class Score:
 
 
 class _Own(NamedTuple):
-    """The model's own parameters: their information with prior (o, o), gradient (o,) and columns.
+    """The model's own parameters: their information and gradient, prior included, (o, o) and (o,), and columns.
 
-    At the optimum of the model the gradient is that of the prior and counts as zero.
+    The gradient counts although it is small at an optimum: only with it is the quadratic a sum of squares, which no
+    step can bring below zero, and a fit that stopped short of its optimum promises no more than there is to gain.
     """
 
     h: FloatArray
@@ -87,11 +89,12 @@ class Everything:
     def loss(self, gone: Candidate) -> float:
         """Predicted rise of the deviance when `gone`, and what requires it, is dropped."""
         _, own, risen = self._left(gone)
-        return risen - own.fall
+        return risen - own.fall + self._unspent()
 
     def scores(self, listed: Sequence[Candidate], gone: Candidate | None = None) -> list[Score]:
         """What each of `listed` that is not in the model would do, in the place of `gone` if given; best first."""
         lin, own, risen = self._left(gone)
+        risen += self._unspent()
         present = {c.label for c in self.model.causes}
         there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
         out = []
@@ -107,16 +110,21 @@ class Everything:
             out.append(replace(found, drop=found.drop - risen, gone=gone))
         return sorted(out, key=lambda s: -s.drop)
 
+    def _unspent(self) -> float:
+        """Fall of the deviance that the fit of the model itself left undone."""
+        return self._left(None)[1].fall
+
     def _left(self, gone: Candidate | None) -> tuple[Linearised, _Own, float]:
         """The quadratic, the model's parameters and the rise of the deviance where `gone` is neutral."""
         model = self.model
         leaving = [] if gone is None else [c for c in model.causes if c not in taken_out_causes(model.causes, gone)]
         lost = [n for n in model.free.names if any(n in c.names for c in leaving)]
-        kept = [(self.place[n], p) for n, p in zip(model.free.names, model.precision, strict=True) if n not in lost]
-        place = np.array([i for i, _ in kept])
+        kept = [i for i, n in enumerate(model.free.names) if n not in lost]
+        place = np.array([self.place[model.free.names[i]] for i in kept])
+        precision, pull, _ = prior_terms(model.free, model.prior, model.theta)
         lin, risen = self._moved(lost)
-        h = lin.gram.sum(axis=0)[np.ix_(place, place)] + np.diag([p for _, p in kept])
-        return lin, _Own(h, (lin.grad - self.lin.grad).sum(axis=0)[place], place), risen
+        h = lin.gram.sum(axis=0)[np.ix_(place, place)] + np.diag(precision[kept])
+        return lin, _Own(h, lin.grad.sum(axis=0)[place] + pull[kept], place), risen
 
     def _moved(self, lost: Sequence[str]) -> tuple[Linearised, float]:
         """The quadratic around the point where entries `lost` are neutral, and by how much it is higher there."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.diagnose.model import Model, extend
+from quadid.diagnose.model import Model, extend, fit_model
 from quadid.diagnose.score_test import Score, screen
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
@@ -84,3 +84,12 @@ def test_a_direction_the_nominal_parameters_explain_promises_nothing() -> None:
     (score,) = screen(problem.shooting, problem.nominal, [whole])
     assert score.drop < 5.0
     assert np.isfinite(score.z).all()
+
+
+def test_a_fit_that_stopped_short_promises_no_more_than_there_is_to_gain() -> None:
+    """Deviance is a sum of squares: no move brings it below zero, wherever the model stands."""
+    problem = clean()
+    short = fit_model(problem.shooting, problem.shooting.layout.initial(problem.shooting.vehicle), (), iterations=1)
+    assert short.deviance > 2.0 * problem.nominal.deviance, "the fit has ended after all"
+    scores = screen(problem.shooting, short, problem.listed)
+    assert max(s.drop for s in scores) < short.deviance
