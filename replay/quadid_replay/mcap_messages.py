@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from quadid_replay.motors import RPM
 
 FloatArray = NDArray[np.float64]
 Signals = list[tuple[str, Sequence[float]]]
+_LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -97,14 +99,21 @@ def _odometry_signals(blocks: Blocks, extra: Any) -> Signals:
     return out
 
 
+def _joint_order(m: Any) -> tuple[int, ...] | None:
+    """Places of the joints in the order of the numbers that end their names (`rotor_1` ...); None where names say none.
+
+    A publisher may list joints in any order (joint_state_publisher sorts them as words: 1, 10, 2).
+    """
+    ends = [_LAST_NUMBER.search(name) for name in m.name]
+    numbers = [int(end[1]) for end in ends if end]
+    if len(numbers) < len(ends) or len({*numbers}) < len(numbers) or numbers == sorted(numbers):
+        return None
+    return tuple(sorted(range(len(numbers)), key=numbers.__getitem__))
+
+
 def _joint_signals(blocks: Blocks, extra: Any) -> Signals:
-    out: Signals = []
-    speed, effort = blocks
-    if len(speed):
-        out.append(("rotor_speed", speed))
-    if len(effort):
-        out.append(("motor_command", effort))
-    return out
+    named = zip(("rotor_speed", "motor_command"), blocks, strict=True)
+    return [(name, [run[i] for i in extra] if extra else run) for name, run in named if len(run)]
 
 
 def _microseconds(stamp: float) -> tuple[int, int]:
@@ -143,7 +152,9 @@ TYPES: dict[str, MessageType] = {
     "geometry_msgs/QuaternionStamped": MessageType(
         lambda m: [_quaternion(m.quaternion)], lambda b, extra: [("attitude", _wxyz(b[0]))]
     ),
-    "sensor_msgs/JointState": MessageType(lambda m: [list(m.velocity), list(m.effort)], _joint_signals),
+    "sensor_msgs/JointState": MessageType(
+        lambda m: [list(m.velocity), list(m.effort)], _joint_signals, _joint_order
+    ),
     "nav_msgs/Odometry": MessageType(
         _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id,
         deciding=((0, 0), (0, 43)),

@@ -130,7 +130,7 @@ def test_columns_are_the_signals_of_each_message(kind: str, seed: int) -> None:
         runs[0][:, [4, 16, 28][seed - 1]] = -1.0
     if seed == 1 and kind == "nav_msgs/Odometry":
         runs[0][:, 0] = np.nan
-    extra = bool(seed % 2)
+    extra = bool(seed % 2) and ((2, 0, 3, 1) if kind == "sensor_msgs/JointState" else True)
     told = SignalColumns(TYPES[kind]).pick(runs, extra)
     assert told is not None
     for row in range(5):

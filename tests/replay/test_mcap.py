@@ -128,6 +128,26 @@ def test_stamps_of_zero_fall_back_to_log_time_and_another_clock_is_shifted(tmp_p
         np.testing.assert_allclose(t, 0.01 * np.arange(100), atol=1e-6, err_msg=name)
 
 
+@pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        (["rotor_10", "rotor_1", "rotor_3", "rotor_2"], [1, 3, 2, 0]),
+        (["motor2_joint", "motor0_joint", "motor3_joint", "motor1_joint"], [1, 3, 0, 2]),
+        (["front", "left", "rear", "right"], [0, 1, 2, 3]),
+        ([], [0, 1, 2, 3]),
+    ],
+)
+def test_joints_are_rotors_in_the_order_of_their_numbers(tmp_path: Path, names: list[str], order: list[int]) -> None:
+    with TopicWriter(tmp_path / "log") as writer:
+        for k in range(60):
+            ns = EPOCH + k * 10_000_000
+            speeds = [100.0 + k, 200.0 + k, 300.0 + k, 400.0 + k]
+            message = {"header": header(ns), "name": names, "position": [], "velocity": speeds, "effort": []}
+            writer.write("rotor_speeds", "sensor_msgs/msg/JointState", message, ns)
+    values = open_log(tmp_path / "log").channels["rotor_speed"].values
+    np.testing.assert_array_equal(values, (100.0 * (np.array(order) + 1.0)) + np.arange(60.0)[:, None])
+
+
 def test_actuators_of_rotors_and_gazebo(tmp_path: Path) -> None:
     text = with_parts(
         "std_msgs/Header header\nfloat64[] position\nfloat64[] velocity\nfloat64[] normalized\n",
