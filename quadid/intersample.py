@@ -10,6 +10,8 @@ which two minutes of flight tell to 0.1 %.
 
 The surplus of the measured angle's change is compared with measured rate and acceleration, frequency by frequency, so
 that kp and kd are read off a flight without knowing any parameter of the vehicle, and speeds get their slope from them.
+A gyro with a wrong scale makes a surplus of the same form as kp, but one of its own on each axis.  Where roll and pitch
+disagree, or their kp would hardly damp, only kd is believed, and kp follows from it as in a well damped loop.
 Motors that lag behind, or a delay, smooth the torque: then nothing is found, and the speeds stay as they were logged,
 unless the vehicle file tells its stabiliser and how often it runs: then that control law gives the slope.
 """
@@ -47,6 +49,10 @@ STEEPEST_PITCH = 1.2
 """Pitch [rad] beyond which Euler's angles are left alone."""
 _UNIT = {"thrust_coefficient": 1.0, "drag_coefficient": 1.0}
 """Torques for the squares of the speeds, where the coefficients are not known."""
+DAMPING = 0.85
+"""Damping ratio of a loop whose kp cannot be told from the gyro's scale: between Butterworth and critical …"""
+LEAST_DAMPING = 0.5
+"""… and the least that is believed of one whose kp can."""
 LEAST_CORRELATION = 0.5
 """Of angular acceleration and rotor moment; below it the speeds do not tell what slope they need."""
 
@@ -107,19 +113,38 @@ def find_feedback(windows: Sequence[Window]) -> Feedback | None:
     if len(spectra) < LEAST_STRETCHES or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
         return None  # too little, or a sensor that always says the same
     shares, covariance = _weighted(spectra)
-    sigma = np.sqrt(np.diag(covariance))
-    evidence = float(shares @ np.linalg.solve(covariance, shares))
-    if evidence < exceeded(FALSE_ALARM, 2) or shares[0] < 0.0 or shares[1] < LEAST_RATE * sigma[1]:
-        return None
     scale = 12.0 / dt**2
-    (proportional, derivative), (sigma_p, sigma_d) = scale * shares, scale * sigma
-    found = Feedback(float(proportional), float(derivative), (float(sigma_p), float(sigma_d)))
-    stable = found.derivative * dt < 1.0 and found.proportional * dt**2 < 1.0
+    found = _feedback(scale * shares, scale**2 * covariance)
+    stable = found is not None and found.derivative * dt < 1.0 and found.proportional * dt**2 < 1.0
     return found if stable else None
 
 
+def _feedback(gains: FloatArray, covariance: FloatArray) -> Feedback | None:
+    """Loop from kp of roll, kp of pitch and the kd of both, as they look if the gyro's scale is right.
+
+    Args:
+        gains: the three, shape (3,).
+        covariance: of them, shape (3, 3).
+    """
+    apart = (gains[0] - gains[1]) ** 2 / (covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+    same = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    precision = np.linalg.inv(covariance)
+    both = np.linalg.inv(same.T @ precision @ same)
+    kp, kd = (float(k) for k in both @ same.T @ precision @ gains)
+    sigma_p, sigma_d = (float(k) for k in np.sqrt(np.diag(both)))
+    strongest = (0.5 * (kd + 2.0 * sigma_d) / LEAST_DAMPING) ** 2 + 2.0 * sigma_p
+    if apart < exceeded(FALSE_ALARM, 1) and 0.0 < kp < strongest:
+        evidence = float(gains @ precision @ same @ both @ same.T @ precision @ gains)
+        told = evidence > exceeded(FALSE_ALARM, 2) and kd > LEAST_RATE * sigma_d
+        return Feedback(kp, kd, (sigma_p, sigma_d)) if told else None
+    kd, sigma_d = float(gains[2]), float(np.sqrt(covariance[2, 2]))
+    kp = (0.5 * kd / DAMPING) ** 2
+    told = kd > np.sqrt(exceeded(FALSE_ALARM, 1)) * sigma_d
+    return Feedback(kp, kd, (2.0 * kp / kd * sigma_d, sigma_d)) if told else None
+
+
 def _spectra(window: Window, every: int) -> list[ComplexArray]:
-    """Rate, its change, surplus of the angle's change, of roll and pitch; (frequencies, 3) of every n-th stretch."""
+    """Rate in roll and in pitch, its change, surplus of the angle's change; (frequencies, 4) of every n-th stretch."""
     if window.gyro is None or window.attitude is None:
         return []
     angles = euler(window.attitude)[:, :2]
@@ -136,13 +161,15 @@ def _spectra(window: Window, every: int) -> list[ComplexArray]:
     for start in range(0, len(columns) - length + 1, every * (length // 2)):
         rows = columns[start : start + length]
         if np.isfinite(rows).all() and np.abs(pitch[start : start + length]).max() < STEEPEST_PITCH:
-            out += [np.fft.rfft(taper * rows[:, axis], axis=0)[1:] for axis in range(2)]
+            for axis in range(2):
+                rate, *others = np.fft.rfft(taper * rows[:, axis], axis=0)[1:].T
+                out.append(np.column_stack([*(rate * (axis == i) for i in range(2)), *others]))
     return out
 
 
 def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, FloatArray]:
-    """Shares of rate and its change in the surplus, with their covariance, from spectra (stretches, frequencies, 3)."""
-    x, y = spectra[:, :, :2], spectra[:, :, 2]
+    """Shares of the rates and their change in the surplus, from spectra (stretches, frequencies, 4); covariance."""
+    x, y = spectra[:, :, :-1], spectra[:, :, -1]
     weights = np.ones(x.shape[1])
     for _ in range(rounds):
         inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)

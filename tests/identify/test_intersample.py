@@ -43,6 +43,25 @@ def test_the_inner_loop_is_read_off_a_flight(fast: Window) -> None:
     assert found.sigma[1] < 0.4 * KD
 
 
+@pytest.mark.parametrize("scale", [(0.0, -0.012), (0.033, -0.007), (-0.03, -0.03)])
+def test_a_wrong_scale_of_the_gyro_is_not_taken_for_feedback_of_the_angle(
+    fast: Window, scale: tuple[float, float]
+) -> None:
+    assert fast.gyro is not None
+    found = find_feedback([replace(fast, gyro=fast.gyro * [1.0 + scale[0], 1.0 + scale[1], 1.0])])
+    assert found is not None
+    assert abs(found.proportional - KP) < 3.0 * found.sigma[0]
+    assert abs(found.proportional - KP) < KP
+    assert abs(found.derivative - KD) < 3.0 * found.sigma[1]
+
+
+def test_a_wrong_scale_of_the_gyro_alone_is_no_feedback() -> None:
+    held = fly_fast(PELICAN, 60.0, 0, KP, KD, act_every=EVERY)
+    assert held.gyro is not None
+    for scale in ([0.97, 1.0, 1.0], [0.97, 0.97, 1.0]):
+        assert find_feedback([replace(held, gyro=held.gyro * scale)]) is None
+
+
 def test_two_windows_of_a_flight_tell_what_one_does(fast: Window) -> None:
     half = len(fast) // 2
     whole, parts = find_feedback([fast]), find_feedback([fast.slice(0, half), fast.slice(half, len(fast))])
