@@ -7,6 +7,10 @@ from typing import NamedTuple
 
 from quadid.sanitise import plain
 
+ALONE = 1.0
+"""An input with several publishers is used when only one of them was heard for this long [s].  One that was killed
+stays listed until its lease ends (20 s with Fast DDS), while its successor already speaks."""
+
 
 class Offer(NamedTuple):
     """One publisher of a topic: the type of its messages, and whether its QoS lets us hear them."""
@@ -20,20 +24,22 @@ class Neighbours:
 
     Attributes:
         notes: by topic.
-        paused: an input has two publishers: taking samples would mix two vehicles.
+        paused: two publishers of an input are heard: taking samples would mix two vehicles.
     """
 
     def __init__(
-        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[Offer]], tell: Callable[[str], None],
+        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[Offer]],
+        unbroken: Callable[[str], float], tell: Callable[[str], None],
     ) -> None:  # fmt: skip
         """Watches the topics `inputs`.
 
         Args:
             inputs: type of messages by full name.
             offered: a topic's publishers.
+            unbroken: for how long [s] a topic's messages have been one publisher's.
             tell: takes a line for people.
         """
-        self._inputs, self._offered, self._tell = dict(inputs), offered, tell
+        self._inputs, self._offered, self._unbroken, self._tell = dict(inputs), offered, unbroken, tell
         self.notes: dict[str, str] = {}
         self.paused = False
 
@@ -46,10 +52,14 @@ class Neighbours:
             self.notes[topic] = text
 
     def count(self, topic: str, publishers: int) -> None:
-        """So many publishers send to an input: two pause it at once, until `look` finds one."""
-        if publishers > 1:
+        """So many publishers send to an input: two are noted, and pause it at once while both are heard."""
+        if publishers <= 1:
+            return
+        if self._unbroken(topic) < ALONE:
             self.paused = True
-            self.note(topic, f"{publishers} publishers on one topic: paused until there is one")
+            self.note(topic, f"{publishers} publishers on one topic: paused until one is heard alone")
+        else:
+            self.note(topic, f"{publishers} publishers on one topic, one of them is heard")
 
     def look(self, deaf: Mapping[str, bool]) -> None:
         """Looks at every topic, once a second.

@@ -133,7 +133,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
-        self._neighbours = Neighbours(inputs, self._offers_on, lambda text: self._log("error", text))
+        self._neighbours = Neighbours(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None

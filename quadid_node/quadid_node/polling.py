@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -21,6 +23,7 @@ class PollingNode(Node):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """As the class that follows."""
         self._polled: list[Subscription[Any]] = []
+        self._broken_at: dict[str, float] = {}
         super().__init__(*arguments, **options)
 
     @property
@@ -34,14 +37,28 @@ class PollingNode(Node):
             kind, topic, _never, qos, raw=True, event_callbacks=NO_SUBSCRIPTION_EVENTS
         )
         self._polled.append(subscription)
-        handle = subscription.handle
+        handle, name, last = subscription.handle, subscription.topic_name, None
 
         def take() -> bytes | None:
+            nonlocal last
             with handle:
                 taken = handle.take_message(kind, True)
-            return None if taken is None else taken[0]
+            if taken is None:
+                return None
+            number = taken[1]["publication_sequence_number"]
+            if number is None or last is None or number != last + 1:
+                self._broken_at[name] = time.monotonic()
+            last = number
+            return bytes(taken[0])
 
         return take
+
+    def unbroken(self, topic: str) -> float:
+        """For how long [s] the messages of a polled topic have been one publisher's, each numbered one above the last.
+
+        Publishers number their own messages, so two that are heard break each other's row; so does a loss.
+        """
+        return time.monotonic() - self._broken_at.get(topic, -math.inf)
 
     def publisher_counts(self) -> dict[str, int]:
         """How many publishers send to each polled topic now; one is counted before its first message can be taken."""
@@ -52,6 +69,7 @@ class PollingNode(Node):
         for subscription in self._polled:
             self.destroy_subscription(subscription)
         self._polled.clear()
+        self._broken_at.clear()
 
 
 def _never(message: bytes) -> None:

@@ -15,7 +15,10 @@ class Topic:
     def __init__(self) -> None:
         self.offers: list[Offer] = [GOOD]
         self.lines: list[str] = []
-        self.neighbours = Neighbours({"/imu": IMU}, lambda topic: self.offers, self.lines.append)
+        self.unbroken = 0.0
+        self.neighbours = Neighbours(
+            {"/imu": IMU}, lambda topic: self.offers, lambda topic: self.unbroken, self.lines.append
+        )
 
     def look(self, *offers: Offer, deaf: bool = False) -> dict[str, str]:
         self.offers = [*offers]
@@ -31,7 +34,7 @@ def topic() -> Topic:
 @pytest.mark.parametrize(
     ("offers", "told"),
     [
-        ([GOOD, GOOD], "2 publishers on one topic: paused until there is one"),
+        ([GOOD, GOOD], "2 publishers on one topic: paused until one is heard alone"),
         ([Offer(IMU, False)], "its publisher's QoS does not match"),
         ([GOOD, Offer(JOINTS, True)], f"a publisher of another type ({JOINTS} for {IMU}), which is not listened to"),
     ],
@@ -54,6 +57,18 @@ def test_two_publishers_pause_at_once_and_one_goes_on(topic: Topic) -> None:
     assert topic.neighbours.paused
     topic.look(GOOD)
     assert not topic.neighbours.paused
+
+
+def test_a_publisher_that_is_listed_but_not_heard_does_not_pause(topic: Topic) -> None:
+    """One that was killed is listed until its lease ends."""
+    topic.neighbours.count("/imu", 2)
+    assert topic.neighbours.paused
+    topic.unbroken = 1.1
+    assert topic.look(GOOD, GOOD) == {"/imu": "2 publishers on one topic, one of them is heard"}
+    assert not topic.neighbours.paused
+    topic.unbroken = 0.02
+    topic.neighbours.count("/imu", 2)
+    assert topic.neighbours.paused
 
 
 def test_two_types_on_a_topic_do_not_pause(topic: Topic) -> None:

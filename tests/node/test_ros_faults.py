@@ -46,9 +46,11 @@ def test_silence_rivals_and_strangers_on_the_topics(log: Path, tmp_path: Path, e
         with player(log, 1.0) as vehicle:
             assert ear.until(lambda: sets, 60.0), identify.text
             rogue = ear.node.create_publisher(Imu, "imu", 10)
+            timer = ear.node.create_timer(0.1, lambda: rogue.publish(Imu()))
             assert ear.until(lambda: "2 publishers" in message(health, "inputs"), 20.0), message(health, "inputs")
             assert level(health, "inputs") == ERROR
             assert ear.until(lambda: rate(health, "gyro") == 0.0, 10.0), "paused: nothing is taken in"
+            ear.node.destroy_timer(timer)
             ear.node.destroy_publisher(rogue)
             assert ear.until(lambda: level(health, "inputs") == OK, 20.0), identify.text
             happened(15, "second IMU publisher: ERROR naming topic and count, nothing taken in until it was gone again")

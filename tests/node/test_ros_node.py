@@ -317,9 +317,15 @@ def level(health: list[Any], part: str) -> bytes:
     return found
 
 
-def test_a_second_publisher_pauses_it(log: Path, tmp_path: Path, ear: Ear) -> None:
+def test_a_second_publisher_that_speaks_pauses_it_and_a_killed_one_does_not(
+    log: Path, tmp_path: Path, ear: Ear
+) -> None:
     from diagnostic_msgs.msg import DiagnosticArray
     from sensor_msgs.msg import Imu
+
+    def rate() -> float:
+        entry = next(s for s in health[-1].status if s.name.endswith("inputs"))
+        return float(next(v.value for v in entry.values if v.key == "gyro [Hz]"))
 
     with node(tmp_path / "h.sqlite") as identify:
         health = ear.listen("/diagnostics", DiagnosticArray)
@@ -327,10 +333,18 @@ def test_a_second_publisher_pauses_it(log: Path, tmp_path: Path, ear: Ear) -> No
         with player(log, 1.0):
             assert ear.until(lambda: health and level(health, "inputs") == b"\x00", 20.0)
             rogue = ear.node.create_publisher(Imu, "imu", 10)
-            assert ear.until(lambda: "2 publishers" in message(health, "inputs"), 20.0), message(health, "inputs")
+            timer = ear.node.create_timer(0.1, lambda: rogue.publish(Imu()))
+            assert ear.until(lambda: "paused" in message(health, "inputs"), 20.0), message(health, "inputs")
             assert level(health, "inputs") == b"\x02"
+            assert ear.until(lambda: rate() == 0.0, 10.0), "nothing is taken in"
+            ear.node.destroy_timer(timer)
             ear.node.destroy_publisher(rogue)
             assert ear.until(lambda: level(health, "inputs") == b"\x00", 20.0), identify.text
+        # The player was killed: it stays listed until its lease ends.
+        with player(log, 1.0):
+            assert ear.until(lambda: "one of them is heard" in message(health, "inputs") and rate() > 20.0, 15.0), (
+                message(health, "inputs")
+            )
 
 
 @pytest.mark.parametrize(
