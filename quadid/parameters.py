@@ -63,6 +63,7 @@ class Parameter:
         relative_to: for `ratio_only`, the parameter whose ratio to this one is known.
         ci95: 95 % interval; derived from `sigma` by the fit, which may use the log scale.
         prior_share: share of what is known about it that was known before the flight, 0 to 1; NaN when unknown.
+        measured_before: what was known is sharper than its bounds: a `sigma` of the vehicle file, or a thrust stand.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Parameter:
     relative_to: str | None = None
     ci95: tuple[float, float] = (math.nan, math.nan)
     prior_share: float = math.nan
+    measured_before: bool = False
 
 
 @dataclass(frozen=True)

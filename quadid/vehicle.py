@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
+from quadid.proof import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
 from quadid.vehicle_size import impossible_hover, impossible_size
@@ -143,27 +144,6 @@ class Stabiliser(_Strict):
 
     gains: dict[str, float]
     rate: PositiveFloat | None = None
-
-
-class Proof(_Strict):
-    """What shows that the values of this file predict.
-
-    Attributes:
-        verdict: on the result that the file was written by: good (green), fair (amber), poor (red).
-        unseen: flights that were predicted and not fitted.
-        error: largest of their errors over one second, in noise variances (1 is the noise floor).
-    """
-
-    verdict: Literal["good", "fair", "poor"]
-    unseen: tuple[str, ...] = ()
-    error: PositiveFloat | None = None
-
-    @property
-    def lacking(self) -> str:
-        """Why the values are not proven; empty when they are."""
-        if self.verdict == "poor":
-            return "the fit was red" + (f", error {self.error:.3g} (noise floor 1)" if self.error else "")
-        return "" if self.unseen else "no flight was predicted that was not fitted"
 
 
 class Mounting(_Strict):

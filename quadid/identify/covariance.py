@@ -120,6 +120,7 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
             Parameter(
                 e.name, e.unit, value, float(sigma[j]) * (value if log else e.typical), float(initial[e.index]),
                 (e.lower, e.upper), status, partner, ci, float(unc.prior_share[j]),
+                log and float(unc.prior_sigma[j]) < 0.49 * math.log(e.upper / e.lower),
             )
         )  # fmt: skip
     scale = free.jacobian(theta)

@@ -74,7 +74,7 @@ def identify_result(
 
 
 def parameter_entry(p: Parameter) -> JsonDict:
-    """One parameter of the contract; `prior_share` is the share of the information that the prior brings."""
+    """One parameter of the contract, and the share of the information that was known before the flight."""
     entry: JsonDict = {
         "name": p.name,
         "unit": p.unit,
@@ -83,6 +83,7 @@ def parameter_entry(p: Parameter) -> JsonDict:
         "initial": p.initial,
         "status": p.status.value,
         "prior_share": p.prior_share,
+        "measured_before": p.measured_before,
     }
     if p.relative_to is not None:
         entry["relative_to"] = p.relative_to
@@ -137,8 +138,8 @@ def fitted_vehicle(fit: Fit) -> Vehicle:
 def with_values(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
     """The vehicle with these nominal values as initial guess; bounds are kept unless a value lies outside.
 
-    Only identified values carry their standard deviation: a guess, or a number of a model that misses the flight, never
-    becomes a sharp prior of the next fit.
+    Only values that this flight or an earlier one measured carry their standard deviation: a guess, or a number of a
+    model that misses the flight, never becomes a sharp prior of the next fit.
     """
     priors = dict(vehicle.parameters)
     for p in parameters:
@@ -149,7 +150,8 @@ def with_values(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
 
 def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
     value = _rounded(p.value)
-    known = p.status is Status.IDENTIFIED and math.isfinite(p.sigma) and p.sigma > 0.0
+    measured = p.status is Status.IDENTIFIED or (p.status is Status.PRIOR_DOMINATED and p.measured_before)
+    known = measured and math.isfinite(p.sigma) and p.sigma > 0.0
     bounds = given.bounds and (min(given.bounds[0], value), max(given.bounds[1], value))
     return ParameterPrior(initial=value, bounds=bounds, sigma=_rounded(p.sigma) if known else None)
 

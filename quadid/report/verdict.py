@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from quadid.report.words import decided_before
+
 JsonDict = Mapping[str, Any]
 Level = Literal["good", "fair", "poor"]
 
@@ -18,6 +20,9 @@ NEAR_FLOOR = 2.0
 """Up to this multiple of the floor a prediction error may be sensor noise: the floor is that of white noise alone."""
 LEAST_SECONDS = 10.0
 """Flight that it takes to prove anything [s]: ten runs of one second."""
+_TOGETHER = (
+    "To let the flights decide, fit them together, `quadid identify FLIGHT FLIGHT …`, from a file without sigma."
+)
 _DIAGNOSE = "`quadid diagnose` names what the simulation gets wrong and measures what the better model gains."
 MOTION = {
     "b": "climbs and descents",
@@ -62,23 +67,28 @@ def identify_verdict(result: JsonDict) -> Verdict:
     parameters, sets = result["parameters"], result["sets"]
     stuck = at_bounds(result)
     known = [p for p in parameters if p["status"] == "identified" and p["name"] not in stuck]
-    open_ones = [p for p in parameters if p["status"] != "identified"]
+    before = [p["name"] for p in parameters if decided_before(p)]
+    open_ones = [p for p in parameters if p["status"] != "identified" and p["name"] not in before]
     unseen = [s for s in sets if s["role"] == "validate"]
     judged = unseen or sets
     ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
     level, match = _match(ratio, "a flight it has not seen" if unseen else "the fitted flight")
     lacking = _lacking(sets)
-    if not known:
+    if not known and not before:
         level = "poor"
-    elif (open_ones or stuck or lacking) and level == "good":
+    elif (before or open_ones or stuck or lacking) and level == "good":
         level = "fair"
     headline = f"{_count(len(known), len(parameters))} identified; {match}."
-    details = (*lacking, *_details(known, judged))
+    if before and not known and len(before) == len(parameters):
+        headline = f"All {len(before)} parameters known from earlier flights; {match}."
+    rest = f"Decided by the sigmas of the vehicle file rather than by this flight: {', '.join(before)}."
+    details = (*([rest] if before else []), *lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
         found = "The intervals are narrow but wrong: the parameters absorb what the model lacks."
         details = (found, *_details(known, judged)[1:]) if known else details
-    return Verdict(level, headline, details, _next_steps(result, open_ones, stuck, ratio))
+    steps = _next_steps(result, open_ones, stuck, ratio)
+    return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
 
 
 def _lacking(sets: Sequence[JsonDict]) -> tuple[str, ...]:
@@ -196,6 +206,8 @@ def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
     name, status = parameter["name"], parameter["status"]
     if name in stuck:
         return "Rests on a bound of the vehicle file: the data want a value outside, or the model lacks something."
+    if decided_before(parameter):
+        return f"{percent(_number(parameter['prior_share']))} of what is known comes from the vehicle file's sigma."
     if status == "prior_dominated":
         needs = MOTION.get(name)
         return "Not observable in these data; the value is the guess." + (f" It needs {needs}." if needs else "")

@@ -28,4 +28,11 @@ def parameter_name(symbol: str) -> str:
 
 def status_words(parameter: Mapping[str, Any]) -> str:
     """A parameter's status for people; `parameter` as in ``quadid.identify/1``."""
+    if decided_before(parameter):
+        return f"{100.0 * parameter['prior_share']:.0f} % from the file"
     return STATUS_WORDS[parameter["status"]].format(parameter.get("relative_to", "another"))
+
+
+def decided_before(parameter: Mapping[str, Any]) -> bool:
+    """Whether earlier knowledge, such as a `sigma` of the vehicle file, decides the value rather than this flight."""
+    return parameter["status"] == "prior_dominated" and bool(parameter.get("measured_before"))

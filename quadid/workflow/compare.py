@@ -64,7 +64,8 @@ def compare(
     from quadid.identify.fit import FitOptions, fit
 
     names = check_names(methods, objective)
-    described, train, held = settled(logs, validate, vehicle)
+    given = settled(logs, validate, vehicle)
+    described, train, held = given.vehicle, given.train, given.held
     windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]
     check_length(windows)
     noise = fit(windows, described, FitOptions(seed=seeds[0]), progress=lambda _, share: advance("noise", share)).noise

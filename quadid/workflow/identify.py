@@ -56,7 +56,7 @@ class Identified(Outcome):
         from quadid.identify.result import fitted_vehicle
 
         train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
-        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"])
+        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], train)
         return vehicle.with_remark(origin_remark(train))
 
     @property
@@ -138,15 +138,15 @@ def identify(
     from quadid.identify.result import answered, identify_result
 
     check_optimizer(optimizer)
-    described, train, held = settled(logs, validate, vehicle)
+    given = settled(logs, validate, vehicle)
+    described, train, held = given.vehicle, given.train, given.held
     windows = [w for log in train for w in log.windows]
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
     seconds = time.perf_counter() - begin
     autopilot = find_autopilot(windows, described)
     sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
-    warnings = [text for log in (*train, *held) for text in log.warnings]
-    result = identify_result(fit, optimizer, seed, seconds, sets, None, warnings)
+    result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
     for entry, log in zip(result["sets"], (*train, *held), strict=True):
         entry["seconds"] = log.grid.seconds_used
     done = Identified(result, fit, sets, [*train, *held])
@@ -189,21 +189,24 @@ def origin_remark(logs: Sequence[Log]) -> str:
     return "\n".join(plain(line, LONGEST_LINE) for line in lines)
 
 
-def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]]) -> Vehicle:
+def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log]) -> Vehicle:
     """The vehicle with the proof of its values; values of a red fit become guesses without `sigma`.
 
     Args:
         vehicle: with what was found.
         verdict: on the result.
         sets: its scored logs, as in ``quadid.identify/1``.
+        train: the logs that were fitted.
     """
-    from quadid.vehicle import Proof
+    from quadid.proof import Proof
+    from quadid.workflow.overlap import remembered
 
     unseen = [s for s in sets if s["role"] == "validate"]
     errors = [s["mse"]["fitted"] for s in unseen]
     proof = Proof(
         verdict=verdict.level, unseen=tuple(s["log"] for s in unseen),
         error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
+        fitted=remembered(train, vehicle),
     )  # fmt: skip
     values = dict(vehicle.parameters)
     if verdict.level == "poor":

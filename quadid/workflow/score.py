@@ -72,9 +72,10 @@ def score(
     from quadid.identify.result import score_result, units
     from quadid.model.layout import Layout
     from quadid.report.verdict import score_verdict
+    from quadid.workflow.overlap import fitted_before
 
-    described, given, _ = settled(logs, (), vehicle)
-    opened = [log.at(rate) for log in given]
+    given = settled(logs, (), vehicle)
+    described, opened = given.vehicle, [log.at(rate) for log in given.train]
     theta = Layout(described).initial(described)
     windows = [w for log in opened for w in log.windows]
     pooled, each = horizon_scores([log.windows for log in opened], described, theta, list(horizons))
@@ -85,4 +86,9 @@ def score(
     result["no_change"] = {str(h): no_change(windows, described, h) for h in wanted}
     result["units"] = units()
     result["verdict"] = score_verdict(result).level
-    return Scored(result, tuple(text for log in opened for text in log.warnings))
+    seen = [
+        f"{log.name}: the vehicle file was fitted to this flight, so these errors are no proof"
+        for log in opened
+        if fitted_before(described, log)
+    ]
+    return Scored(result, (*seen, *(text for log in opened for text in log.warnings)))

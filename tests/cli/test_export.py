@@ -12,7 +12,8 @@ import pytest
 
 from quadid.report.programs import FORMATS, export
 from quadid.residual import ResidualTerm
-from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, Vehicle
+from quadid.proof import Proof
+from quadid.vehicle import GRAVITY, Command, ParameterPrior, Vehicle
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0

@@ -35,7 +35,7 @@ def test_json_has_exactly_the_keys_of_the_contract(done: tuple[Run, dict[str, An
     assert (result["schema"], result["vehicle"], result["optimizer"]) == ("quadid.identify/1", "pelican", "pso_polish")
     assert 0.0 < result["seconds"] < 300.0
     for p in result["parameters"]:
-        assert list(p) == ["name", "unit", "value", "ci95", "initial", "status", "prior_share"]
+        assert list(p) == ["name", "unit", "value", "ci95", "initial", "status", "prior_share", "measured_before"]
         assert p["unit"] == NOMINAL_UNITS[p["name"]]
     assert [s["role"] for s in result["sets"]] == ["train", "validate"]
     assert [s["log"] for s in result["sets"]] == ["train.mcap", "unseen.csv"]
