@@ -46,8 +46,8 @@ def check_unseen(train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle | N
                     "give another flight to --validate, or parts that do not overlap: LOG@0:60 --validate LOG@60:120",
                 )
 
-    for log in held if vehicle is not None else ():
-        for flight in fitted_before(vehicle, log):
+    for log in held:
+        for flight in () if vehicle is None else fitted_before(vehicle, log):
             raise LogError(
                 f"{log.name} proves nothing: {flight.log}, to which this vehicle file was fitted, is the same flight",
                 "a flight that the file was not fitted to",
@@ -145,11 +145,11 @@ def _runs(rates: FloatArray) -> Marks:
     """Hashes of the `RUN` rows that begin at each row, but for those in which a sensor does not move."""
     if len(rates) < RUN:
         return np.zeros(0, dtype=np.uint64)
-    rounded = np.rint(rates * 10.0**ROUNDED).astype(np.int64)
+    rounded: NDArray[np.int64] = np.rint(rates * 10.0**ROUNDED).astype(np.int64)
     changes = np.cumsum(np.vstack([np.zeros((1, 3), dtype=np.int64), np.diff(rounded, axis=0) != 0]), axis=0)
     moving = np.all(changes[RUN - 1 :] > changes[: len(changes) - RUN + 1], axis=1)
-    axes = _mixed(rounded.astype(np.uint64) + np.arange(3, dtype=np.uint64))
-    rows = _mixed(axes[:, 0] + _mixed(axes[:, 1] + _mixed(axes[:, 2])))
+    axes: Marks = rounded.view(np.uint64)
+    rows = _mixed(axes[:, 0] + _mixed(axes[:, 1] + _mixed(axes[:, 2] + np.uint64(1))))
     out = np.zeros(len(rows) - RUN + 1, dtype=np.uint64)
     for k in range(RUN):
         out = _mixed(out + rows[k : k + len(out)])

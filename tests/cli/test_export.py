@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadid.proof import Proof
 from quadid.report.programs import FORMATS, export
 from quadid.residual import ResidualTerm
-from quadid.proof import Proof
 from quadid.vehicle import GRAVITY, Command, ParameterPrior, Vehicle
 from tests.cli.conftest import Cli, one_line
 
