@@ -129,7 +129,7 @@ faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/res
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser" --faults-page docs/results/faults.md tests
 
 .PHONY: fuzz
-fuzz: $(DEV) ## mutated logs through the four binary readers for an hour; goes on where it stopped, into docs/results/fuzz.md
+fuzz: $(DEV) ## mutated logs of seven formats through their readers for an hour; goes on where it stopped, into docs/results/fuzz.md
 	OPENBLAS_NUM_THREADS=1 nice -n 19 $(BIN)/python -m tests.fuzz
 
 .PHONY: soak

@@ -251,14 +251,14 @@ def _one_message(body: bytes, wanted: Set[int]) -> Iterator[Message]:
 
 
 def _split_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yields opcode, begin and end of each record; raises _DamagedError when one is longer than the data."""
+    """Yields opcode, begin and end of each record; raises _DamagedError where there is no whole one."""
     offset, size = 0, len(data)
     while offset + _RECORD.size <= size:
         kind, length = _RECORD.unpack_from(data, offset)
         begin = offset + _RECORD.size
         offset = begin + length
-        if offset > size:
-            raise _DamagedError("record longer than its chunk")
+        if offset > size or kind == 0:
+            raise _DamagedError("no record, or longer than its chunk")
         yield kind, begin, offset
 
 

@@ -21,6 +21,7 @@ MOST_TYPES, MOST_VARIABLES, LONGEST_NAME = 256, 512, 128
 _NUMBERS = dict(zip("bBhHiIqQfd", ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"), strict=True))
 _STAMP = [("id", "<u2"), ("t", "<u8")]
 _CRC = 4
+_FIRST_LOOK = 16
 
 
 @dataclass
@@ -77,11 +78,19 @@ def collect_usd_records(data: bytes, name: str) -> UsdRecords:
 
 
 def _run(data: bytes, at: int, end: int, declared: _Declared) -> NDArray[np.void]:
-    """The records of one type that follow each other from `at` on, without one of another between them."""
+    """The records of one type that follow each other from `at` on, without one of another between them.
+
+    It is looked for in stretches that double, so that the work is that of its own length, however much follows.
+    """
     layout = declared.layout
     rows = np.frombuffer(data, layout, max((end - at) // layout.itemsize, 0), at)
-    other = np.flatnonzero(rows["id"] != rows["id"][:1])
-    return rows[: other[0]] if len(other) else rows
+    known, looked = 0, _FIRST_LOOK
+    while known < len(rows):
+        other = np.flatnonzero(rows["id"][known:looked] != rows["id"][0])
+        if len(other):
+            return rows[: known + other[0]]
+        known, looked = looked, 2 * looked
+    return rows
 
 
 def _declarations(data: bytes, name: str) -> tuple[dict[int, _Declared], int]:

@@ -30,6 +30,7 @@ def note(runs: list[Run], run: Run) -> None:
     if last and (last["stop"], last["date"], last["revision"]) == (run["start"], run["date"], run["revision"]):
         for key in ("read", "refused", "findings", "seconds"):
             last[key] += run[key]
+        last["slowest"] = max(last["slowest"], run["slowest"])
         last["stop"] = run["stop"]
     else:
         runs.append(run)
@@ -48,24 +49,27 @@ def page(book: Mapping[str, Sequence[Run]]) -> str:
         "# Fuzzing of the binary readers",
         "",
         "Written by `make fuzz`. Small whole logs are mutated with knowledge of their format (bits, integers, records "
-        "lost, doubled, swapped or spliced, length fields, checksums repaired or not, cuts) and opened in process, "
-        "each under a guard of 5 s, 64 MiB of growth and 1 GiB in all. Allowed is a recording that keeps its promises "
-        "(finite values, rising times) or one line of a documented error; anything else, a warning of numpy included, "
-        "is a finding. Input number n is the same everywhere; findings become tests (`tests/fuzz/test_findings.py`).",
+        "lost, doubled, swapped or spliced; lengths that lie, records cut to nothing; message definitions, formats and "
+        "headers that say something else; chunks made to inflate; records or filler repeated up to 1 MiB; checksums "
+        "repaired or not; cuts) and opened in process, each under a guard of 0.5 s of processor time and 3 µs for each "
+        "byte, 64 MiB of growth and 1 GiB in all. Allowed is a recording that keeps its promises (finite values, "
+        "rising times) or one line of a documented error; anything else, a warning of numpy included, is a finding. "
+        "Input number n is the same everywhere; findings become tests (`tests/fuzz/test_findings.py`).",
         "",
         f"Goal: {GOAL:,} inputs of each format.",
         "",
-        "| format | inputs | of the goal | read | refused | findings | inputs/s |",
-        "|---|---|---|---|---|---|---|",
+        "| format | inputs | of the goal | read | refused | findings | inputs/s | slowest, of its time |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for kind in FORMATS:
         runs = book.get(kind, [])
         read, refused, findings = (sum(int(run[k]) for run in runs) for k in ("read", "refused", "findings"))
         tried, seconds = sum(run["stop"] - run["start"] for run in runs), sum(run["seconds"] for run in runs)
         rate = f"{tried / seconds:.0f}" if seconds else ""
+        slowest = f"{max(run['slowest'] for run in runs):.0%}" if runs else ""
         lines.append(
-            f"| {kind} | {tried:,} | {tried / GOAL:.0%} | {read:,} | {refused:,} | {findings} | {rate} |"
-        )  # fmt: skip
+            f"| {kind} | {tried:,} | {tried / GOAL:.0%} | {read:,} | {refused:,} | {findings} | {rate} | {slowest} |"
+        )
     lines += [
         "",
         "## Runs",

@@ -25,11 +25,11 @@ from quadid_replay import open_log
 
 from quadid.errors import QuadidError
 from quadid.window import Recording
-from tests.fuzz.formats import mutated
+from tests.fuzz.formats import FORMATS, mutated
 from tests.fuzz.seeds import seeds
 
-SECONDS = 5.0
-"""Time guard of one input [s of CPU]: inputs have a few kB and take milliseconds."""
+SECONDS, SECONDS_PER_BYTE = 0.5, 3e-6
+"""Time guard of one input [s of CPU]: so much, and so much for each of its bytes; a few kB take milliseconds."""
 GROWTH = 64 << 20
 """Memory guard: the process may not grow by more than this [bytes] over one input …"""
 LIMIT = 1 << 30
@@ -45,12 +45,19 @@ class Finding(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of a range of inputs: read, refused with a documented error, findings, and seconds of this process."""
+    """Result of a range of inputs: read, refused with a documented error, findings, seconds of this process, and the
+    largest share of its allowed time that an input took."""
 
     read: int
     refused: int
     findings: tuple[Finding, ...]
     seconds: float
+    slowest: float
+
+
+def allowed_seconds(size: int) -> float:
+    """Processor time that an input of this size [bytes] may take [s]."""
+    return SECONDS + SECONDS_PER_BYTE * size
 
 
 class _TooSlowError(BaseException):
@@ -58,7 +65,7 @@ class _TooSlowError(BaseException):
 
 
 def _expired(number: int, frame: FrameType | None) -> None:
-    raise _TooSlowError(f"more than {SECONDS:g} s")
+    raise _TooSlowError("more time than its size allows")
 
 
 def _data() -> int:
@@ -108,7 +115,7 @@ def judge(path: Path) -> tuple[bool, str, str]:
     """Opens a log under the guards: whether it was read, what broke in one line (nothing: all well), and where."""
     before = _peak_of_memory(since_now=True)
     try:
-        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, allowed_seconds(path.stat().st_size))
         try:
             read, what, where = _attempt(path)
         finally:
@@ -136,19 +143,23 @@ def run(kind: str, first: int, count: int) -> Outcome:
     began = time.process_time()
     old = signal.signal(signal.SIGPROF, _expired)
     shared = Path("/dev/shm")
-    read = refused = 0
+    read, refused, slowest = 0, 0, 0.0
     findings = []
     try:
         scratch = tempfile.TemporaryDirectory(dir=shared if shared.is_dir() else None)
         with scratch as folder, memory_limit(), warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # numpy's word for numbers that went wrong unnoticed
             path = Path(folder) / "log"
+            path.write_bytes(FORMATS[kind].finish(seeds(kind)[0]))
+            judge(path)  # imports what the reader needs
             for number in range(first, first + count):
                 path.write_bytes(input_of(kind, number))
+                start = time.process_time()
                 good, what, where = judge(path)
+                slowest = max(slowest, (time.process_time() - start) / allowed_seconds(path.stat().st_size))
                 read, refused = read + good, refused + (not good and not what)
                 if what:
                     findings.append(Finding(number, what, where))
     finally:
         signal.signal(signal.SIGPROF, old)
-    return Outcome(read, refused, tuple(findings), time.process_time() - began)
+    return Outcome(read, refused, tuple(findings), time.process_time() - began, slowest)

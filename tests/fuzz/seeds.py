@@ -13,6 +13,9 @@ from mcap_ros2._dynamic import serialize_dynamic
 from quadid_replay.schemas import schema_text
 from quadid_replay.tlog_messages import READERS
 
+from tests.fuzz import rosbag2_format
+from tests.replay import blackbox_writer
+from tests.replay.test_blackbox import rows as blackbox_rows
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import EPOCH, MAVROS, PX4, header, imu, with_parts
 from tests.replay.test_tlog import MAV, Tlog, attitude, heartbeat
@@ -171,14 +174,48 @@ def _usd_seeds() -> list[bytes]:
     return [controller_log(ROWS).closed(), motor_log(ROWS).closed()]
 
 
+def _rosbag2_seeds() -> list[bytes]:
+    """The rows of `rosbag2_format`: an IMU and rotors with their definitions, and an IMU whose type is known."""
+    kinds = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState")
+    messages: list[Callable[[int], Any]] = [
+        imu, lambda ns: {"header": header(ns), "name": ["a", "b", "c", "d"], "velocity": [400.0] * 4}
+    ]  # fmt: skip
+    seeds = []
+    for described in (True, False):
+        rows = []
+        for number, (kind, message) in enumerate(zip(kinds, messages, strict=True), 1):
+            text = schema_text(kind)
+            rows.append(rosbag2_format.row("topics", number, kind.rsplit("/")[-1].lower(), kind, "cdr", ""))
+            if described:
+                rows.append(rosbag2_format.row("message_definitions", number, kind, "ros2msg", text))
+            encode = serialize_dynamic(kind, text)[kind]
+            stamps = [EPOCH + k * 20_000_000 for k in range(ROWS)]
+            rows += [
+                rosbag2_format.row("messages", 100 * number + k, number, ns, encode(message(ns)))
+                for k, ns in enumerate(stamps)
+            ]
+        seeds.append(b"".join(rows))
+    return seeds
+
+
+def _blackbox_seeds() -> list[bytes]:
+    flown = blackbox_rows(24)
+    head = blackbox_writer.header()
+    return [head + b"".join(blackbox_writer.frames(flown, n)) + blackbox_writer.END for n in (8, 4)]
+
+
+_MAKE = {
+    "mcap": _mcap_seeds,
+    "tlog": _tlog_seeds,
+    "dataflash": _dataflash_seeds,
+    "ulog": _ulog_seeds,
+    "rosbag2": _rosbag2_seeds,
+    "usdlog": _usd_seeds,
+    "blackbox": _blackbox_seeds,
+}
+
+
 @lru_cache(maxsize=8)
 def seeds(kind: str) -> tuple[bytes, ...]:
-    """The seeds of a format: mcap, tlog, dataflash, ulog or usdlog."""
-    make = {
-        "mcap": _mcap_seeds,
-        "tlog": _tlog_seeds,
-        "dataflash": _dataflash_seeds,
-        "ulog": _ulog_seeds,
-        "usdlog": _usd_seeds,
-    }
-    return tuple(make[kind]())
+    """The seeds of a format, a key of `tests.fuzz.formats.FORMATS`."""
+    return tuple(_MAKE[kind]())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from pathlib import Path
+from random import Random
 
 import pytest
 import quadid_replay
@@ -13,13 +14,13 @@ from quadid.errors import LogError
 from quadid.window import Recording
 from tests.faults.evidence import Happened
 from tests.fuzz import book, campaign
-from tests.fuzz.formats import FORMATS
+from tests.fuzz.formats import FLOODED, FORMATS
 from tests.fuzz.seeds import seeds
 
 COUNT = 400
 FROM = 10**9
 """Numbers that `make fuzz` does not reach: these inputs are others than those of the page."""
-ROW = {"mcap": 1, "tlog": 3, "dataflash": 3, "ulog": 4}
+ROW = {"mcap": 1, "rosbag2": 1, "tlog": 3, "dataflash": 3, "ulog": 4, "usdlog": 4, "blackbox": 4}
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -37,10 +38,28 @@ def test_mutated_logs_are_read_or_refused_in_one_line(kind: str, happened: Happe
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_seeds_are_whole_logs_whose_records_are_known(kind: str) -> None:
+    form = FORMATS[kind]
     for seed in seeds(kind):
-        assert b"".join(FORMATS[kind].split(seed)) == seed
+        records = form.split(seed)
+        assert b"".join(records) == seed
+        assert any(form.define(Random(n), record) != record for n in range(20) for record in records)
     assert campaign.input_of(kind, 7) == campaign.input_of(kind, 7)
     assert len({campaign.input_of(kind, n) for n in range(50)}) > 40
+
+
+@pytest.mark.parametrize(
+    ("kind", "filler"), [("tlog", b"\xfe"), ("ulog", b"\x00"), ("mcap", b"\x00"), ("dataflash", b"\xa3\x95\x80")]
+)
+def test_inputs_grow_by_filler_and_stay_within_the_largest_size(kind: str, filler: bytes) -> None:
+    longest = 0
+    for number in range(20_000):
+        data = campaign.input_of(kind, number)
+        longest = max(longest, len(data))
+        if filler * (FLOODED[0] // len(filler) // 2) in data:
+            break
+    else:
+        raise AssertionError("no input with this filler")
+    assert longest < 2 * FLOODED[-1]
 
 
 def _greedy(path: Path) -> Recording:
@@ -60,7 +79,7 @@ def _growing(path: Path) -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("reader", "word"), [(_greedy, "MemoryError"), (_slow, "more than 0.2 s"), (_growing, "MiB more")]
+    ("reader", "word"), [(_greedy, "MemoryError"), (_slow, "than its size allows"), (_growing, "MiB more")]
 )
 def test_guards_strike(monkeypatch: pytest.MonkeyPatch, reader: object, word: str) -> None:
     monkeypatch.setattr(campaign, "open_log", reader)
@@ -74,7 +93,15 @@ def test_guards_strike(monkeypatch: pytest.MonkeyPatch, reader: object, word: st
 
 def test_the_account_goes_on_where_it_stopped(tmp_path: Path) -> None:
     path = tmp_path / "fuzz.json"
-    entry = {"read": 1, "refused": 1, "findings": 0, "seconds": 1.0, "date": "2026-01-01", "revision": "abc"}
+    entry = {
+        "read": 1,
+        "refused": 1,
+        "findings": 0,
+        "seconds": 1.0,
+        "slowest": 0.1,
+        "date": "2026-01-01",
+        "revision": "abc",
+    }
     account = book.load(path)
     for start in (0, 10, 20):
         runs = account.setdefault("mcap", [])

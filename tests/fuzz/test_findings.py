@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_replay import open_log
+import zstandard
+from numpy.typing import NDArray
+from quadid_replay import open_log, usd_records
 from quadid_replay.frames import from_euler, to_euler
 from quadid_replay.motors import ardupilot_motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
@@ -20,6 +22,7 @@ from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import header
 from tests.replay.test_ulog import Ulog
+from tests.replay.test_usd import Usd
 
 
 def opened(tmp_path: Path, data: bytes) -> Path:
@@ -111,3 +114,36 @@ def test_a_throttle_that_signals_nan_passes_without_a_warning(tmp_path: Path) ->
         warnings.simplefilter("error")
         reference = open_log(opened(tmp_path, bytes(log.data))).channels["attitude_reference"]
     assert len(reference.t) == 9, "the sample without a throttle is dropped"
+
+
+def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> None:
+    kind = "quadid_msgs/msg/MotorCommand"
+    message = ("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5] * 4})
+    log = mcap_of([message], False)
+    packed = zstandard.compress(bytes(60 << 20))
+    body = struct.pack("<QQQII", 0, 1, 60 << 20, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    hostile = opened(tmp_path, log + bytes([6]) + struct.pack("<Q", len(body)) + body)
+    began = time.process_time()
+    recording = open_log(hostile)
+    seconds = time.process_time() - began
+    assert any("damaged chunks" in warning for warning in recording.warnings), (
+        "before, seven million records of nothing"
+    )
+    happened(5, f"a chunk of 60 MiB of zeros: refused as no records after {seconds:.2f} s of CPU")
+
+
+def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[int] = []
+    kept = np.flatnonzero
+
+    def counted(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+        looked.append(len(mask))
+        return kept(mask)
+
+    monkeypatch.setattr(np, "flatnonzero", counted)
+    log = Usd(fixedFrequency="motor.m1(B)", modeChanged="mode(B)")
+    for k in range(4000):
+        log.add("fixedFrequency" if k % 2 else "modeChanged", 1000 * k, 1)
+    tables = usd_records.collect_usd_records(log.closed(), "log").tables
+    assert {name: len(table) for name, table in tables.items()} == {"fixedFrequency": 2000, "modeChanged": 2000}
+    assert sum(looked) < 100 * 4000, "each run used to look at all that follows"
