@@ -36,6 +36,7 @@ COMMANDS: dict[str, str] = {
     "history": "Stored parameter sets: what, when, from which data, by whom.",
     "export": "The parameters for another program.",
     "fleet": "Identify a folder of logs in parallel.",
+    "warmup": "Compile now what the first fit would compile.",
 }
 """Every command with its one-line help, in the order of `quadid --help`."""
 
@@ -73,6 +74,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
         "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
     ),
+    "warmup": ("quadid warmup",),
 }
 """Calls that each command's help ends with."""
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from quadid.sanitise import one_line
 from quadid.workflow.progress import Advance as Advance
+from quadid.workflow.progress import silent
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,10 +42,17 @@ def warn(messages: tuple[str, ...] | list[str]) -> None:
 
 
 @contextmanager
-def progress() -> Iterator[Advance]:
-    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it."""
+def progress(compiled: Sequence[str] = ("simulation", "statistics")) -> Iterator[Advance]:
+    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
+
+    Args:
+        compiled: kernels that the block needs (`quadid.workflow.kernels.PARTS`), compiled first where they are not.
+    """
+    from quadid_cli.warmup import prepare
+
     if not sys.stderr.isatty():
-        yield lambda stage, share: None
+        prepare(compiled, silent)
+        yield silent
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -62,4 +70,5 @@ def progress() -> Iterator[Advance]:
         def advance(stage: str, share: float) -> None:
             bar.update(task, description=stage, completed=share)
 
+        prepare(compiled, advance)
         yield advance

@@ -44,7 +44,9 @@ def reduce_segments(
     inverse = np.zeros(len(out) * LANES)
     inverse[lane[1:]] = 1.0 / steps
     w = whitening
-    _reduce_on_disk(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, lane, prior, into)
+    # A copy, because read-only arrays are another type, for which all would be compiled again.
+    own_lane = np.array(lane)
+    _reduce_on_disk(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, own_lane, prior, into)
 
 
 @nb.njit(**{**jit, "fastmath": False})

@@ -50,15 +50,9 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
         folder: for logs and vehicle files.
         advance: told how far it is.
     """
-    from multiprocessing import get_context
-
     from quadid.flight import TruthParameters
-    from quadid.online.window_fit import warm_up
 
     vehicle = as_vehicle(VEHICLE)
-    # A first start compiles for a minute: the other core begins with the fit while this one flies.
-    warming = get_context("spawn").Process(target=warm_up, args=(vehicle,), daemon=True)
-    warming.start()
     truth = TruthParameters.of(vehicle).as_dict()
     flights = [
         fly_and_load(vehicle, folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}, advance) for i in range(3)
@@ -71,9 +65,6 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
         fly_and_load(vehicle, apart / f"flight{i + 1}.mcap", shorter, 10 * seed + 5 + i, HIDDEN, advance)
         for i in range(2)
     ]
-    advance("compile, at a first start", 0.0)
-    warming.join()
-    advance("compile, at a first start", 1.0)
     identified = identify(flights[:1], flights[1:], seed=seed, advance=_named("identify", advance))
     diagnosed = diagnose(flights[:1], flights[1:], seed=seed, advance=_named("diagnose", advance))
     hidden = diagnose(other[:1], other[1:], seed=seed, advance=_named("diagnose hidden effect", advance))
