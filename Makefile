@@ -76,7 +76,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: health health-hours truth cases campaign foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -88,6 +88,9 @@ foreign: venv ## vehicles and logs of others: truth, answers, predictions beside
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results
+
+ablation: venv ## the diagnosis without each rule, with half and twice each number (many hours; goes on where it stopped)
+	$(STUDY) studies.ablation --records ablation.jsonl --out docs/results
 
 health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
 	$(STUDY) studies.health.hours --out docs/results

@@ -31,7 +31,7 @@ from quadid.diagnose.model import Model, extend
 from quadid.diagnose.pipeline import Workings
 from quadid.diagnose.residual_tests import ALARM
 from quadid.diagnose.result import FoundParameter
-from quadid.diagnose.score_test import screen
+from quadid.diagnose.score_test import Everything
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
 from quadid.identify.shooting import Shooting
@@ -62,7 +62,7 @@ def _gates(workings: Workings) -> dict[str, Any]:
     """
     decisive, model = workings.decisive, workings.search.model
     listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
-    scores = [s for s in screen(decisive, model, listed) if s.candidate.timed is None]
+    scores = [s for s in Everything.of(decisive, model, listed).scores(listed) if s.candidate.timed is None]
     trials = [_refit(decisive, model, s.candidate, len(scores)) for s in scores[:3]]
     left = workings.remainder
     return {

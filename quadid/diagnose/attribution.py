@@ -17,13 +17,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.cross_validation import block_labels, paired_gain
 from quadid.diagnose.hypotheses import Candidate, all_names
 from quadid.diagnose.model import Model, as_model, free_names, settled_states, taken_out
-from quadid.diagnose.result import Benefit, Validation
-from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import bounded_step, default_prior, polish, scaled_difference
 from quadid.identify.initial_states import InitialStates
@@ -31,16 +28,38 @@ from quadid.identify.parameterization import Free
 from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 UNTIDY = 0.2
 """How far, in typical sizes, each effect may be from neutral, or from its found value, on any vehicle."""
-TAKES_UP = 0.001
-"""Entries that would move by less than this many typical sizes are left where they are, but for what acts through
-another effect (a moment through drag): while that one is at neutral, a linear problem does not see it."""
-_ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class Benefit:
+    """Mean squared error (noise floor 1) on unseen data before and after, and the 95 % interval of the difference."""
+
+    mse_before: float
+    mse_after: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Error on unseen data: flights given for validation, else blocks left out; noise floor 1.
+
+    Attributes:
+        nominal, extended: mean squared error without and with the findings.
+        on: ``validation logs`` or ``held-out blocks``.
+        refitted: extended, with per-log values refitted on the first half and scored on the second; None without logs.
+        contradicted: the findings make the prediction of the validation logs worse, values of a flight refitted.
+    """
+
+    nominal: float
+    extended: float
+    on: str
+    refitted: float | None = None
+    contradicted: bool = False
 
 
 def untidy_names(listed: Sequence[Candidate]) -> list[str]:
@@ -67,13 +86,9 @@ def without_in_clutter(
     names = clutter_names(model, listed)
     gone = [n for n in free_names(model.causes) if n not in free_names(causes)]
     free = _boxed(shooting, [n for n in names if n not in gone], theta)
-    step = _predicted(shooting, model, names, free, gone, theta, everything)
-    always = {*NOMINAL_NAMES, *untidy_names([c for c in listed if c.requires])}
-    takes_up = [abs(z) > TAKES_UP or e.name in always for z, e in zip(step, free.entries, strict=True)]
-    used = Free(tuple(e for e, keep in zip(free.entries, takes_up, strict=True) if keep))
-    start = used.move(theta, step[np.array(takes_up)])
-    result = polish(shooting, start, used, states=model.states, iterations=_ITERATIONS, tolerance=0.1, settled=True)
-    return as_model(shooting, result, used, causes)
+    start = free.move(theta, _predicted(shooting, model, names, free, gone, theta, everything))
+    result = polish(shooting, start, free, states=model.states, iterations=4, tolerance=0.1, settled=True)
+    return as_model(shooting, result, free, causes)
 
 
 def ordinary(shooting: Shooting, model: Model, cause: Candidate, listed: Sequence[Candidate]) -> bool:
@@ -128,28 +143,28 @@ class Worth:
 
     cause: Candidate
     benefit: Benefit
-    p_value: float
     deviance: float
     ordinary: bool = False
 
 
 def validate(
-    decisive: Shooting, search: Search, logs: Sequence[Window], listed: Sequence[Candidate]
+    decisive: Shooting, nominal: Model, model: Model, logs: Sequence[Window], listed: Sequence[Candidate]
 ) -> tuple[Validation, tuple[Worth, ...]]:
     """Scores nominal and extended model on unseen data, and each cause by leaving it out (`without_in_clutter`).
 
     Args:
         decisive: the problem that decided.
-        search: the selection.
+        nominal: without causes.
+        model: the selected one.
         logs: validation flights; none: blocks of the training data are left out.
         listed: the catalogue.
 
     Returns:
         The overall figures, and the worth of each cause: what is larger than on any vehicle first, then by gain.
     """
-    rest = _each_left_out(decisive, search.model, listed)
-    figures, worth = _on_logs(decisive, search, rest, logs) if logs else _on_blocks(search, rest)
-    told = [replace(w, ordinary=ordinary(decisive, search.model, w.cause, listed)) for w in worth]
+    rest = _each_left_out(decisive, model, listed)
+    figures, worth = _on_logs(decisive, nominal, model, rest, logs) if logs else _on_blocks(nominal, model, rest)
+    told = [replace(w, ordinary=ordinary(decisive, model, w.cause, listed)) for w in worth]
     return figures, tuple(sorted(told, key=lambda w: (w.ordinary, -w.deviance)))
 
 
@@ -162,17 +177,14 @@ def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]
     return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}
 
 
-def _on_blocks(search: Search, rest: dict[str, Model]) -> tuple[Validation, list[Worth]]:
-    rows = search.model.rows
-    figures = Validation(
-        float(search.nominal.held_out.sum()) / rows, float(search.model.held_out.sum()) / rows, "held-out blocks"
-    )
-    return figures, [_block_worth(c, search, rest) for c in search.model.causes]
+def _on_blocks(nominal: Model, model: Model, rest: dict[str, Model]) -> tuple[Validation, list[Worth]]:
+    before, after = (float(m.held_out.sum()) / model.rows for m in (nominal, model))
+    return Validation(before, after, "held-out blocks"), [_block_worth(c, model, rest) for c in model.causes]
 
 
-def _block_worth(cause: Candidate, search: Search, rest: dict[str, Model]) -> Worth:
-    mse = float(search.model.held_out.sum()) / search.model.rows
-    return _worth(cause, rest[cause.label].held_out, rest[_ALL].held_out, mse, search.model.rows)
+def _block_worth(cause: Candidate, model: Model, rest: dict[str, Model]) -> Worth:
+    mse = float(model.held_out.sum()) / model.rows
+    return _worth(cause, rest[cause.label].held_out, rest[_ALL].held_out, mse, model.rows)
 
 
 def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, rows: float) -> Worth:
@@ -188,33 +200,33 @@ def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, 
     gain = paired_gain(before, after)
     low, high = gain.interval
     benefit = Benefit(mse + gain.total / rows, mse, (low / rows, high / rows))
-    return Worth(cause, benefit, gain.p_value, gain.total)
+    return Worth(cause, benefit, gain.total)
 
 
 def _on_logs(
-    decisive: Shooting, search: Search, rest: dict[str, Model], logs: Sequence[Window]
+    decisive: Shooting, nominal: Model, model: Model, rest: dict[str, Model], logs: Sequence[Window]
 ) -> tuple[Validation, list[Worth]]:
     scorer = decisive.on(logs)
-    nominal, rows = block_deviance(scorer, search.nominal)
-    extended, _ = block_deviance(scorer, search.model)
+    simple, rows = block_deviance(scorer, nominal)
+    extended, _ = block_deviance(scorer, model)
     mse, untidy = float(extended.sum()) / rows, np.empty(0)
     worth = []
-    for cause in search.model.causes:
+    for cause in model.causes:
         if EFFECTS[cause.effect].per_log:
             # The value belongs to the training flight; its worth is measured there, on blocks left out.
-            worth.append(_block_worth(cause, search, rest))
+            worth.append(_block_worth(cause, model, rest))
         else:
             if not len(untidy):
                 untidy, _ = block_deviance(scorer, rest[_ALL])
             before, _ = block_deviance(scorer, rest[cause.label])
             worth.append(_worth(cause, before, untidy, mse, rows))
-    figures = Validation(float(nominal.sum()) / rows, mse, "validation logs")
-    halves = _second_halves(scorer, search, logs)
+    figures = Validation(float(simple.sum()) / rows, mse, "validation logs")
+    halves = _second_halves(scorer, nominal, model, logs)
     if halves is not None:
         figures = replace(figures, refitted=float(halves.refitted.sum()) / halves.rows)
-    before, after = (nominal, extended) if halves is None else (halves.nominal, halves.refitted)
-    events = any(c.timed is not None for c in search.model.causes)
-    contradicted = bool(search.model.causes) and not events and paired_gain(before, after).total < 0.0
+    before, after = (simple, extended) if halves is None else (halves.nominal, halves.refitted)
+    events = any(c.timed is not None for c in model.causes)
+    contradicted = bool(model.causes) and not events and paired_gain(before, after).total < 0.0
     return replace(figures, contradicted=contradicted), worth
 
 
@@ -253,11 +265,10 @@ class _Halves(NamedTuple):
     rows: float
 
 
-def _second_halves(scorer: Shooting, search: Search, logs: Sequence[Window]) -> _Halves | None:
+def _second_halves(scorer: Shooting, nominal: Model, model: Model, logs: Sequence[Window]) -> _Halves | None:
     """Refits what belongs to a flight on the first half of each log and scores its second half; None without such."""
-    model = search.model
     per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
-    refitted, nominal, rows = [], [], 0.0
+    refitted, simple, rows = [], [], 0.0
     for window in logs:
         middle = len(window) // 2
         if not per_log or middle < 4 * scorer.length:
@@ -266,6 +277,6 @@ def _second_halves(scorer: Shooting, search: Search, logs: Sequence[Window]) -> 
         theta = polish(first, model.theta, first.free(per_log), iterations=6).theta
         total, count = block_deviance(second, model, theta)
         refitted.append(total)
-        nominal.append(block_deviance(second, search.nominal)[0])
+        simple.append(block_deviance(second, nominal)[0])
         rows += count
-    return _Halves(np.concatenate(refitted), np.concatenate(nominal), rows) if refitted else None
+    return _Halves(np.concatenate(refitted), np.concatenate(simple), rows) if refitted else None

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr, stdtrit
+from scipy.special import stdtrit
 
 from quadid.identify.shooting import Linearised
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 BLOCK_SECONDS = 10.0
 FEWEST_BLOCKS = 10
@@ -69,22 +68,6 @@ class Gain:
     total: float
     error: float
     blocks: FloatArray
-
-    @property
-    def p_value(self) -> float:
-        """One-sided p-value of no gain, from the spread between blocks (Student)."""
-        n = len(self.blocks)
-        if n < 3 or self.error <= 0.0:
-            return 1.0 if self.total <= 0.0 else 0.0
-        return float(stdtr(n - 1, -self.total / self.error))
-
-    @property
-    def spread(self) -> bool:
-        """Whether most blocks gain, and the gain outlasts its best block: it is not one odd stretch of the flight.
-
-        An effect that acts only in some manoeuvres gains in few blocks; their spread then says little about chance.
-        """
-        return float(np.mean(self.blocks > 0.0)) >= 2.0 / 3.0 and self.total > 1.25 * float(np.max(self.blocks))
 
     @property
     def interval(self) -> tuple[float, float]:

@@ -12,11 +12,9 @@ from quadid.diagnose.model import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
 from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
-from quadid.identify.covariance import uncertainty
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Entry
 
-MOST_ALTERNATIVES = 4
 STEP_SIGMA = 3e-4
 """Standard deviation [s] added to lags and delays: commands and samples of a loop at 1 kHz keep whole steps, and stamps
 no more; two minutes of data would tell a delay ten times better than that."""
@@ -28,14 +26,8 @@ def describe(
     shooting: Shooting, search: Search, worth: Sequence[Worth], believed: Sequence[Candidate]
 ) -> tuple[Finding, ...]:
     """Findings in the order of their worth; those `believed` are confident."""
-    sigma = _sigmas(search.model)
+    sigma = search.model.deviations
     return tuple(_finding(shooting, search, w, sigma, w.cause in believed) for w in worth if not w.cause.refines)
-
-
-def _sigmas(model: Model) -> dict[str, float]:
-    unc = uncertainty(model.lin, model.free, model.prior, model.theta)
-    scale = model.free.jacobian(model.theta)
-    return {e.name: float(s * k) for e, s, k in zip(model.free.entries, unc.sigma, scale, strict=True)}
 
 
 def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool) -> Finding:
@@ -123,7 +115,7 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
             if t.candidate.effect != cause.effect:
                 worse = float(t.model.held_out.sum() - mine.held_out.sum()) / mine.rows
                 found[t.candidate.effect] = Alternative(t.candidate.effect, mse_after + worse)
-    return tuple(sorted(found.values(), key=lambda a: a.mse_after)[:MOST_ALTERNATIVES])
+    return tuple(sorted(found.values(), key=lambda a: a.mse_after))
 
 
 def _sentence(effect: str, values: Mapping[str, float], before: float, after: float) -> str:

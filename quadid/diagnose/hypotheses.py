@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quadid.effects import EFFECTS, NEVER, Effect
 from quadid.model.layout import Layout, places
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)

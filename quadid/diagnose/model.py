@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.cross_validation import block_labels, held_out_deviance
 from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import NEVER
-from quadid.identify.covariance import score_products
+from quadid.identify.covariance import Uncertainty, score_products, uncertainty
 from quadid.identify.gauss_newton import (
     Polished,
     Prior,
@@ -25,10 +24,7 @@ from quadid.identify.gauss_newton import (
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
-
-FloatArray = NDArray[np.float64]
-
-FAR_STEPS = 4
+from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -79,29 +75,26 @@ class Model:
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""
-        covariance = self._model_covariance
+        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision))
         return np.asarray(np.diag(covariance @ score_products(self.lin)[0] @ covariance) / np.diag(covariance))
 
     @cached_property
-    def _model_covariance(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision)))
-
-    @property
-    def covariance(self) -> FloatArray:
+    def uncertainty(self) -> Uncertainty:
         """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
-        widen = np.sqrt(np.maximum(self.inflation, 1.0))
-        return np.asarray(self._model_covariance * np.outer(widen, widen))
+        return uncertainty(self.lin, self.free, self.prior, self.theta)
 
     @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of the scaled parameters."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations of the fitted entries in their own units, by name."""
+        sigma = self.uncertainty.sigma * self.free.jacobian(self.theta)
+        return dict(zip(self.free.names, sigma.tolist(), strict=True))
 
     def wald(self, cause: Candidate) -> float:
         """Robust chi-square of the parameters of `cause` against neutral."""
         z = self.free.from_neutral(self.theta)
         place = [self.free.names.index(n) for n in cause.names]
-        return float(z[place] @ np.linalg.solve(self.covariance[np.ix_(place, place)], z[place]))
+        covariance = self.uncertainty.covariance[np.ix_(place, place)]
+        return float(z[place] @ np.linalg.solve(covariance, z[place]))
 
     @property
     def finds_velocity(self) -> bool:
@@ -172,35 +165,17 @@ class Sketch:
     states: InitialStates
 
 
-def sketch(shooting: Shooting, model: Model, candidate: Candidate, elsewhere: Sequence[FloatArray] = ()) -> Sketch:
-    """Predicts what `model` with `candidate` would gain, by one linearisation at each of its starts; the best one.
-
-    Args:
-        shooting: the problem.
-        model: what to extend.
-        candidate: the cause to add.
-        elsewhere: nominal parameters, shape (6,), to start from too: without the cause those of `model` may have been
-            driven far away.
-    """
+def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Sketch:
+    """What `model` with `candidate` would gain, by one linearisation at each of its starts; the best one."""
     free = shooting.free(free_names((*model.causes, candidate)))
     prior = default_prior(shooting, free)
-    thetas = [model.theta]
-    thetas += [np.concatenate([nominal, model.theta[len(NOMINAL_NAMES) :]]) for nominal in elsewhere]
-    best: Sketch | None = None
-    for base in thetas:
-        for start in candidate.starts or ((),):
-            theta = base.copy()
-            if start:
-                theta[shooting.free(list(candidate.names)).index] = start
-            trial = _walk(shooting, model, free, theta) if elsewhere else _step(shooting, model, free, prior, theta)
-            if best is None or trial.drop > best.drop:
-                best = trial
-    assert best is not None
-    return best
+    thetas = [model.theta.copy() for _ in candidate.starts] or [model.theta]
+    for theta, start in zip(thetas, candidate.starts, strict=False):
+        theta[shooting.free(list(candidate.names)).index] = start
+    return max((_step(shooting, model, free, prior, theta) for theta in thetas), key=lambda s: s.drop)
 
 
 def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: FloatArray) -> Sketch:
-    """What the linearised problem promises."""
     lin = shooting.linearise(theta, free, model.states)
     precision, pull, cost = prior_terms(free, prior, theta)
     h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
@@ -208,21 +183,6 @@ def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: Flo
     deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
     moved = free.move(theta, z)
     return Sketch(moved, model.deviance - deviance, lin.stepped(scaled_difference(free, theta, moved)))
-
-
-def _walk(shooting: Shooting, model: Model, free: Free, theta: FloatArray) -> Sketch:
-    """What a few steps bring: far from the optimum a linear promise is worth nothing."""
-    result = polish(shooting, theta, free, states=model.states, iterations=FAR_STEPS)
-    drop = model.deviance - result.cost - float(result.lin.occam.sum())
-    return Sketch(result.theta, drop, result.states)
-
-
-def thinned(shooting: Shooting, model: Model, most: int) -> tuple[Shooting, Model, int]:
-    """Every n-th segment of the problem, so that at most about `most` stay, the model refitted there, and n."""
-    every = max(shooting.count // most, 1)
-    places = shooting.places(every)
-    thin, states = shooting.taking(places), model.states.taking(places)
-    return thin, fit_model(thin, model.theta, model.causes, states, iterations=FAR_STEPS), every
 
 
 def extend(

@@ -6,35 +6,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import validate
-from quadid.diagnose.extended_vehicle import Fitted, extended_vehicle
+from quadid.diagnose.extended_vehicle import extended_vehicle
 from quadid.diagnose.findings import describe
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names
 from quadid.diagnose.plausibility import impossible_causes
-from quadid.diagnose.prediction import POOR, Prediction, learn_prediction
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
-from quadid.diagnose.segment_schedule import LINEAR_MISFIT, is_long
+from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.errors import NotIdentifiableError
-from quadid.identify.covariance import parameter_set, uncertainty
+from quadid.identify.covariance import parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.model.supply import with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, Parameter
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
@@ -42,22 +41,13 @@ DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 only the short ones of the first fit."""
 FEWEST_SEGMENTS = 5
 FAR_ITERATIONS = 10
-NOISE_ROUNDS = 2
+"""Linearisations of the flexible fit where the nominal one is far off."""
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
-NOISE_ROSE = 1.5
-"""When it rises by more than this, and all together more than they fall, the flexible fit has lost its way, and the
-first estimate stands; likewise …"""
-NOISE_LOST = 3.0
-"""… when one rises by more than this, whatever the others do."""
-SHARE_TO_NAME = 0.8
-"""Named causes must account for this share of all structure, else the answer is `unknown` …"""
-SHARE_ALONE = 0.9
-"""… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
+SHARE_TO_NAME = 0.9
+"""Named causes must account for this share of all structure, else the answer is `unknown`."""
 LEAST_STRUCTURE = 0.01
-"""Structure below this share of the noise is not worth a word …"""
-LEAST_OF_EXPLAINED = 1e-3
-"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
+"""Structure below this share of the noise is not worth a word."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +55,11 @@ class Workings:
     """Everything a report or a test may want to look into.
 
     Attributes:
-        search: the selection; short, decisive: the problems it ran on.
+        search: the selection; decisive: the problem that decided.
         remainder: what is left.
     """
 
     search: Search
-    short: Shooting
     decisive: Shooting
     remainder: Remainder
 
@@ -100,13 +89,12 @@ def diagnose(
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     begun, search = _select(windows, begun, report)
     decisive = search.shooting
-    nominal = _usual_nominal(begun, search)
     left = remainder(decisive, search.model, seed)
     report("validation", 0.0)
-    outcome, per_finding = validate(decisive, search, validation, begun.listed)
+    outcome, per_finding = validate(decisive, search.nominal, search.model, validation, begun.listed)
     doubts = impossible_causes(search.model) | inconstant_causes(search.model, left)
     unnamed = sum(max(w.deviance, 0.0) for w in per_finding if w.cause.label in doubts)
-    verdict = judge(nominal, search.model, left, unnamed)
+    verdict = judge(search.nominal, search.model, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
     if search.model.causes and (outcome.contradicted or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
@@ -117,7 +105,7 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
     ]
-    text = extended_vehicle(vehicle, decisive.layout, Fitted.of(search.model))
+    text = extended_vehicle(vehicle, decisive.layout, search.model)
     prediction = None
     if search.model.reduced_chi_square > POOR:
         report("prediction", 0.0)
@@ -127,7 +115,7 @@ def diagnose(
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)
-    return result, Workings(search, begun.short, decisive, left)
+    return result, Workings(search, decisive, left)
 
 
 def _prediction(
@@ -146,9 +134,7 @@ def _prediction(
 def _nominal_parameters(vehicle: Vehicle, model: Model) -> tuple[Parameter, ...]:
     """The nominal six beside the findings, as an identification gives them."""
     initial = Layout(vehicle).initial(vehicle)
-    everything = parameter_set(
-        model.free, model.theta, initial, uncertainty(model.lin, model.free, model.prior, model.theta)
-    )
+    everything = parameter_set(model.free, model.theta, initial, model.uncertainty)
     return tuple(p for p in everything if p.name in NOMINAL_NAMES)
 
 
@@ -159,7 +145,6 @@ class _Begun:
     Attributes:
         short: short segments; schedule: the lengths that may decide, short ones last.
         nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
-        elsewhere: other nominal parameters to start from, each of shape (6,).
         listed: the catalogue.
     """
 
@@ -167,7 +152,6 @@ class _Begun:
     schedule: list[Shooting]
     nominal: FloatArray
     flexible: FloatArray
-    elsewhere: list[FloatArray]
     listed: list[Candidate]
 
 
@@ -180,23 +164,20 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
         settings = replace(swarm.swarm, iterations=swarm.iterations)
         start, _ = swarm_search(short, start, free, settings, swarm.particles, swarm.seed, report)
     report("fit", 0.0)
-    first = polish(short, start, free, iterations=8)
+    typical, first = short.noise, polish(short, start, free, iterations=8)
     far = first.cost > LINEAR_MISFIT * float(first.lin.rows.sum())
-    typical, short = short.noise, short.with_noise(residual_noise(short, first))
+    short = short.with_noise(residual_noise(short, first))
     first = polish(short, first.theta, free, states=first.states, iterations=8)
     report("noise floor", 0.0)
-    if far:
-        # What the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
-        flexible = flexible_fit(windows, short, [first.theta, start], free, typical, FAR_ITERATIONS)
-    else:
-        flexible = flexible_fit(windows, short, [first.theta], free, short.noise)
+    # Far off, what the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
+    begun = ([first.theta, start], free, typical, FAR_ITERATIONS) if far else ([first.theta], free, short.noise)
+    flexible = flexible_fit(windows, short, *begun)
     short = short.with_noise(flexible.noise)
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     schedule = [*(s for s in schedule if s.count >= FEWEST_SEGMENTS), short]
-    elsewhere = [theta[: len(NOMINAL_NAMES)] for theta in (start, flexible.theta)]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    return _Begun(short, schedule, first.theta, flexible.theta, elsewhere, listed)
+    return _Begun(short, schedule, first.theta, flexible.theta, listed)
 
 
 def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
@@ -208,25 +189,23 @@ def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
 
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
     """Selects causes, and again when they show the noise to be less."""
-    search = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere)
+    search = select(begun.schedule, begun.nominal, begun.listed, report)
     if search.model.reduced_chi_square > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
         general = from_everything(begun.short, begun.flexible, begun.listed)
-        other = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere, general)
+        other = select(begun.schedule, begun.nominal, begun.listed, report, general)
         search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
-    for _ in range(NOISE_ROUNDS):
-        if not search.model.causes:
-            break
+    while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance
         noise = _noise_around(windows, begun.short, search.model)
         growth = noise.variance / before
-        if np.any(growth > NOISE_LOST) or (np.any(growth > NOISE_ROSE) and np.mean(np.log(growth)) > 0.0):
-            break
+        if np.mean(np.log(growth)) > 0.0:
+            break  # around the causes there is no less noise than before
         begun, search = _with_noise(noise, begun, search)
         if np.all(noise.variance > NOISE_FELL * before):
             break
-        again = select(begun.schedule, begun.nominal, begun.listed, report, begun.elsewhere, search.model)
+        again = select(begun.schedule, begun.nominal, begun.listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
     # Under less noise a cause may be nothing any more.
     return begun, replace(search, model=pruned(search.shooting, search.model))
@@ -249,13 +228,6 @@ def _with_noise(noise: NoiseModel, begun: _Begun, search: Search) -> tuple[_Begu
     return begun, replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
-def _usual_nominal(begun: _Begun, search: Search) -> Model:
-    """Nominal model on segments of usual length, from which the verdict counts what is explained."""
-    if not is_long(search.shooting):
-        return search.nominal
-    return fit_model(next(s for s in begun.schedule if not is_long(s)), search.nominal.theta, ())
-
-
 def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Verdict:
     """Verdict from what the causes explain and what is left.
 
@@ -266,11 +238,11 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
         unnamed: deviance that causes which are not what their names say take away; it counts as left.
     """
     explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
-    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
-    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
+    structure = left.deviance + unnamed
+    structure = structure if structure > LEAST_STRUCTURE * model.rows else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:
         return Verdict.EXPLAINED
-    share = SHARE_TO_NAME if len(model.effects) > 1 else SHARE_ALONE
-    return Verdict.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Verdict.UNKNOWN
+    known = explained >= SHARE_TO_NAME * (explained + structure)
+    return Verdict.PARTLY_EXPLAINED if known else Verdict.UNKNOWN

@@ -12,13 +12,12 @@ from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
 from quadid.model.layout import Entry
+from quadid.parameters import at_bound
 
 LIKELY_SENSOR = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
 WRONG_SIGN = 0.1
 """Share of its typical size by which a number that cannot be negative may be, for what a fit lays beside the truth."""
-AT_BOUND = 1e-3
-"""Share of the width of the bounds within which a number rests on one of them (contract §7)."""
 
 
 def impossible_causes(model: Model) -> dict[str, str]:
@@ -29,7 +28,7 @@ def impossible_causes(model: Model) -> dict[str, str]:
 
 def impossible(model: Model, cause: Candidate) -> str:
     """Which number of `cause` no vehicle has; empty when all are possible."""
-    sigma = dict(zip(model.free.names, model.sigma, strict=True))
+    sigma = dict(zip(model.free.names, model.uncertainty.sigma, strict=True))
     for e in model.free.entries:
         if e.name not in cause.names:
             continue
@@ -46,5 +45,7 @@ def impossible(model: Model, cause: Candidate) -> str:
 
 def _bound(entry: Entry, value: float) -> float | None:
     """The bound, other than neutral, that a number rests on."""
-    near = AT_BOUND * (entry.upper - entry.lower)
-    return next((b for b in (entry.lower, entry.upper) if b != entry.neutral and abs(value - b) <= near), None)
+    if not at_bound(value, entry.lower, entry.upper):
+        return None
+    bound = min(entry.lower, entry.upper, key=lambda b: abs(value - b))
+    return None if bound == entry.neutral else bound

@@ -22,8 +22,7 @@ from quadid.diagnose.cross_validation import Gain, block_labels, held_out_devian
 from quadid.diagnose.model import Model
 from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 ERRORS = 2.5
 """Standard errors of a gain on unseen blocks above which a site counts as structured …"""

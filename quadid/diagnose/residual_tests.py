@@ -24,8 +24,7 @@ from quadid.identify.noise_spectrum import LOWEST, mode_power
 from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.identify.shooting import Shooting
 from quadid.model.rollout import CHANNEL_NAMES
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 SMOOTH = 3
 """Neighbouring modes averaged before they are judged …"""

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from quadid.diagnose.prediction import Prediction
+from quadid.diagnose.attribution import Benefit, Validation
 from quadid.diagnose.residual_tests import Remainder
+from quadid.identify.residual_prediction import Prediction
 from quadid.identify.result import parameter_entry
 from quadid.jsonable import jsonable
 from quadid.parameters import Parameter
@@ -39,15 +40,6 @@ class FoundParameter:
     name: str
     unit: str
     value: float
-    ci95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Benefit:
-    """Mean squared error (noise floor 1) on unseen data before and after, and the 95 % interval of the difference."""
-
-    mse_before: float
-    mse_after: float
     ci95: tuple[float, float]
 
 
@@ -104,24 +96,6 @@ class Finding:
             "per_log": self.per_log,
             "ordinary": self.ordinary,
         }
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Error on unseen data: flights given for validation, else blocks left out; noise floor 1.
-
-    Attributes:
-        nominal, extended: mean squared error without and with the findings.
-        on: ``validation logs`` or ``held-out blocks``.
-        refitted: extended, with per-log values refitted on the first half and scored on the second; None without logs.
-        contradicted: the findings make the prediction of the validation logs worse, values of a flight refitted.
-    """
-
-    nominal: float
-    extended: float
-    on: str
-    refitted: float | None = None
-    contradicted: bool = False
 
 
 @dataclass(frozen=True)

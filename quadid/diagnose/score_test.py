@@ -18,8 +18,7 @@ from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
 from quadid.diagnose.model import Model, settled_states, taken_out_causes
 from quadid.identify.gauss_newton import prior_terms
 from quadid.identify.shooting import Linearised, Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Score:
         drop: predicted fall of the deviance on the fitted data, negative for a rise.
         z: scaled parameters of `candidate` at the predicted optimum, shape (its names,).
         time: best moment of onset [s] for timed causes.
-        trials: how many alternatives were looked at for it.
+        trials: how many alternatives were looked at: causes, and onsets of them.
         gone: the cause that leaves; None: none does.
     """
 
@@ -107,7 +106,7 @@ class Everything:
                 continue
             mine = np.array([self.place[n] for n in candidate.names])
             found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)
-            out.append(replace(found, drop=found.drop - risen, gone=gone))
+            out.append(replace(found, drop=found.drop - risen, trials=found.trials * len(listed), gone=gone))
         return sorted(out, key=lambda s: -s.drop)
 
     def _unspent(self) -> float:
@@ -165,11 +164,6 @@ def missed(model: Model, least: float) -> tuple[Candidate, ...]:
         kept.remove(cause)
         alive[mine] = False
     return tuple(kept)
-
-
-def screen(shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> list[Score]:
-    """Scores all candidates not yet in the model, best first."""
-    return Everything.of(shooting, model, listed).scores(listed)
 
 
 def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> tuple[FloatArray, FloatArray]:

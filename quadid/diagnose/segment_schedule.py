@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quadid.diagnose.model import Model, fit_model
 from quadid.identify.shooting import Shooting
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LINEAR_MISFIT = 4.0
 """Deviance per row above which segments are too long for the model: it does not follow the flight to their end."""

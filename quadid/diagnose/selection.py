@@ -5,32 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.log_evidence import better, worth_a_refit
-from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, thinned, without
+from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, without
 from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.score_test import Everything, Score, missed
-from quadid.diagnose.segment_schedule import LINEAR_MISFIT, Stage
+from quadid.diagnose.segment_schedule import Stage
 from quadid.identify.noise_estimation import flexible_names
-from quadid.identify.shooting import MEASURED, Shooting
+from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 NEAR = 0.4
-"""Moves predicted to gain this share of what the best one should are refitted beside it; a swap, when it should regain
-this share of what is lost."""
+"""Additions predicted to gain this share of what the best one did are refitted too …"""
 ALIKE = 0.8
-"""Share of what is lost that a cause of another family should regain by the linear prediction to be looked at."""
-FEWEST_REFITS, MOST_REFITS = 3, 7
-"""Fewest and most causes refitted in one round: the prediction is linear, the effects are not."""
+"""… and so are causes that should regain this share of what is lost when another one leaves."""
 MOST_ROUNDS = 24
 """Moves after which the search ends: where the catalogue lacks the cause, stand-ins take turns for long."""
-FAR_SEGMENTS = 60
-"""Segments on which causes are compared while the misfit is large, and so any difference shows on a few."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +62,7 @@ class Search:
 
 def select(
     schedule: Sequence[Shooting], theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None],
-    elsewhere: Sequence[FloatArray] = (), known: Model | None = None,
+    known: Model | None = None,
 ) -> Search:  # fmt: skip
     """Selects the causes that the data support.
 
@@ -80,7 +71,6 @@ def select(
         theta: nominal optimum.
         listed: causes to try.
         report: progress.
-        elsewhere: nominal parameters, shape (6,), to start from too while the misfit is large.
         known: selection to go on from.
     """
     stage = Stage.begin(schedule, theta, known)
@@ -88,14 +78,14 @@ def select(
     seen = {_key(stage.shooting, stage.model)}
     while len(rounds) < MOST_ROUNDS:
         report("search", len(rounds) / (len(rounds) + 2.0))
-        rounds.append(_round(stage.shooting, stage.model, listed, elsewhere, seen))
+        rounds.append(_round(stage.shooting, stage.model, listed, seen))
         if rounds[-1].accepted is None:
             # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
             far = None if stage.model.causes else stage.longest()
             airborne = [] if far is None else [c for c in listed if far.shooting.finds_velocity(c.names)]
             if far is None or not airborne:
                 break
-            rounds.append(_round(far.shooting, far.model, airborne, elsewhere, seen))
+            rounds.append(_round(far.shooting, far.model, airborne, seen))
             if rounds[-1].accepted is None:
                 break
             stage = far
@@ -148,15 +138,14 @@ def pruned(shooting: Shooting, model: Model) -> Model:
 
 
 def _round(
-    shooting: Shooting, model: Model, listed: Sequence[Candidate], elsewhere: Sequence[FloatArray],
-    seen: Collection[tuple[int, frozenset[str]]],
-) -> Round:  # fmt: skip
+    shooting: Shooting, model: Model, listed: Sequence[Candidate], seen: Collection[tuple[int, frozenset[str]]]
+) -> Round:
     """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
     trials: list[Trial] = []
     for moves in (_adds_and_drops, _swaps):
-        new = moves(shooting, everything, listed, least, elsewhere)
+        new = moves(shooting, everything, listed, least)
         trials += [t for t in new if _key(shooting, t.model) not in seen]
         best = _best(model, trials)
         if best is not None:
@@ -189,44 +178,58 @@ def _possible(shooting: Shooting, model: Model, trials: Sequence[Trial]) -> Tria
 
 
 def _adds_and_drops(
-    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float,
-    elsewhere: Sequence[FloatArray],
-) -> Iterator[Trial]:  # fmt: skip
+    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float
+) -> Iterator[Trial]:
     model = everything.model
-    for draft in _drafts(shooting, model, everything.scores(listed), least, elsewhere):
-        yield _tried(shooting, model, draft, len(listed))
+    scores = [s for s in everything.scores(listed) if s.candidate.starts or s.drop > least]
+    yield from _refits(shooting, model, scores, least, NEAR)
     for cause in _removable(model):
         if everything.loss(cause) < 4.0 * least:
             yield Trial(None, cause, without(shooting, model, cause))
 
 
-def _swaps(
-    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float,
-    elsewhere: Sequence[FloatArray],
-) -> Iterator[Trial]:  # fmt: skip
-    """The best two in the place of each cause, among those that should regain enough of what its loss costs.
-
-    In the place of one with an impossible number anything that should regain something.
-    """
+def _swaps(shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float) -> Iterator[Trial]:
+    """Look-alikes in the place of each cause; anything at all in the place of one with an impossible number."""
     model, told = everything.model, impossible_causes(everything.model)
     for cause in _removable(model):
-        scores = everything.scores(listed, cause)
         lost = everything.loss(cause)
-        rest = taken_out(shooting, model, cause)
         share = 0.0 if cause.label in told else ALIKE
-        rivals = [s for s in scores if _rivals(s.candidate, cause, lost + s.drop > max(share * lost, least))]
-        drafts = [_draft(shooting, rest, s, ()) for s in rivals]
-        share = 0.0 if cause.label in told else NEAR
-        drafts = sorted((d for d in drafts if lost + d.drop > share * lost), key=lambda d: -d.drop)
-        for draft in drafts[: MOST_REFITS if cause.label in told else 2]:
-            yield _tried(shooting, rest, draft, len(listed))
+        rivals = [
+            s for s in everything.scores(listed, cause) if _rivals(s, cause, lost + s.drop > max(share * lost, least))
+        ]
+        yield from _refits(shooting, taken_out(shooting, model, cause), rivals, least, share, lost)
 
 
-def _rivals(candidate: Candidate, cause: Candidate, alike: bool) -> bool:
+def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
     """Whether a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
+    candidate = score.candidate
     if candidate.split or candidate.effect == cause.effect:
         return False
-    return alike or (candidate.family == cause.family and candidate.timed is None)
+    return regains or (candidate.family == cause.family and candidate.timed is None)
+
+
+def _refits(
+    shooting: Shooting, model: Model, scores: Sequence[Score], least: float, near: float, lost: float = 0.0
+) -> Iterator[Trial]:
+    """Refits with one cause each, by what it is predicted to gain, until none comes `near` what one did gain.
+
+    A prediction is linear and the effects are not, so what a refit brought counts, not what another one promised.
+
+    Args:
+        shooting: the problem.
+        model: what to extend.
+        scores: the causes.
+        least: gain below which none is of use.
+        near: share of the largest gain so far that a prediction must reach.
+        lost: deviance that `model` lost when another cause left it, to be gained again.
+    """
+    gained = 0.0
+    for draft in sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d.drop):
+        if lost + draft.drop < max(least, near * gained):
+            break
+        trial = _tried(shooting, model, draft)
+        gained = max(gained, lost + model.deviance - trial.model.deviance)
+        yield trial
 
 
 def _removable(model: Model) -> list[Candidate]:
@@ -242,53 +245,22 @@ class Draft:
     start: FloatArray | Sketch | None
 
 
-def _drafts(
-    shooting: Shooting, model: Model, scores: list[Score], least: float, elsewhere: Sequence[FloatArray]
-) -> list[Draft]:
-    """Causes to add: the best by prediction, and those that come near them."""
-    far = model.reduced_chi_square > LINEAR_MISFIT
-    linear = [s for s in scores if s.candidate.starts or s.drop > least]
-    if far:
-        thin, base, every = thinned(shooting, model, FAR_SEGMENTS)
-        drafts = [_far_draft(thin, base, every, s, elsewhere) for s in _one_corner(linear)]
-    else:
-        drafts = [_draft(shooting, model, s, ()) for s in _one_corner(linear)]
-    drafts = sorted((d for d in drafts if d.drop > least), key=lambda d: -d.drop)
-    near = [d for d in drafts if d.drop > NEAR * drafts[0].drop]
-    return near[:MOST_REFITS] if len(near) > FEWEST_REFITS else drafts[:FEWEST_REFITS]
-
-
-def _draft(shooting: Shooting, model: Model, score: Score, elsewhere: Sequence[FloatArray]) -> Draft:
+def _draft(shooting: Shooting, model: Model, score: Score) -> Draft:
     """Linear causes start from the model, others where one linearisation from the best of their starts leads."""
     if score.candidate.starts:
-        drawn = sketch(shooting, model, score.candidate, elsewhere)
+        drawn = sketch(shooting, model, score.candidate)
         return Draft(score, drawn.drop, drawn)
     return Draft(score, score.drop, model.theta)
 
 
-def _far_draft(thin: Shooting, base: Model, every: int, score: Score, elsewhere: Sequence[FloatArray]) -> Draft:
-    """Far from the optimum the model's initial states are as wrong as its parameters: begin at measured ones."""
-    if score.candidate.timed is not None:
-        return Draft(score, score.drop, base.theta)
-    drawn = sketch(thin, base, score.candidate, elsewhere)
-    return Draft(score, max(every * drawn.drop, score.drop), replace(drawn, states=MEASURED))
-
-
-def _one_corner(scores: list[Score]) -> list[Score]:
-    """Of the rotors, only the two best need a refit."""
-    weak = [s for s in scores if s.candidate.effect == "weak_rotor"]
-    drop = {id(s) for s in weak[2:]}
-    return [s for s in scores if id(s) not in drop]
-
-
-def _tried(shooting: Shooting, model: Model, draft: Draft, tests: int) -> Trial:
-    """Refits `model` with the cause of a draft; `tests` alternatives were looked at."""
+def _tried(shooting: Shooting, model: Model, draft: Draft) -> Trial:
+    """Refits `model` with the cause of a draft."""
     candidate, time = draft.score.candidate, draft.score.time
     start = draft.start
     if candidate.timed is not None and time is not None:
         start = model.theta.copy()
         start[candidate.timed] = time
-    extended = extend(shooting, model, candidate, start, tried=float(tests * draft.score.trials))
+    extended = extend(shooting, model, candidate, start, tried=float(draft.score.trials))
     if candidate.timed is not None:
         extended = _refine_time(shooting, extended, candidate)
     return Trial(candidate, draft.score.gone, extended)

@@ -1,6 +1,7 @@
 """Runs the diagnosis with each rule left out and each number halved and doubled, and says what changes.
 
-QUADID_DATA=../shared/data python -m studies.ablation --records ablation.jsonl --out docs/results
+QUADID_DATA=../shared/data python -m studies.ablation --out docs/results
+python -m studies.ablation --house
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from studies.ablation.answers import Answer, run
-from studies.ablation.corpus import CLASSES, flights
+from studies.ablation.corpus import CLASSES, START, flights
+from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
 
@@ -47,16 +49,21 @@ def _difference(base: Answer, other: Answer) -> str:
 def main() -> None:
     """Command line of the study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--records", type=Path, required=True, help="JSON lines; a stopped run goes on from them")
+    parser.add_argument("--house", action="store_true", help="print files, lines, named numbers and layers, and end")
+    parser.add_argument("--records", type=Path, default=Path("ablation.jsonl"), help="a stopped run goes on from them")
     parser.add_argument("--cache", type=Path, help="folder that keeps flights once flown")
     parser.add_argument("--kinds", default="campaign,cases,recorded")
     parser.add_argument("--classes", default="", help="name:count of campaign classes, by commas")
     parser.add_argument("--only", default="", help="variants whose name holds one of these words, by commas")
     parser.add_argument("--out", type=Path, help="folder of the page")
+    parser.add_argument("--start", type=int, default=START, help="number of the first case of each class")
     options = parser.parse_args()
+    if options.house:
+        print(measured())
+        return
     given = [part.split(":") for part in options.classes.split(",") if part]
     classes = {name: int(count) for name, count in given} or CLASSES
-    todo = flights(options.kinds.split(","), classes)
+    todo = flights(options.kinds.split(","), classes, options.start)
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
     rows: list[str] = []

@@ -15,10 +15,10 @@ from quadid.workflow.loading import GRID, load_logs, load_vehicle
 from studies.campaign import Case, cases, flown
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
-CLASSES = {"single": 25, "null": 5, "pair": 10, "look_alike": 6, "clutter": 6, "outside": 12}
-"""Cases of each class of the campaign, numbers from 0."""
-PINNED = (("single", 1083), ("single", 1055), ("look_alike", 15), ("clutter", 10), ("clutter", 2005))
-"""Cases that tests name."""
+CLASSES = {"single": 25, "later": 5, "null": 4, "pair": 5, "look_alike": 6, "clutter": 4, "outside": 12}
+"""Cases of each class of the campaign, numbers from `START`."""
+START = 7000
+"""No other study and no test draws from here."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,17 @@ def _recorded() -> list[Flight]:
     return out
 
 
-def flights(kinds: Sequence[str], classes: dict[str, int] | None = None) -> list[Flight]:
+def flights(kinds: Sequence[str], classes: dict[str, int] | None = None, start: int = START) -> list[Flight]:
     """All flights of the kinds asked for.
 
     Args:
         kinds: of ``campaign``, ``cases``, ``recorded``.
         classes: cases of each class of the campaign, `CLASSES` by default.
+        start: number of the first case of each class.
     """
     out: list[Flight] = []
     if "campaign" in kinds:
-        chosen = [c for group, n in (classes or CLASSES).items() for c in cases(group, n)]
-        chosen += [c for group, n in PINNED for c in cases(group, 1, n)]
+        chosen = [c for group, n in (classes or CLASSES).items() for c in cases(group, n, start)]
         out += [Flight(f"{c.group} {c.number}", "campaign", c, hidden=c.expected) for c in chosen]
     if "cases" in kinds:
         out += [f for folder in ("cases", "cases_hub") for f in _independent(folder)]

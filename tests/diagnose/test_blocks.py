@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.signal import lfilter
 
 from quadid.diagnose.attribution import settle
@@ -127,13 +126,6 @@ def test_the_error_of_a_gain_holds_under_autocorrelation_where_that_of_single_se
     assert naive / 400 < 0.85
 
 
-def test_the_p_value_is_that_of_a_one_sided_t_test() -> None:
-    rng = np.random.default_rng(6)
-    before, after = rng.standard_normal(12) + 0.5, rng.standard_normal(12)
-    expected = stats.ttest_rel(before, after, alternative="greater").pvalue
-    assert paired_gain(before, after).p_value == pytest.approx(float(expected))
-
-
 def test_without_spread_there_is_no_evidence() -> None:
     assert paired_gain(np.ones(1), np.zeros(1)).error == float("inf")
-    assert paired_gain(np.zeros(5), np.zeros(5)).p_value == 1.0
+    assert paired_gain(np.zeros(5), np.zeros(5)).interval == (0.0, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.diagnose.model import Model, extend, fit_model
-from quadid.diagnose.score_test import Score, screen
+from quadid.diagnose.score_test import Everything, Score
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 SMALL = {
@@ -20,8 +20,13 @@ SMALL = {
 """Sizes at which the model is linear in the effect."""
 
 
+def screen(problem: Problem, model: Model | None = None) -> list[Score]:
+    everything = Everything.of(problem.shooting, model or problem.nominal, problem.listed)
+    return everything.scores(problem.listed)
+
+
 def score_of(problem: Problem, label: str, model: Model | None = None) -> Score:
-    scores = screen(problem.shooting, model or problem.nominal, problem.listed)
+    scores = screen(problem, model)
     (found,) = [s for s in scores if s.candidate.label == label]
     return found
 
@@ -34,14 +39,14 @@ def test_the_predicted_drop_is_that_of_a_refit(name: str) -> None:
     drop = problem.nominal.deviance - refit.deviance
     assert drop > 30.0
     assert score.drop == pytest.approx(drop, rel=0.05)
-    scores = screen(problem.shooting, problem.nominal, problem.listed)
+    scores = screen(problem)
     assert max(scores, key=lambda s: s.drop / len(s.candidate.names)).drop <= 1.2 * score.drop + 10.0
 
 
 def test_without_effects_no_drop_is_beyond_chance() -> None:
     """Chi-square tails of the score tests: smallest of about 25 not below 1e-4, and none promises half a per cent."""
     problem = clean()
-    scores = screen(problem.shooting, problem.nominal, problem.listed)
+    scores = screen(problem)
     assert len(scores) >= 20
     assert max(s.drop for s in scores) < 0.004 * problem.nominal.rows
 
@@ -50,7 +55,7 @@ def test_the_scan_finds_when_thrust_dropped() -> None:
     problem = fitted(window_with({"thrust_drop": {"time": 37.3, "fraction": 0.02}}), clean().shooting.noise)
     score = score_of(problem, "thrust_drop")
     assert score.time == pytest.approx(37.3, abs=1.5)
-    assert score.trials == len(problem.nominal.lin.time)
+    assert score.trials == len(problem.nominal.lin.time) * len(problem.listed)
 
 
 def test_the_scan_is_that_of_masked_columns() -> None:
@@ -68,11 +73,11 @@ def test_the_scan_is_that_of_masked_columns() -> None:
 
 def test_what_is_in_the_model_or_lacks_its_companion_is_not_tried() -> None:
     problem = clean()
-    labels = {s.candidate.label for s in screen(problem.shooting, problem.nominal, problem.listed)}
+    labels = {s.candidate.label for s in screen(problem)}
     assert "rotor_drag_moment" not in labels
     assert "rotor_drag" in labels
     drag = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), iterations=3)
-    labels = {s.candidate.label for s in screen(problem.shooting, drag, problem.listed)}
+    labels = {s.candidate.label for s in screen(problem, drag)}
     assert "rotor_drag" not in labels
     assert "rotor_drag_moment" in labels
 
@@ -81,7 +86,7 @@ def test_a_direction_the_nominal_parameters_explain_promises_nothing() -> None:
     """A thrust drop before the log begins is a smaller b: nothing is left to gain."""
     problem = clean()
     whole = replace(cause(problem, "thrust_drop"), timed=None)
-    (score,) = screen(problem.shooting, problem.nominal, [whole])
+    (score,) = Everything.of(problem.shooting, problem.nominal, [whole]).scores([whole])
     assert score.drop < 5.0
     assert np.isfinite(score.z).all()
 
@@ -91,5 +96,5 @@ def test_a_fit_that_stopped_short_promises_no_more_than_there_is_to_gain() -> No
     problem = clean()
     short = fit_model(problem.shooting, problem.shooting.layout.initial(problem.shooting.vehicle), (), iterations=1)
     assert short.deviance > 2.0 * problem.nominal.deviance, "the fit has ended after all"
-    scores = screen(problem.shooting, short, problem.listed)
+    scores = screen(problem, short)
     assert max(s.drop for s in scores) < short.deviance

@@ -38,7 +38,7 @@ def answer(a: Model, b: Model) -> bool:
 
 def selected(known: Model | None) -> Model:
     problem = late()
-    return select([problem.shooting], problem.nominal.theta, problem.listed, lambda *_: None, (), known).model
+    return select([problem.shooting], problem.nominal.theta, problem.listed, lambda *_: None, known).model
 
 
 def test_a_true_cause_is_better_than_none_and_none_than_an_absent_one() -> None:

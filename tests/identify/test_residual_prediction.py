@@ -13,9 +13,9 @@ from quadid_replay import open_log
 from typer.testing import CliRunner
 
 from quadid.diagnose import diagnose
-from quadid.diagnose.prediction import AHEAD, _relative, learn_prediction
 from quadid.flight import fly
 from quadid.grid import grid_recording
+from quadid.identify.residual_prediction import AHEAD, _relative, learn_prediction
 from quadid.vehicle import Vehicle
 
 NANODRONE = "nanodrone"
