@@ -22,7 +22,7 @@ from quadid.diagnose.cross_validation import block_labels, paired_gain
 from quadid.diagnose.hypotheses import Candidate, all_names
 from quadid.diagnose.model import Model, as_model, free_names, settled_states, taken_out
 from quadid.effects import EFFECTS
-from quadid.identify.gauss_newton import bounded_step, default_prior, polish, scaled_difference
+from quadid.identify.gauss_newton import polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.parameterization import Free
 from quadid.identify.segment_cost import Linearised
@@ -67,9 +67,7 @@ def untidy_names(listed: Sequence[Candidate]) -> list[str]:
     return all_names([c for c in listed if c.timed is None and not c.refines and not EFFECTS[c.effect].needs])
 
 
-def without_in_clutter(
-    shooting: Shooting, model: Model, cause: Candidate | None, listed: Sequence[Candidate], everything: Linearised
-) -> Model:
+def without_in_clutter(shooting: Shooting, model: Model, cause: Candidate | None, listed: Sequence[Candidate]) -> Model:
     """Refits `model` without `cause` (None: with all its causes) amid clutter.
 
     Nominal parameters are free, effects that are left move within the sizes of clutter.
@@ -79,16 +77,12 @@ def without_in_clutter(
         model: the extended model.
         cause: what to take out.
         listed: the catalogue.
-        everything: linearisation at `model` with `clutter_names` free.
     """
     left = taken_out(shooting, model, cause)
-    causes, theta = left.causes, left.theta
-    names = clutter_names(model, listed)
-    gone = [n for n in free_names(model.causes) if n not in free_names(causes)]
-    free = _boxed(shooting, [n for n in names if n not in gone], theta)
-    start = free.move(theta, _predicted(shooting, model, names, free, gone, theta, everything))
-    result = polish(shooting, start, free, states=model.states, iterations=4, tolerance=0.1, settled=True)
-    return as_model(shooting, result, free, causes)
+    gone = set(free_names(model.causes)) - set(free_names(left.causes))
+    free = _boxed(shooting, [n for n in clutter_names(model, listed) if n not in gone], left.theta)
+    result = polish(shooting, left.theta, free, states=model.states, iterations=5, tolerance=0.1, settled=True)
+    return as_model(shooting, result, free, left.causes)
 
 
 def ordinary(shooting: Shooting, model: Model, cause: Candidate, listed: Sequence[Candidate]) -> bool:
@@ -112,22 +106,6 @@ def _boxed(shooting: Shooting, names: Sequence[str], theta: FloatArray) -> Free:
             entry = replace(entry, lower=max(entry.lower, value - room), upper=min(entry.upper, value + room))
         out.append(entry)
     return Free(tuple(out))
-
-
-def _predicted(
-    shooting: Shooting, model: Model, names: list[str], free: Free, gone: list[str], theta: FloatArray,
-    everything: Linearised,
-) -> FloatArray:  # fmt: skip
-    """Step of `free` that makes up best for the loss of `gone`, from the linearised problem."""
-    place = {n: i for i, n in enumerate(names)}
-    mine = np.array([place[n] for n in free.names])
-    lost = np.array([place[n] for n in gone], dtype=np.intp)
-    h, g = everything.gram.sum(axis=0), everything.grad.sum(axis=0)
-    z = scaled_difference(shooting.free(gone), model.theta, theta)
-    prior = default_prior(shooting, free)
-    return bounded_step(
-        free, theta, h[np.ix_(mine, mine)] + np.diag(1.0 / prior.sigma**2), g[mine] + h[np.ix_(mine, lost)] @ z
-    )
 
 
 _ALL = ""
@@ -172,9 +150,9 @@ def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]
     if not model.causes:
         return {}
     model = replace(model, states=settled_states(decisive, model))
-    everything = decisive.linearise(model.theta, decisive.free(clutter_names(model, listed)), model.states)
-    out = {c.label: without_in_clutter(decisive, model, c, listed, everything) for c in model.causes}
-    return out | {_ALL: without_in_clutter(decisive, model, None, listed, everything)}
+    return {
+        _ALL if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
+    }
 
 
 def _on_blocks(nominal: Model, model: Model, rest: dict[str, Model]) -> tuple[Validation, list[Worth]]:

@@ -27,10 +27,7 @@ from quadid.model.rollout import CHANNEL_NAMES
 from quadid.types import FloatArray
 
 SMOOTH = 3
-"""Neighbouring modes averaged before they are judged …"""
-RESOLVED = SPECTRUM_SMOOTH / (2.0 * SPECTRUM_SECONDS)
-"""… and, where the spectrum of the noise was taken from the data, as many as lie within this width [Hz], which is what
-that spectrum resolves: a line of vibration narrower than it is noise."""
+"""Neighbouring modes averaged before they are judged."""
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
 CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
@@ -39,7 +36,6 @@ CHANGE_ALARM = 30.0
 """Chi-square of one signal alone that no luck brings among a few hundred …"""
 CHANGE_SHARE = 0.008
 """… and the share of the finding's own chi-square that it must reach: an untidy vehicle has a little of everything."""
-_ATTITUDE = (3, 4, 5)
 
 
 @dataclass(frozen=True)
@@ -110,7 +106,7 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
     rate = 1.0 / shooting.dt
     out = []
     for c in range(found.shape[0]):
-        if c in _ATTITUDE or not np.isfinite(found[c]).all() or segments[c] < 5:
+        if 3 <= c < 6 or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
         out.append(_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
     followed, alone = follows(shooting, model)
@@ -121,7 +117,9 @@ def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: 
     spacing = 0.5 * rate / len(found)
     frequency = spacing * np.arange(len(found))
     usable = null > 0.3  # modes the initial state takes away say nothing
-    wide = max(SMOOTH, 2 * round(0.5 * RESOLVED / spacing) + 1)
+    # Where the noise spectrum came from the data, a line of vibration narrower than it resolves is noise.
+    resolved = SPECTRUM_SMOOTH / (2.0 * SPECTRUM_SECONDS)
+    wide = max(SMOOTH, 2 * round(0.5 * resolved / spacing) + 1)
     own = [_band(found, null, usable, segments, width) for width in (SMOOTH, wide)]
     ratio, z = (np.where(frequency < LOWEST, slow, fast) for slow, fast in zip(*own, strict=True))
     k = int(np.argmax(z))

@@ -224,10 +224,10 @@ def _refits(
         lost: deviance that `model` lost when another cause left it, to be gained again.
     """
     gained = 0.0
-    for draft in sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d.drop):
-        if lost + draft.drop < max(least, near * gained):
+    for score, start in sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d[0].drop):
+        if lost + score.drop < max(least, near * gained):
             break
-        trial = _tried(shooting, model, draft)
+        trial = _tried(shooting, model, score, start)
         gained = max(gained, lost + model.deviance - trial.model.deviance)
         yield trial
 
@@ -236,34 +236,22 @@ def _removable(model: Model) -> list[Candidate]:
     return [c for c in model.causes if not any(x.requires in (c.effect, c.label) and x is not c for x in model.causes)]
 
 
-@dataclass(frozen=True)
-class Draft:
-    """A move worth making: what it should gain, and where to start."""
-
-    score: Score
-    drop: float
-    start: FloatArray | Sketch | None
-
-
-def _draft(shooting: Shooting, model: Model, score: Score) -> Draft:
-    """Linear causes start from the model, others where one linearisation from the best of their starts leads."""
+def _draft(shooting: Shooting, model: Model, score: Score) -> tuple[Score, FloatArray | Sketch]:
+    """What to expect of a refit and where it starts: causes that no slope at neutral shows, where a sketch leads."""
     if score.candidate.starts:
         drawn = sketch(shooting, model, score.candidate)
-        return Draft(score, drawn.drop, drawn)
-    return Draft(score, score.drop, model.theta)
+        return replace(score, drop=drawn.drop), drawn
+    return score, model.theta
 
 
-def _tried(shooting: Shooting, model: Model, draft: Draft) -> Trial:
-    """Refits `model` with the cause of a draft."""
-    candidate, time = draft.score.candidate, draft.score.time
-    start = draft.start
-    if candidate.timed is not None and time is not None:
-        start = model.theta.copy()
-        start[candidate.timed] = time
-    extended = extend(shooting, model, candidate, start, tried=float(draft.score.trials))
-    if candidate.timed is not None:
-        extended = _refine_time(shooting, extended, candidate)
-    return Trial(candidate, draft.score.gone, extended)
+def _tried(shooting: Shooting, model: Model, score: Score, start: FloatArray | Sketch) -> Trial:
+    """Refits `model` with a cause; one that begins at a moment where the scan found it, then refined."""
+    if score.time is None:
+        return Trial(score.candidate, score.gone, extend(shooting, model, score.candidate, start, tried=score.trials))
+    theta = model.theta.copy()
+    theta[score.candidate.timed] = score.time
+    extended = extend(shooting, model, score.candidate, theta, tried=score.trials)
+    return Trial(score.candidate, score.gone, _refine_time(shooting, extended, score.candidate))
 
 
 def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Model:
