@@ -7,20 +7,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from quadid_cli.options import JsonTarget, OutFolder, VehicleName
+from quadid_cli.options import JsonTarget, OutFolder, shipped_names
 
 if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
 
 
 def export(
-    vehicle: VehicleName,
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
+        ),
+    ] = None,
     form: Annotated[
         str,
         typer.Option(
-            "--format", metavar="F", help="yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco or urdf."
+            "--format",
+            metavar="F",
+            help="yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco, urdf, drone-models or isaac-lab.",
         ),
     ] = "yaml",
+    what: Annotated[bool, typer.Option("--list", help="Print which effects each form carries, and end.")] = False,
     history: Annotated[
         Path | None,
         typer.Option(
@@ -40,6 +48,11 @@ def export(
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
+    if what:
+        listed(json)
+        return
+    if vehicle is None:
+        raise typer.BadParameter("whose parameters? give --vehicle, or --list", param_hint="--vehicle")
     described, source = load_vehicle(vehicle), Path(vehicle).name
     if history is not None:
         described, source = _accepted(described, history, name or described.name)
@@ -56,6 +69,19 @@ def export(
     for file in done.result["files"]:
         console.print(f"Written: {file}", soft_wrap=True)
     terminal.warn(done.result["warnings"])
+
+
+def listed(json: str | None) -> None:
+    """Prints what each form carries."""
+    from quadid.report.programs import FORMS
+    from quadid.workflow.export import forms
+    from quadid_cli import output, tables, terminal
+
+    carried = {name: {"program": form.program, "effects": list(form.carried)} for name, form in FORMS.items()}
+    output.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
+    console = terminal.console(quiet=json == "-")
+    tables.print_tables(console, forms())
+    console.print("\nEvery form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names.")
 
 
 def _accepted(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:

@@ -69,6 +69,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export": (
         "quadid export --vehicle pelican.fitted.yaml --format px4 --out params",
         "quadid export --vehicle pelican --history h.sqlite --format ardupilot",
+        "quadid export --list",
     ),
     "fleet": (
         "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",

@@ -11,6 +11,7 @@ from quadid.workflow.files import file_name, write_text
 from quadid.workflow.loading import as_vehicle
 
 if TYPE_CHECKING:
+    from quadid.report.text_table import TextTable
     from quadid.vehicle import Vehicle
 
 
@@ -45,7 +46,7 @@ def export(
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
-        form: yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco or urdf.
+        form: one of `quadid.report.programs.FORMATS`.
         source: where the values come from, for the file; default the vehicle's file or name.
         anyway: write the values of a fit that is not proven; the file says so at its top.
 
@@ -72,3 +73,21 @@ def export(
         "schema": "quadid.export/1", "vehicle": described.name, "format": form, "files": [], "warnings": warnings,
     }  # fmt: skip
     return Exported(result, texts)
+
+
+def forms() -> list[TextTable]:
+    """What each form carries, in two tables that fit a terminal; what it does not carry is named in its file."""
+    from quadid.effects import EFFECTS
+    from quadid.report.programs import FORMS
+    from quadid.report.text_table import Column, TextTable
+
+    out = []
+    for part in (
+        ("px4", "ardupilot", "gazebo", "agilicious"),
+        ("rotorpy", "mujoco", "urdf", "drone-models", "isaac-lab"),
+    ):
+        rows = [(effect, *("yes" if effect in FORMS[name].carried else "-" for name in part)) for effect in EFFECTS]
+        columns = (Column("effect"), *(Column(name) for name in part))
+        programs = ", ".join(FORMS[name].program for name in part)
+        out.append(TextTable(f"Effects carried to {programs}", columns, tuple(row for row in rows if "yes" in row)))
+    return out

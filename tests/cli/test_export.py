@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -183,8 +185,10 @@ def test_awkward_names_break_nothing(vehicle: Vehicle) -> None:
         for ending, text in export(odd, form, "--x--.yaml").items():
             if ending == ".sdf":
                 ET.fromstring(text)
-            if ending == "_params.py":
+            if ending.endswith(".py"):
                 compile(text, "x", "exec")
+            if ending == ".params.toml":
+                tomllib.loads(text)
 
 
 def test_what_nothing_proves_is_asked_about_and_says_so_at_its_top(
@@ -205,3 +209,36 @@ def test_what_nothing_proves_is_asked_about_and_says_so_at_its_top(
     run = inside("export", "--vehicle", green.save(tmp_path / "good.yaml"), "--format", "px4", "--out", tmp_path)
     assert run.code == 0
     assert "NOT PROVEN" not in next(tmp_path.glob("*.params")).read_text(encoding="utf-8")
+
+
+def test_the_list_names_what_the_files_leave_out(inside: Cli, vehicle: Vehicle) -> None:
+    carried = inside("export", "--list", "--json", "-").data["formats"]
+    assert set(carried) == set(FORMATS)
+    assert "drone-models" in inside("export", "--list").out
+    cross = Vehicle.shipped("pelican_x")
+    every = vehicle.model_copy(
+        update={"rotors": cross.rotors, "effects": {**vehicle.effects, "weak_rotor": {"loss_2": 0.04}}}
+    )
+    for form in FORMATS:
+        for text in export(every, form, "x").values():
+            said = [line for line in text.splitlines() if "have no place here" in line]
+            left = set(said[0].split(": ")[1].split(", ")) if said else set()
+            assert set(every.effects) - left <= set(carried[form]["effects"]), form
+    # Where the full rotor speed is not known, PX4 holds nothing of single rotors.
+    unknown = every.model_copy(update={"command": Command()})
+    assert "weak_rotor" in next(iter(export(unknown, "px4", "x").values())).split("no place here")[1].split("\n")[0]
+
+
+def test_isaac_lab_ranges_are_the_intervals(vehicle: Vehicle) -> None:
+    text = export(vehicle, "isaac-lab", "x")["_isaaclab.py"].replace("from isaaclab_contrib", "#")
+    space: dict[str, Any] = {"ThrusterCfg": dict}
+    exec(text, space)
+    thrusters, turns = space["THRUSTERS"], (2.0 * math.pi) ** 2
+    low, high = thrusters["thrust_const_range"]
+    assert (low, high) == pytest.approx((turns * (2.3e-5 - 1.96e-7), turns * (2.3e-5 + 1.96e-7)), rel=1e-4)
+    assert thrusters["tau_inc_range"] == (0.03, 0.03)
+    assert space["J_XX_RANGE"] == (vehicle.parameters["J_xx"].initial,) * 2  # not from data
+    speeds = np.array([400.0, 420.0, 380.0, 450.0])
+    thrust, moment = _wrench(vehicle, speeds)
+    force = np.array(space["ALLOCATION_MATRIX"]) @ (2.3e-5 * speeds**2)
+    np.testing.assert_allclose(force, [0.0, 0.0, thrust, *moment * [1.0, -1.0, -1.0]], rtol=1e-6, atol=1e-9)

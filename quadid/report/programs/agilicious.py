@@ -5,7 +5,7 @@ from __future__ import annotations
 from quadid.errors import ParameterError
 from quadid.report.programs.facts import TO_FLU, Facts
 
-_CARRIED = ("cg_offset", "motor_lag", "rotor_drag")
+CARRIED = ("cg_offset", "motor_lag", "rotor_drag")
 _PLACES = {"fr": (1, -1), "bl": (-1, 1), "br": (-1, -1), "fl": (1, 1)}
 """Its rotors in its order: signs of x forward and y left."""
 _SPINS = {"fr": 1, "bl": 1, "br": -1, "fl": -1}
@@ -51,7 +51,7 @@ def agilicious(facts: Facts) -> str:
         ("aero_coeff_3", _row((0.0, 0.0, 0.0)), "kg s/m^2"),
         ("aero_coeff_h", "0.0", "kg/m"),
     ]
-    lines = [f"# {line}" for line in facts.header(_CARRIED)]
+    lines = [f"# {line}" for line in facts.header(CARRIED)]
     lines.append("# omega_max [rad/s] and the control gains are not in the flight: keep your own.")
     return "\n".join([*lines, *(f"{n}: {value}{f'  # {unit}' if unit else ''}" for n, value, unit in rows)]) + "\n"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from quadid.report.programs.facts import Facts
 
+CARRIED = ("thrust_curve",)
 _SITL_PWM = (1000.0, 2000.0)
 
 
@@ -64,4 +65,4 @@ def thrust_expo(facts: Facts) -> float | None:
 
 
 def _carried(facts: Facts) -> tuple[str, ...]:
-    return ("thrust_curve",) if thrust_expo(facts) is not None else ()
+    return CARRIED if thrust_expo(facts) is not None else ()

@@ -2,18 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, nearest
-from quadid.report.programs.agilicious import agilicious
-from quadid.report.programs.ardupilot import ardupilot_frame, ardupilot_parameters
+from quadid.report.programs import agilicious, ardupilot, drone_models, gazebo, isaac_lab, mujoco, px4, rotorpy, urdf
 from quadid.report.programs.facts import Facts
-from quadid.report.programs.gazebo import gazebo
-from quadid.report.programs.mujoco import mujoco
-from quadid.report.programs.px4 import px4
-from quadid.report.programs.rotorpy import rotorpy
-from quadid.report.programs.urdf import urdf
 from quadid.vehicle import Vehicle
 
-FORMATS = ("yaml", "px4", "ardupilot", "gazebo", "rotorpy", "agilicious", "mujoco", "urdf")
+
+class Form(NamedTuple):
+    """The form of another program.
+
+    Attributes:
+        program: whose.
+        carried: effects that it can hold; all others are named in the file as left out.
+        texts: makes the text that belongs in a file, by the ending of its name.
+    """
+
+    program: str
+    carried: tuple[str, ...]
+    texts: Mapping[str, Callable[[Facts], str]]
+
+
+def _yaml(facts: Facts) -> str:
+    head = facts.header((*facts.vehicle.effects, "residual"))
+    return "".join(f"# {line}\n" for line in head) + facts.vehicle.to_yaml()
+
+
+FORMS: dict[str, Form] = {
+    "yaml": Form("quadid", tuple(EFFECTS), {".yaml": _yaml}),
+    "px4": Form("PX4, SIH, EKF2", px4.CARRIED, {".params": px4.px4}),
+    "ardupilot": Form(
+        "ArduPilot, SITL", ardupilot.CARRIED,
+        {".param": ardupilot.ardupilot_parameters, ".sitl.json": ardupilot.ardupilot_frame},
+    ),
+    "gazebo": Form("Gazebo", gazebo.CARRIED, {".sdf": gazebo.gazebo}),
+    "rotorpy": Form("RotorPy", rotorpy.CARRIED, {"_params.py": rotorpy.rotorpy}),
+    "agilicious": Form("Agilicious", agilicious.CARRIED, {".agilicious.yaml": agilicious.agilicious}),
+    "mujoco": Form("MuJoCo", mujoco.CARRIED, {".mjcf.xml": mujoco.mujoco}),
+    "urdf": Form("URDF", urdf.CARRIED, {".urdf": urdf.urdf}),
+    "drone-models": Form("drone-models, crazyflow", drone_models.CARRIED, {".params.toml": drone_models.drone_models}),
+    "isaac-lab": Form("Isaac Lab", isaac_lab.CARRIED, {"_isaaclab.py": isaac_lab.isaac_lab}),
+}  # fmt: skip
+FORMATS = tuple(FORMS)
 
 
 def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
@@ -30,23 +63,7 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
     Raises:
         ParameterError: unknown form.
     """
+    if form not in FORMS:
+        raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
     facts = Facts(vehicle, source)
-    if form == "yaml":
-        return {
-            ".yaml": "".join(f"# {line}\n" for line in facts.header((*vehicle.effects, "residual"))) + vehicle.to_yaml()
-        }
-    if form == "px4":
-        return {".params": px4(facts)}
-    if form == "ardupilot":
-        return {".param": ardupilot_parameters(facts), ".sitl.json": ardupilot_frame(facts)}
-    if form == "gazebo":
-        return {".sdf": gazebo(facts)}
-    if form == "rotorpy":
-        return {"_params.py": rotorpy(facts)}
-    if form == "agilicious":
-        return {".agilicious.yaml": agilicious(facts)}
-    if form == "mujoco":
-        return {".mjcf.xml": mujoco(facts)}
-    if form == "urdf":
-        return {".urdf": urdf(facts)}
-    raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
+    return {end: write(facts) for end, write in FORMS[form].texts.items()}

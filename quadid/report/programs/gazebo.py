@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.report.programs.facts import TO_FLU, Facts
 
-_CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "weak_rotor")
+CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "weak_rotor")
 ROTOR_MASS = 1e-3
 """Share of the mass that each rotor link gets; taken off the body, so that the whole vehicle keeps mass and inertia."""
 SHORTEST_LAG = 1e-3
@@ -24,7 +24,7 @@ def gazebo(facts: Facts) -> str:
     name = escape(facts.vehicle.name)
     arms = facts.arms @ TO_FLU
     # Two hyphens would end the comment.
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(_CARRIED))
+    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
     rotors = "".join(_rotor(facts, i, arm) for i, arm in enumerate(arms))
     plugins = "".join(_plugin(facts, i) for i in range(len(arms)))
     body, mass = _body_inertia(facts, arms)

@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.report.programs.facts import TO_FLU, Facts
 
-_CARRIED = ("cg_offset", "product_of_inertia", "weak_rotor")
+CARRIED = ("cg_offset", "product_of_inertia", "weak_rotor")
 
 
 def mujoco(facts: Facts) -> str:
@@ -19,7 +19,7 @@ def mujoco(facts: Facts) -> str:
     thrust at full command where the full rotor speed is known.
     """
     # Two hyphens would end the comment.
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(_CARRIED))
+    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
     inertia = TO_FLU @ facts.inertia @ TO_FLU
     full = " ".join(f"{float(inertia[i, j]) + 0.0:.8g}" for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     arms = facts.arms @ TO_FLU

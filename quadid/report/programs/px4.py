@@ -7,7 +7,7 @@ import numpy as np
 from quadid.report.programs.facts import Facts
 
 _FLOAT, _INT = 9, 6  # MAV_PARAM_TYPE
-_CARRIED = (
+CARRIED = (
     "cg_offset",
     "weak_rotor",
     "product_of_inertia",
@@ -26,7 +26,9 @@ def px4(facts: Facts) -> str:
     CA_ROTORn_KM is torque over thrust [m], positive for rotors that turn counterclockwise seen from above, as ours of
     spin +1 do; CA_ROTORn_CT is the thrust at full command [N], which needs the full rotor speed.
     """
-    lines = [f"# {line}" for line in facts.header(_CARRIED)]
+    # Losses of single rotors stand in CA_ROTORn_CT, which needs the full rotor speed.
+    carried = CARRIED if facts.max_speed is not None else tuple(n for n in CARRIED if n != "weak_rotor")
+    lines = [f"# {line}" for line in facts.header(carried)]
     lines += ["# Motor 1 of PX4 is rotor 1 of the vehicle file. Check with the propellers off.", "#"]
     rows: list[tuple[str, float, int]] = [("CA_ROTOR_COUNT", len(facts.vehicle.rotors), _INT)]
     for i, (rotor, arm) in enumerate(zip(facts.vehicle.rotors, facts.arms, strict=True)):

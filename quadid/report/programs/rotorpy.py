@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from quadid.report.programs.facts import TO_FLU, Facts
 
-_CARRIED = (
+CARRIED = (
     "cg_offset",
     "product_of_inertia",
     "motor_lag",
@@ -44,7 +44,7 @@ def rotorpy(facts: Facts) -> str:
         ("rotor_speed_min", 0.0, "rad/s"), ("rotor_speed_max", fastest, f"rad/s, {origin}"),
         ("motor_noise_std", 0.0, "rad/s"),
     ]  # fmt: skip
-    lines = [f"# {line}" for line in facts.header(_CARRIED)]
+    lines = [f"# {line}" for line in facts.header(CARRIED)]
     lines += ["", "import numpy as np", "", "quad_params = {"]
     lines += [f'    "{name}": {_number(value)},  # {unit}' for name, value, unit in entries]
     lines += [

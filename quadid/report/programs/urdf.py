@@ -7,12 +7,12 @@ from xml.sax.saxutils import quoteattr
 
 from quadid.report.programs.facts import TO_FLU, Facts
 
-_CARRIED = ("cg_offset", "product_of_inertia")
+CARRIED = ("cg_offset", "product_of_inertia")
 
 
 def urdf(facts: Facts) -> str:
     """Returns the URDF of one body with a massless frame at every rotor; thrust is named in the comment only."""
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(_CARRIED))
+    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
     inertia = TO_FLU @ facts.inertia @ TO_FLU
     names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
     tensor = " ".join(f'{n}="{float(inertia[i, j]) + 0.0:.8g}"' for n, i, j in names)
