@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from quadid.health.comparison import Explained, compare, distance, p_healthy
 from quadid.health.hypotheses import hypotheses
@@ -142,7 +142,7 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     changed = p_value < SIGNIFICANT
     rest = change - found[0].hypothesis.effect @ found[0].value
     left = float((distance(rest, deviation, healthy.freedom) ** 2).sum())
-    explained = float(chi2.sf(left, len(AXES))) > _UNEXPLAINED
+    explained = float(chdtrc(len(AXES), left)) > _UNEXPLAINED
     verdict = "unchanged" if not changed else "changed" if explained else "unknown"
     changes = _changes(found, vehicle, verdict == "changed")
     score = float(np.sqrt((far**2).sum()))

@@ -7,9 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.special import chdtrc, fdtrc, log_ndtr, ndtri, stdtr
 
 from quadid.health.hypotheses import Hypothesis
 from quadid.health.spread import Healthy
@@ -38,13 +36,13 @@ class Explained(NamedTuple):
 def distance(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> FloatArray:
     """Each trim's change as a standard normal deviate of the same probability as its Student t, shape (4,)."""
     z = np.abs(change) / deviation
-    far = np.asarray(norm.isf(np.maximum(student.sf(z, freedom), 1e-300)))
+    far = -ndtri(np.maximum(stdtr(freedom, -z), 1e-300))
     return np.asarray(np.sign(change) * far)
 
 
 def p_healthy(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> float:
     """Chance that healthy flights differ by `change` or more: chi-square of its `distance`."""
-    return float(chi2.sf((distance(change, deviation, freedom) ** 2).sum(), len(change)))
+    return float(chdtrc(len(change), (distance(change, deviation, freedom) ** 2).sum()))
 
 
 def explain(change: FloatArray, healthy: Healthy, flights: int, hypothesis: Hypothesis) -> Explained:
@@ -69,7 +67,7 @@ def explain(change: FloatArray, healthy: Healthy, flights: int, hypothesis: Hypo
     covariance = scale * (p - gain @ a @ p)
     evidence = -tail * np.log1p(quadratic / freedom) - 0.5 * float(np.linalg.slogdet(spread)[1])
     for k in hypothesis.positive:
-        evidence += float(norm.logcdf(value[k] / np.sqrt(covariance[k, k]))) + np.log(2.0)
+        evidence += float(log_ndtr(value[k] / np.sqrt(covariance[k, k]))) + np.log(2.0)
     return Explained(
         hypothesis, evidence + hypothesis.log_odds, value, covariance, _along(change, deviation, a, freedom)
     )
@@ -81,7 +79,7 @@ def _along(change: FloatArray, deviation: FloatArray, a: FloatArray, freedom: fl
     basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
     kept = basis[:, sizes > 1e-9 * sizes[0]]
     part = float(((kept.T @ z) ** 2).sum())
-    return float(fisher.sf(part / kept.shape[1], kept.shape[1], freedom))
+    return float(fdtrc(kept.shape[1], freedom, part / kept.shape[1]))
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:

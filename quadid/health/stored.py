@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,4 +25,4 @@ def flight_from_dict(data: Mapping[str, Any]) -> FlightTrim:
     if shares.ndim != 1 or not all(np.isfinite(v).all() for v in (mean, parts, shares, wander)):
         raise ValueError("numbers that are not finite")
     seconds = float(data["seconds"])
-    return FlightTrim(str(data["name"]), mean, parts, shares, wander, math.nan, seconds, str(data["channels"]))
+    return FlightTrim(str(data["name"]), mean, parts, shares, wander, seconds, str(data["channels"]))

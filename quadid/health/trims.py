@@ -46,7 +46,6 @@ class FlightTrim(NamedTuple):
         parts: the same of parts of the flight (between landings, else thirds), shape (parts, 4).
         shares: each rotor's share of sum(w), shape (rotors,).
         wander: standard deviation of means of three seconds about the flight's, shape (4,).
-        vibration: logarithm of the accelerometer's noise above a quarter of its rate [log m/s²]; NaN without it.
         seconds: of steady flight.
         channels: what the effort and the motion were taken from, for people.
     """
@@ -56,7 +55,6 @@ class FlightTrim(NamedTuple):
     parts: FloatArray
     shares: FloatArray
     wander: FloatArray
-    vibration: float
     seconds: float
     channels: str
 
@@ -107,7 +105,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
         recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), wander(rest),
-        _vibration(recording, edges), len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
+        len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
     )  # fmt: skip
 
 
@@ -205,16 +203,3 @@ def _parts(edges: FloatArray) -> Sequence[NDArray[np.intp]]:
     parts = np.split(np.arange(len(edges)), breaks)
     long = [part for part in parts if len(part) >= 3]
     return long if len(long) > 1 else np.array_split(np.arange(len(edges)), 3)
-
-
-def _vibration(recording: Recording, edges: FloatArray) -> float:
-    """Logarithm of the root mean square of second differences of the force along z, as a level of white noise."""
-    for name in ("accel", "accel_z", "accel_world"):
-        channel = recording.channels.get(name)
-        if channel is None or len(channel.t) < 3:
-            continue
-        inside = np.searchsorted(edges, channel.t, side="right") - 1
-        flying = (inside >= 0) & (channel.t - edges[np.maximum(inside, 0)] < BLOCK)
-        bend = np.diff(channel.values[:, -1], 2)[flying[1:-1]]
-        return float(np.log(np.sqrt(np.mean(bend**2) / 6.0) + 1e-9)) if len(bend) else np.nan
-    return np.nan

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from quadid.health.changes import Change, changes_of
 from quadid.health.comparison import distance, p_healthy
@@ -40,6 +41,8 @@ _STEADY_FORCE = 0.1
 """A second whose specific force differs from gravity by more than this share is no steady flight."""
 _AIRBORNE = 0.5
 """Flying is at least this share of the usual load."""
+_NO_MASS = (math.nan, math.nan, math.nan)
+"""Said by one object: reports of equal content are equal."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,11 @@ class HealthReport:
         verdict: unchanged, changed or unknown.
         has_baseline: whether there are enough healthy flights to compare with.
         score: as `Health.score`; NaN without a baseline.
-        changes: what changed, the most probable explanation.
+        changes: what changed, the most probable explanation; empty where nothing did.
         rotor_loss: fraction of thrust that each rotor lost, shape (rotors,); NaN without a baseline.
         rotor_interval: 95 % intervals, shape (rotors, 2).
+        mass: mass that the rotors carry by the thrust of the baseline, and its 95 % interval [kg], shape (3,); NaN
+            without a baseline, where commands say nothing of thrust, and where a rotor or all of them lost thrust.
         text: one sentence.
     """
 
@@ -64,6 +69,7 @@ class HealthReport:
     changes: tuple[Change, ...]
     rotor_loss: tuple[float, ...]
     rotor_interval: tuple[tuple[float, float], ...]
+    mass: tuple[float, float, float]
     text: str
 
 
@@ -118,7 +124,7 @@ class HealthWatch:
             return None
         mean = trims.mean(axis=0)
         parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
-        kept = FlightTrim("", mean, parts, shares, wander(trims), np.nan, float(len(trims)), "in flight")
+        kept = FlightTrim("", mean, parts, shares, wander(trims), float(len(trims)), "in flight")
         self.history.append(kept)
         self._land()
         return kept
@@ -126,6 +132,7 @@ class HealthWatch:
     def _land(self) -> None:
         """Forgets the flight; looks at the history anew."""
         self._trims: list[FloatArray] = []
+        self._before = np.zeros(len(AXES))
         self._shares: list[FloatArray] = []
         self._suspect = False
         self._alarm: HealthReport | None = None
@@ -137,17 +144,20 @@ class HealthWatch:
     def _without_baseline(self, t: float) -> HealthReport:
         n = len(self._vehicle.rotors)
         text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
-        # The one NaN of the module: reports of equal content are equal.
-        return HealthReport(t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, text)
+        return HealthReport(
+            t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, _NO_MASS, text
+        )
 
     def _judged(self, t: float, healthy: Healthy) -> HealthReport | None:
         if self._alarm is not None or len(self._trims) < RECENT:
             return None
         now = np.mean(self._trims[-RECENT:], axis=0)
         against = [self._of_history(healthy)]
-        before = self._trims[: -RECENT - GUARD]
-        if len(before) >= SETTLING:
-            against.append(self._of_flight(np.mean(before, axis=0), len(before), healthy))
+        before = len(self._trims) - RECENT - GUARD
+        if before > 0:
+            self._before += self._trims[before - 1]
+        if before >= SETTLING:
+            against.append(self._of_flight(self._before / before, before, healthy))
         chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
         worst = int(np.argmin(chances))
         rare = chances[worst] < RARE
@@ -168,21 +178,33 @@ class HealthWatch:
         """The yardstick for seconds of the same flight."""
         freedom = np.full(len(AXES), 10.0 * len(self.history))
         flights = max(seconds // RECENT, 1)
-        shares = np.mean(self._shares[:seconds], axis=0)
-        return Healthy(mean, self._wander, freedom, flights, shares)
+        return healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=flights)
 
     def _report(self, t: float, now: FloatArray, against: Healthy, verdict: str) -> HealthReport:
-        shares = np.mean(self._shares[-RECENT:], axis=0)
-        changes = changes_of(now - against.mean, against, 1, self._vehicle, shares, verdict == "changed")
+        change, changes = now - against.mean, ()
+        if verdict == "changed":
+            shares = np.mean(self._shares[-RECENT:], axis=0)
+            changes = changes_of(change, against, 1, self._vehicle, shares, changed=True)
         n = len(self._vehicle.rotors)
         loss, interval = [0.0] * n, [(0.0, 0.0)] * n
-        for change in changes if verdict == "changed" else ():
-            if change.effect == "weak_rotor":
-                numbers = {name: (value, ci) for name, _, value, ci in change.parameters}
+        for one in changes:
+            if one.effect == "weak_rotor":
+                numbers = {name: (value, ci) for name, _, value, ci in one.parameters}
                 j = int(numbers["rotor"][0]) - 1
                 loss[j] = numbers["loss"][0]
                 interval[j] = numbers["loss"][1] or (np.nan, np.nan)
-        far = distance(now - against.mean, against.predictive(1), against.freedom)
-        text = " ".join(change.evidence for change in changes) if verdict == "changed" else "as in healthy flights"
-        score = float(np.sqrt((far**2).sum()))
-        return HealthReport(t, verdict, True, score, changes, tuple(loss), tuple(interval), text)
+        far = distance(change, against.predictive(1), against.freedom)
+        text = " ".join(one.evidence for one in changes) or "as in healthy flights"
+        score, mass = float(np.sqrt((far**2).sum())), self._mass(now, changes)
+        return HealthReport(t, verdict, True, score, changes, tuple(loss), tuple(interval), mass, text)
+
+    def _mass(self, now: FloatArray, changes: Sequence[Change]) -> tuple[float, float, float]:
+        """Mass by the thrust of the baseline and its 95 % interval [kg], from effort against the healthy flights'."""
+        known = self._vehicle.command.kind == "rotor_speed"
+        if self._healthy is None or not known or any(one.effect in ("weak_rotor", "thrust_drop") for one in changes):
+            return _NO_MASS
+        k, healthy = AXES.index("effort"), self._of_history(self._healthy)
+        half = float(stdtrit(healthy.freedom[k], 0.975) * healthy.predictive(1)[k])
+        more = float(now[k] - healthy.mean[k])
+        low, value, high = (self._vehicle.mass * math.exp(more + side) for side in (-half, 0.0, half))
+        return value, low, high

@@ -16,7 +16,7 @@ VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}
 
 def health_message(report: HealthReport, vehicle: str) -> dict[str, Any]:
     """quadid_msgs/Health of a report."""
-    nan = math.nan
+    mass, low, high = report.mass
     return {
         "header": {"stamp": stamp(report.t), "frame_id": FRAME},
         "vehicle_id": vehicle,
@@ -26,8 +26,8 @@ def health_message(report: HealthReport, vehicle: str) -> dict[str, Any]:
         "rotor_loss": list(report.rotor_loss),
         "rotor_loss_lower": [low for low, _ in report.rotor_interval],
         "rotor_loss_upper": [high for _, high in report.rotor_interval],
-        "mass": nan, "mass_lower": nan, "mass_upper": nan,
-        "changes": [_finding(change) for change in report.changes if report.verdict == "changed"],
+        "mass": mass, "mass_lower": low, "mass_upper": high,
+        "changes": [_finding(change) for change in report.changes],
         "text": report.text,
     }  # fmt: skip
 
@@ -55,8 +55,8 @@ def health_to_dict(report: HealthReport) -> dict[str, Any]:
     """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
     data: dict[str, Any] = jsonable({
         "schema": "quadid.health/1", "t": report.t, "verdict": report.verdict, "has_baseline": report.has_baseline,
-        "changes": [change.to_dict() for change in report.changes if report.verdict == "changed"],
+        "changes": [change.to_dict() for change in report.changes],
         "score": report.score, "rotor_loss": report.rotor_loss, "rotor_interval": report.rotor_interval,
-        "text": report.text,
+        "mass": report.mass, "text": report.text,
     })  # fmt: skip
     return data

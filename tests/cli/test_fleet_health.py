@@ -13,7 +13,7 @@ from quadid.report.fleet_summary import summarise
 from quadid.report.page import render
 from quadid.vehicle import Vehicle
 from quadid.workflow.fleet_health import BASELINE, FEWEST, health_trend
-from tests.health.hover import Wrong, hover
+from studies.health.flights import Wrong, hover
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 

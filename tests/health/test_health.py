@@ -12,7 +12,7 @@ from quadid.health.hypotheses import hypotheses
 from quadid.health.trims import trim_directions
 from quadid.vehicle import Command, Vehicle
 from quadid.window import Recording
-from tests.health.hover import Wrong, hover, squared_speeds
+from studies.health.flights import Wrong, hover, squared_speeds
 
 PELICAN_X, PELICAN = Vehicle.shipped("pelican_x"), Vehicle.shipped("pelican")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quadid.health.watch import ENOUGH, HealthWatch
-from quadid.vehicle import Vehicle
-from studies.health.flights import hover_seconds
+from quadid.vehicle import Command, Vehicle
+from studies.health.flights import Wrong, hover_seconds
 from studies.health.hours import alarms, named, practised
 
 PELICAN_X = Vehicle.shipped("pelican_x")
@@ -57,13 +57,35 @@ def test_a_damaged_or_short_flight_never_becomes_healthy_history() -> None:
 def test_a_vehicle_that_comes_back_damaged_is_found_from_its_history() -> None:
     rng = np.random.default_rng(4)
     watch = practised(rng)
-    losses = np.array([0.0, 0.0, 0.25, 0.0])
-    reports = [watch.second(float(t), *one) for t, one in enumerate(hover_seconds(PELICAN_X, 20, rng, losses=losses))]
+    damaged = hover_seconds(PELICAN_X, 20, rng, wrong=Wrong({3: 0.25}, {3: 0.25}))
+    reports = [watch.second(float(t), *one) for t, one in enumerate(damaged)]
     alarm = next(r for r in reports if r is not None and r.verdict == "changed")
     assert alarm.t <= 5.0
     assert alarm.changes[0].parameters[0][2] == 3.0
     assert alarm.rotor_loss[2] == pytest.approx(0.25, abs=0.05)
     assert alarm.rotor_interval[2][0] < alarm.rotor_loss[2] < alarm.rotor_interval[2][1]
+    assert np.isnan(alarm.mass).all(), "a rotor that lost thrust says nothing of mass"
+
+
+def test_mass_is_told_by_the_thrust_of_the_baseline() -> None:
+    rng = np.random.default_rng(6)
+    watch = practised(rng)
+    loaded = hover_seconds(PELICAN_X, 20, rng, wrong=Wrong(mass=0.15 * PELICAN_X.mass))
+    reports = [r for t, one in enumerate(loaded) if (r := watch.second(float(t), *one)) is not None]
+    value, low, high = reports[-1].mass
+    assert low < 1.15 * PELICAN_X.mass < high
+    assert value == pytest.approx(1.15 * PELICAN_X.mass, rel=0.03)
+    commanded = PELICAN_X.model_copy(update={"command": Command(kind="normalized", max_speed=900.0)})
+    other = HealthWatch(commanded, watch.history)
+    told = [other.second(float(t), *one) for t, one in enumerate(hover_seconds(PELICAN_X, 5, rng))]
+    assert all(np.isnan(r.mass).all() for r in told if r is not None), "commands sag with the battery"
+
+
+def test_what_differs_within_healthy_flights_is_no_change() -> None:
+    rng = np.random.default_rng(7)
+    watch = practised(rng)
+    told = [watch.second(float(t), *one) for t, one in enumerate(hover_seconds(PELICAN_X, 40, rng))]
+    assert {(r.verdict, r.changes) for r in told if r is not None} == {("unchanged", ())}
 
 
 def test_seconds_that_are_no_steady_flight_are_passed_over() -> None:

@@ -21,29 +21,17 @@ from quadid.online import Event, SessionSettings
 from quadid.online.records import HealthyFlight
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
-from studies.health.flights import hover_seconds
+from studies.health.flights import Wrong, hover_blocks
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 SETTINGS = SessionSettings(rate=25.0, window=60.0, refit=60.0, diagnose=0.0)
 RATE = 25
 
 
-def flown(
-    seed: int, begin: float, seconds: int = 40, losses: list[float] | None = None, onset: int = 0
-) -> Iterator[Sample]:
+def flown(seed: int, begin: float, seconds: int = 40, wrong: Wrong | None = None, onset: int = 0) -> Iterator[Sample]:
     """A hover with 6 s on the ground before and after; from `begin` [s] on."""
-    rng = np.random.default_rng(seed)
-    hidden = None if losses is None else np.array(losses)
-    aloft = list(hover_seconds(PELICAN_X, seconds, rng, losses=hidden, onset=onset))
-    ground = [(np.full(4, 100.0), 9.81)] * 6
-    for k, (load, force) in enumerate([*ground, *aloft, *ground]):
-        for i in range(RATE):
-            t = begin + k + i / RATE
-            speed = np.sqrt(load) * (1.0 + 0.002 * rng.normal(size=4))
-            yield Sample(t, "rotor_speed", tuple(speed.tolist()))
-            yield Sample(t, "gyro", tuple((0.01 * rng.normal(size=3)).tolist()))
-            yield Sample(t, "accel", (*(0.05 * rng.normal(size=2)).tolist(), -force + 0.05 * float(rng.normal())))
-            yield Sample(t, "attitude", (1.0, 0.0, 0.0, 0.0))
+    for block in hover_blocks(PELICAN_X, begin, seconds, np.random.default_rng(seed), wrong, onset, RATE):
+        yield from block.samples()
 
 
 def served(service: Service, samples: Iterator[Sample]) -> list[Output]:
@@ -89,7 +77,7 @@ def test_a_loss_of_a_tenth_is_named_within_five_seconds_of_its_onset(history: Pa
     copy = tmp_path / "copy.sqlite"
     copy.write_bytes(history.read_bytes())
     service = Service(PELICAN_X, SETTINGS, InlineWorker(), Store(copy, PELICAN_X.name))
-    out = served(service, flown(77, 1.8e9, losses=[0.0, 0.1, 0.0, 0.0], onset=30))
+    out = served(service, flown(77, 1.8e9, wrong=Wrong({2: 0.1}, {2: 0.1}), onset=30))
     alarm = next(o for o in out if isinstance(o, HealthReport) and o.verdict == "changed")
     onset = 1.8e9 + 6 + 30
     assert 0.0 < alarm.t - onset <= 5.0
@@ -99,6 +87,10 @@ def test_a_loss_of_a_tenth_is_named_within_five_seconds_of_its_onset(history: Pa
     assert len(warnings) == 1
     assert warnings[0].startswith("Rotor 2 ")
     assert not any(isinstance(o, HealthyFlight) for o in out), "a damaged flight is no baseline"
+    before = next(o for o in out if isinstance(o, HealthReport) and o.has_baseline)
+    message = health_message(before, "quad1")
+    assert message["mass_lower"] < message["mass"] < message["mass_upper"]
+    assert message["mass"] == pytest.approx(PELICAN_X.mass, rel=0.05)
     message = health_message(alarm, "quad1")
     assert (message["verdict"], message["has_baseline"]) == (1, True)
     assert message["changes"][0]["parameter_values"][0] == 2.0
