@@ -9,7 +9,7 @@ import argparse
 import os
 from pathlib import Path
 
-from studies.health import limits, recorded, simulated
+from studies.health import features, limits, recorded, simulated
 from studies.page import put_section
 
 TITLE = "Health: what changed in this vehicle"
@@ -34,11 +34,13 @@ def main() -> None:
             "### Score against size\n![Score against millimetres cut](health-score.png)"
         ),
         "limits": f"## What the spread of healthy flights allows\n{limits.text(judged)}",
+        "features": f"## What else the logs hold\n{features.text([j.flown for j in judged])}",
         "simulated": (
-            f"## Simulated flights\n`make health`, seed 7; Pelican (plus and X frame) of {simulated.SECONDS:.0f} s, "
-            f"hovering, gentle and lively in turn, {simulated.BASELINES} baseline flights each. From flight to flight "
-            "every rotor's thrust differs by 1 %, the battery sits 0.7 mm elsewhere, the load differs by 1 % (1 sigma)."
-            f"\n\n{simulated.table(chosen.each)}"
+            f"## Simulated flights\n`make health`, seed {simulated.SEED}; Pelican (plus and X frame) of "
+            f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each; in closed loop (`quadid.flight`) "
+            "hovering, gentle and lively in turn, and by the balance of a hover (`studies/health/flights.py`). From "
+            "flight to flight every rotor's thrust differs by 1 %, the battery sits 0.7 mm elsewhere, the load differs "
+            f"by 1 % (1 sigma).\n\n{simulated.table(chosen.each)}"
         ),
     }  # fmt: skip
     for name, text in parts.items():

@@ -1,72 +1,170 @@
-"""What the spread of healthy flights forbids: the same comparison when every cut does just what the mean cut does."""
+"""What the spread of healthy flights forbids: the same comparison when every cut does just what the mean cut does.
+
+Healthy flights differ mostly by their propellers.  Of an airframe whose M3 was cut ever shorter three propellers
+stayed, so its flights share a draw from the healthy spread; their counts are compared with counts of such draws.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from quadid.health import FlightTrim, Health, assess, healthy_spread
+from quadid.health import FlightTrim, Health, Healthy, assess, healthy_spread
 from quadid.health.changes import SIGNIFICANT
 from quadid.health.hypotheses import rotor_effect
-from studies.health.recorded import CRAZYFLIE, Flown, Judged
+from studies.health.recorded import CRAZYFLIE, LARGE, Judged, is_single, kind_right, named_first
 
-SIZES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
-DRAWS = 300
+AIRFRAMES = ("E8", "E9")
+CUT = 2
+"""The rotor whose propeller was cut alone, from 0."""
+SHOWN = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+MASSES = (0.01, 0.02, 0.03, 0.05, 0.08)
+Flags = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+
+class Power(NamedTuple):
+    """Draws of one size: called changed, M3 named first, called a rotor and not a weight; each of shape (draws,)."""
+
+    found: Flags
+    named: Flags
+    rotor: Flags
 
 
 def loss_per_mm(judged: Sequence[Judged]) -> float:
-    """Loss of thrust per millimetre cut from one propeller, least squares through zero over what was found."""
-    pairs = [
-        (j.flown.total, sum(p[2] for c in j.health.changes for p in c.parameters if p[0] == "loss"))
-        for j in judged
-        if j.flown.condition == "cut" and j.flown.rotors == set(j.named)
-    ]
+    """Loss of thrust per millimetre cut from one propeller, least squares through zero over all single cuts.
+
+    Found or not; each change of trim is projected on what a cut does, weighted with the healthy spread.
+    """
+    pairs = []
+    for j in (one for one in judged if is_single(one, 0.0, 99.0)):
+        healthy = j.health.healthy
+        effect = _effect(healthy, next(iter(j.flown.rotors)) - 1) / healthy.deviation
+        change = (j.health.trim - healthy.mean) / healthy.deviation
+        pairs.append((j.flown.total, effect @ change / (effect @ effect)))
     sizes, losses = np.array(pairs).T
     return float(sizes @ losses / (sizes @ sizes))
 
 
-def power(flights: Sequence[Flown], airframe: str, slope: float, seed: int = 1) -> list[tuple[float, float, float]]:
-    """For each size: share of simulated flights found, and share with M3 named first, from the healthy spread alone."""
-    rng = np.random.default_rng(seed)
-    baseline = [f.trim for f in flights if f.airframe == airframe and f.condition == "healthy"]
+def _effect(healthy: Healthy, rotor: int) -> FloatArray:
+    """Change of trim per loss of thrust and as much drag torque of a rotor, shape (4,)."""
+    return np.asarray(rotor_effect(CRAZYFLIE, rotor, float(healthy.shares[rotor]), healthy.mean).sum(axis=1))
+
+
+def power(judged: Sequence[Judged], airframe: str, moved: Callable[[Healthy], FloatArray], draws: int) -> Power:
+    """What is answered where `moved` shifts the trim of draws from the healthy spread of an airframe."""
+    rng = np.random.default_rng(1)
+    baseline = _baseline(judged, airframe)
     healthy = healthy_spread(baseline)
-    effect = rotor_effect(CRAZYFLIE, 2, float(healthy.shares[2]), healthy.mean).sum(axis=1)
     out = []
-    for size in SIZES:
-        found = named = 0
-        for _ in range(DRAWS):
-            noise = healthy.predictive(1) * rng.standard_t(healthy.freedom)
-            mean = healthy.mean + effect * slope * size + noise
-            result = _judged(mean, baseline)
-            found += result.p_value < SIGNIFICANT
-            first = result.changes[0] if result.changes else None
-            named += first is not None and first.effect == "weak_rotor" and first.parameters[0][2] == 3.0
-        out.append((size, found / DRAWS, named / DRAWS))
-    return out
+    for noise in healthy.predictive(1) * rng.standard_t(healthy.freedom, size=(draws, 4)):
+        mean = healthy.mean + moved(healthy) + noise
+        found: Health = assess([baseline[0]._replace(mean=mean)], baseline, CRAZYFLIE)
+        weak = bool(found.changes) and found.changes[0].effect == "weak_rotor"
+        first = weak and found.changes[0].parameters[0][2] == CUT + 1.0
+        out.append((found.p_value < SIGNIFICANT, first, weak))
+    return Power(*np.array(out).T)
 
 
-def _judged(mean: np.ndarray[tuple[int], np.dtype[np.float64]], baseline: list[FlightTrim]) -> Health:
-    return assess([baseline[0]._replace(mean=mean)], baseline, CRAZYFLIE)
+def _baseline(judged: Sequence[Judged], airframe: str) -> list[FlightTrim]:
+    return [j.flown.trim for j in judged if j.flown.airframe == airframe and j.flown.condition == "healthy"]
 
 
-def text(judged: Sequence[Judged]) -> str:
+Row = tuple[str, str, Callable[[Judged], bool], Callable[[Judged], bool], int]
+ROWS: tuple[Row, ...] = (
+    ("found, 3 mm and more", "≥ 95 %", lambda j: is_single(j, LARGE, 99.0), lambda j: j.changed, 0),
+    ("found, less than 3 mm", "–", lambda j: is_single(j, 0.0, LARGE), lambda j: j.changed, 0),
+    ("rotor named first, 3 mm and more", "≥ 95 %", lambda j: is_single(j, LARGE, 99.0), named_first, 1),
+    ("rotor named first, 1 to 2.5 mm", "≥ 75 %", lambda j: is_single(j, 1.0, LARGE), named_first, 1),
+    ("a propeller, not a weight, 3 mm and more", "≥ 90 %", lambda j: is_single(j, LARGE, 99.0), kind_right, 2),
+)  # fmt: skip
+
+
+def _expected(flown: Sequence[Judged], powers: dict[tuple[str, float], Power], column: int) -> str:
+    """Mean and 95 % range of the count of these flights, where those of an airframe share a draw."""
+    rng = np.random.default_rng(2)
+    counts = np.zeros(4000)
+    for airframe in AIRFRAMES:
+        mine = sum(powers[airframe, j.flown.total][column].astype(float) for j in flown if j.flown.airframe == airframe)
+        counts += rng.choice(mine, len(counts))
+    low, high = np.quantile(counts, [0.025, 0.975])
+    return f"{counts.mean():.1f} ({low:.0f} to {high:.0f})"
+
+
+def _percent(values: Sequence[Flags]) -> str:
+    return " | ".join(f"{100.0 * np.mean(v):.0f} %" for v in values)
+
+
+def text(judged: Sequence[Judged], draws: int = 200) -> str:
     """The limits as Markdown."""
-    flights = [j.flown for j in judged]
     slope = loss_per_mm(judged)
+    single = [j for j in judged if is_single(j, 0.0, 99.0) and j.flown.rotors == {CUT + 1}]
+    sizes = sorted({j.flown.total for j in single} | set(SHOWN))
+    powers = {(a, size): power(judged, a, partial(_cut, slope * size), draws) for a in AIRFRAMES for size in sizes}
     lines = [
-        f"A cut costs {100.0 * slope:.1f} % of thrust a millimetre (least squares over the single cuts whose rotor is "
-        "named). If every cut cost just that, and flights differed from the healthy mean as healthy flights do, "
-        f"{DRAWS} draws a size would give:",
-        "",
-        "| mm cut from M3 | E8 found | E8 named first | E9 found | E9 named first |",
-        "|---|---|---|---|---|",
-    ]
-    both = [power(flights, airframe, slope) for airframe in ("E8", "E9")]
-    for a, b in zip(*both, strict=True):
-        lines.append(f"| {a[0]:g} | " + " | ".join(f"{100.0 * v:.0f} %" for v in (*a[1:], *b[1:])) + " |")
-    for airframe in ("E8", "E9"):
-        spread = healthy_spread([f.trim for f in flights if f.airframe == airframe and f.condition == "healthy"])
-        shown = ", ".join(f"{100.0 * s:.2f}" for s in spread.deviation)
-        lines.append(f"\nSpread of healthy flights of {airframe} (roll, pitch, yaw, effort; %): {shown}.")
-    return "\n".join(lines)
+        f"A cut costs {100.0 * slope:.1f} % of thrust a millimetre (least squares over all single cuts). If every cut "
+        "cost just that, and flights differed from the healthy mean as healthy flights do (one draw for an airframe, "
+        "whose other propellers stayed), the single cuts would give:\n",
+        "| single cuts | wanted | expected (95 % of draws) | measured |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for what, wanted, chosen, right, column in ROWS:
+        mine = [j for j in single if chosen(j)]
+        got = f"{sum(right(j) for j in mine)} of {len(mine)}"
+        lines.append(f"| {what} | {wanted} | {_expected(mine, powers, column)} | {got} |")
+    head = " | ".join(f"{airframe} {what}" for airframe in AIRFRAMES for what in ("found", "named first"))
+    lines += [f"\n{draws} draws a size:\n", f"| mm cut from M3 | {head} |", "|---|---|---|---|---|"]
+    for size in SHOWN:
+        lines.append(f"| {size:g} | " + _percent([f for a in AIRFRAMES for f in powers[a, size][:2]]) + " |")
+    head = head.replace("named first", "not called a rotor")
+    lines += [f"\n| weight on the arm of M3, of the vehicle's | {head} |", "|---|---|---|---|---|"]
+    for mass in MASSES:
+        both = [power(judged, a, partial(_loaded, mass), draws) for a in AIRFRAMES]
+        lines.append(f"| {100.0 * mass:.0f} % | " + _percent([f for p in both for f in (p.found, ~p.rotor)]) + " |")
+    for airframe in AIRFRAMES:
+        spread = healthy_spread(_baseline(judged, airframe)).deviation
+        lines.append(f"\nSpread of {airframe} (roll, pitch, yaw, effort; %): between healthy flights {_shown(spread)}; "
+                     f"between two flights of one propeller {_shown(_again(judged, airframe))}.")  # fmt: skip
+    return "\n".join([*lines, "", _doubles(judged)])
+
+
+def _cut(loss: float, healthy: Healthy) -> FloatArray:
+    return loss * _effect(healthy, CUT)
+
+
+def _loaded(mass: float, healthy: Healthy) -> FloatArray:
+    """Change of trim by a mass (fraction of the vehicle's) at the cut rotor's hub, shape (4,)."""
+    x, y = CRAZYFLIE.rotors[CUT].position[:2]
+    return np.array([-y / CRAZYFLIE.arm * mass, x / CRAZYFLIE.arm * mass, 0.0, mass]) / (1.0 + mass)
+
+
+def _shown(values: FloatArray) -> str:
+    return ", ".join(f"{100.0 * v:.2f}" for v in values)
+
+
+def _again(judged: Sequence[Judged], airframe: str) -> FloatArray:
+    """Standard deviation of flights with the same damage, for either kind of log one."""
+    by: dict[object, list[FloatArray]] = {}
+    for j in judged:
+        if j.flown.airframe == airframe and j.flown.condition == "cut":
+            by.setdefault(j.flown.cut, []).append(j.flown.trim.mean)
+    pairs = np.array([a - b for a, b, *more in (v for v in by.values() if len(v) == 2) if not more])
+    return np.asarray(np.median(np.abs(pairs), axis=0) / 0.6745 / np.sqrt(2.0))
+
+
+def _doubles(judged: Sequence[Judged]) -> str:
+    """Two cut propellers against the least cut ones of the same set, which differs from the healthy flights' set."""
+    two = [j for j in judged if j.flown.condition == "cut" and j.flown.rotors == {1, 2}]
+    least = [j.flown.trim for j in two if j.flown.total <= 1.5]
+    again = [Judged(j.flown, assess([j.flown.trim], least, CRAZYFLIE)) for j in two if min(j.flown.cut[:2]) >= LARGE]
+    three = sum(len(j.named) == 3 for j in again)
+    both = sum(set(j.named) == {1, 2} for j in again)
+    return (
+        f"Cuts of M1 and M2 are mostly answered with M3 besides, for that set of propellers differs from the healthy "
+        f"flights' at 0.5 mm already. Against its own {len(least)} least cut flights (to 1.5 mm in all), {three} of "
+        f"{len(again)} are answered with three rotors, {both} with just these two, the others with their look-alike, a "
+        "weight between them."
+    )

@@ -12,6 +12,7 @@ from scipy.stats import spearmanr
 
 from quadid.health import FlightTrim, Health, assess, flight_trim
 from quadid.vehicle import Vehicle
+from quadid.window import Recording
 from quadid.workflow.loading import open_recording
 
 CRAZYFLIE = Vehicle.shipped("crazyflie")
@@ -21,7 +22,7 @@ LARGE = 3.0
 
 @dataclass(frozen=True)
 class Flown:
-    """One recorded flight: its file, airframe, kind of log by content, what was done to it, and its trim."""
+    """One recorded flight: its file, airframe, kind of log by content, what was done to it, its trim and the log."""
 
     file: str
     airframe: str
@@ -30,6 +31,7 @@ class Flown:
     cut: tuple[float, float, float]
     weight: str
     trim: FlightTrim
+    recording: Recording
 
     @property
     def total(self) -> float:
@@ -77,7 +79,7 @@ def read(folder: Path) -> list[Flown]:
             kind = "controller" if "mixer_input" in recording.channels else "motor"
             cut = _size(row["cut_M1"]), _size(row["cut_M2"]), _size(row["cut_M3"])
             trim = flight_trim(recording, CRAZYFLIE)
-            out.append(Flown(row["file"], row["drone"], kind, row["condition"], cut, row["weight"], trim))
+            out.append(Flown(row["file"], row["drone"], kind, row["condition"], cut, row["weight"], trim, recording))
     return out
 
 
@@ -105,7 +107,8 @@ def _small(one: Judged) -> bool:
     return one.flown.condition == "tape" or (one.flown.condition == "cut" and one.flown.total < LARGE)
 
 
-def _single(one: Judged, low: float, high: float) -> bool:
+def is_single(one: Judged, low: float, high: float) -> bool:
+    """Whether one propeller was cut, by `low` [mm] or more and less than `high`."""
     return one.flown.condition == "cut" and len(one.flown.rotors) == 1 and low <= one.flown.total < high
 
 
@@ -122,7 +125,13 @@ def _balanced(judged: Sequence[Judged]) -> str:
     return f"{accuracy:.3f}: {sum(large)} of {len(large)} found, {alarms} of {len(healthy)} healthy called changed"
 
 
-def _kind_right(one: Judged) -> bool:
+def named_first(one: Judged) -> bool:
+    """Whether the one cut propeller comes first in the answer."""
+    return one.named[:1] == list(one.flown.rotors)
+
+
+def kind_right(one: Judged) -> bool:
+    """Whether a propeller is told from a weight."""
     rotor = bool(one.health.changes) and one.health.changes[0].effect == "weak_rotor"
     return rotor == (one.flown.condition == "cut")
 
@@ -149,15 +158,15 @@ ROWS: tuple[Row, ...] = (
     ("… cuts below 3 mm and tape: found", "as many as the spread allows",
      lambda all_: _share([j for j in all_ if _small(j)], lambda j: j.changed)),
     ("one cut propeller, 3 mm and more: rotor named first", "≥ 95 %",
-     lambda all_: _share([j for j in all_ if _single(j, 3.0, 99.0)], lambda j: j.named[:1] == list(j.flown.rotors))),
+     lambda all_: _share([j for j in all_ if is_single(j, 3.0, 99.0)], named_first)),
     ("one cut propeller, 1 to 2.5 mm: rotor named first", "≥ 75 %",
-     lambda all_: _share([j for j in all_ if _single(j, 1.0, 3.0)], lambda j: j.named[:1] == list(j.flown.rotors))),
+     lambda all_: _share([j for j in all_ if is_single(j, 1.0, 3.0)], named_first)),
     ("two cut propellers, 3 mm and more each: both named", "≥ 85 %",
      lambda all_: _share([j for j in all_ if min(j.flown.cut[:2]) >= 3.0], lambda j: j.flown.rotors <= set(j.named))),
     ("propeller or glued weight, all", "≥ 90 %",
-     lambda all_: _share([j for j in all_ if _large(j)], _kind_right)),
+     lambda all_: _share([j for j in all_ if _large(j)], kind_right)),
     ("… of those found to be changed", "",
-     lambda all_: _share([j for j in all_ if _large(j) and j.changed], _kind_right)),
+     lambda all_: _share([j for j in all_ if _large(j) and j.changed], kind_right)),
     ("order of score against mm cut (Spearman, with healthy flights / cuts alone)", "≥ 0.9", _orders),
 )  # fmt: skip
 

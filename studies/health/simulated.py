@@ -1,8 +1,12 @@
-"""Simulated campaign: damage hidden in the flown vehicle, healthy flights that differ as real ones do."""
+"""Simulated campaign: damage hidden in two simulators, healthy flights that differ as real ones do.
+
+One flies the vehicle in closed loop (`quadid.flight`), the other solves the balance of a hover
+(`studies.health.flights`); neither shares an equation with the other or with the comparison.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,55 +14,81 @@ import numpy as np
 from quadid.flight import fly
 from quadid.health import FlightTrim, assess, flight_trim
 from quadid.vehicle import Vehicle
+from quadid.window import Recording
+from studies.health.flights import Wrong, hover
 
-SECONDS, BASELINES = 30.0, 6
+SECONDS, BASELINES, SEED = 30.0, 6, 7
 ROTOR_SPREAD, SHIFT, EFFORT = 0.01, 0.0007, 0.01
-"""From flight to flight: each rotor's thrust (relative), the battery's place [m a axis], thrust of all; 1 sigma."""
+"""From flight to flight: each rotor's thrust (relative), the battery's place [m an axis], the load; 1 sigma."""
 LOSSES = (0.02, 0.03, 0.05, 0.1, 0.2, 0.3)
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is hidden: losses by rotor (from 1), a shift of the CG [m], added mass (fraction)."""
+    """What is hidden: losses of thrust and of drag torque by rotor (from 1), a shift of the CG [m], a mass (fraction)
+    and where it sits [m]."""
 
     group: str
-    number: int
-    losses: dict[int, float] = field(default_factory=dict)
+    losses: Mapping[int, float] = field(default_factory=dict)
+    drag_losses: Mapping[int, float] = field(default_factory=dict)
     shift: tuple[float, float] = (0.0, 0.0)
     mass: float = 0.0
+    place: tuple[float, float] = (0.0, 0.0)
 
 
 def cases(each: int) -> Iterator[Case]:
-    """All cases: `each` of every kind, twice as many healthy ones."""
-    rng = np.random.default_rng(7)
-    for n in range(4 * each):
-        yield Case("healthy", n)
+    """All cases: `each` of every kind, four times as many healthy ones."""
+    rng = np.random.default_rng(SEED)
+
+    def polar(low: float, high: float) -> tuple[float, float]:
+        angle, size = float(rng.uniform(0.0, 2.0 * np.pi)), float(rng.uniform(low, high))
+        return size * float(np.cos(angle)), size * float(np.sin(angle))
+
+    yield from (Case("healthy") for _ in range(4 * each))
     for loss in LOSSES:
         for n in range(each):
-            yield Case(f"one rotor, {100 * loss:.0f} %", n, {n % 4 + 1: loss})
+            lost = {n % 4 + 1: loss}
+            yield Case(f"one rotor, {100 * loss:.0f} %", lost, lost)
+    for n in range(each):
+        size = float(rng.uniform(0.1, 0.3))
+        yield Case("one rotor, thrust alone, 10 to 30 %", {n % 4 + 1: size}, {n % 4 + 1: 0.0})
+    for n in range(each):
+        size = float(rng.uniform(0.05, 0.15))
+        yield Case("one rotor, 5 to 15 % less thrust, as much more drag", {n % 4 + 1: size}, {n % 4 + 1: -size})
     for count in (2, 3):
-        for n in range(each):
+        for _ in range(each):
             chosen = rng.choice(4, count, replace=False) + 1
-            yield Case(f"{count} rotors, 10 to 30 %", n, {int(j): float(rng.uniform(0.1, 0.3)) for j in chosen})
-    for n in range(each):
-        mass, angle = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 2.0 * np.pi))
-        reach = float(rng.uniform(0.4, 1.0)) * 0.21 * mass / (1.0 + mass)
-        yield Case("weight, 5 to 20 %", n, {}, (reach * np.cos(angle), reach * np.sin(angle)), mass)
-    for n in range(each):
-        angle, size = float(rng.uniform(0.0, 2.0 * np.pi)), float(rng.uniform(0.005, 0.012))
-        yield Case("battery moved 5 to 12 mm", n, {}, (size * np.cos(angle), size * np.sin(angle)))
+            lost = {int(j): float(rng.uniform(0.1, 0.3)) for j in chosen}
+            yield Case(f"{count} rotors, 10 to 30 %", lost, lost)
+    for _ in range(each):
+        yield Case("weight, 5 to 20 %", mass=float(rng.uniform(0.05, 0.2)), place=polar(0.08, 0.21))
+    for _ in range(each):
+        yield Case("battery moved 5 to 12 mm", shift=polar(0.005, 0.012))
 
 
-def trim(vehicle: Vehicle, case: Case, seed: int, profile: str) -> FlightTrim:
-    """Flies the case once, with what differs from flight to flight."""
+def flown(vehicle: Vehicle, case: Case, seed: int, profile: str) -> Recording:
+    """Flies the case once in closed loop, with what differs from flight to flight."""
     rng = np.random.default_rng(seed)
-    losses = {f"loss_{j}": float(rng.normal(0.0, ROTOR_SPREAD)) for j in (1, 2, 3, 4)}
-    for j, loss in case.losses.items():
-        losses[f"loss_{j}"] = 1.0 - (1.0 - losses[f"loss_{j}"]) * (1.0 - loss)
-    x, y = (s + float(rng.normal(0.0, SHIFT)) for s in case.shift)
-    flown = vehicle.model_copy(update={"mass": vehicle.mass * (1.0 + case.mass + float(rng.normal(0.0, EFFORT)))})
-    effects = {"weak_rotor": losses, "cg_offset": {"x": x, "y": y}}
-    return flight_trim(fly(flown, seconds=SECONDS, seed=seed, profile=profile, effects=effects).recording, vehicle)
+    own = {j: float(rng.normal(0.0, ROTOR_SPREAD)) for j in (1, 2, 3, 4)}
+    weak = {f"loss_{j}": 1.0 - (1.0 - own[j]) * (1.0 - case.losses.get(j, 0.0)) for j in own}
+    weak |= {f"drag_loss_{j}": 1.0 - (1.0 - own[j]) * (1.0 - case.drag_losses.get(j, 0.0)) for j in own}
+    hung = [case.mass / (1.0 + case.mass) * p for p in case.place]
+    x, y = (s + h + float(rng.normal(0.0, SHIFT)) for s, h in zip(case.shift, hung, strict=True))
+    loaded = vehicle.model_copy(update={"mass": vehicle.mass * (1.0 + case.mass + float(rng.normal(0.0, EFFORT)))})
+    effects = {"weak_rotor": weak, "cg_offset": {"x": x, "y": y}}
+    return fly(loaded, seconds=SECONDS, seed=seed, profile=profile, effects=effects).recording
+
+
+def balanced(vehicle: Vehicle, case: Case, seed: int, profile: str) -> Recording:
+    """The same by the balance of a hover."""
+    rng = np.random.default_rng(seed)
+    shift = case.shift[0] + float(rng.normal(0.0, SHIFT)), case.shift[1] + float(rng.normal(0.0, SHIFT))
+    wrong = Wrong(case.losses, case.drag_losses, case.mass * vehicle.mass, case.place, shift)
+    return hover(vehicle, wrong, seed, ROTOR_SPREAD, SECONDS)
+
+
+Simulator = Callable[[Vehicle, Case, int, str], Recording]
+SIMULATORS: Mapping[str, Simulator] = {"closed loop": flown, "balance": balanced}
 
 
 def right(case: Case, effects: list[tuple[str, int]]) -> bool:
@@ -71,27 +101,41 @@ def right(case: Case, effects: list[tuple[str, int]]) -> bool:
     return names == {"cg_offset"} if case.shift != (0.0, 0.0) else not names
 
 
+def _judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, float]:
+    """Whether it is called changed, whether rightly answered, and the errors of the losses of thrust and of torque."""
+    vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
+    profile = ("hover", "gentle", "excited")[k % 3]
+
+    def trim(one: Case, i: int) -> FlightTrim:
+        return flight_trim(simulate(vehicle, one, 1000 * k + i, profile), vehicle)
+
+    baseline = [trim(Case(""), i) for i in range(1, BASELINES + 1)]
+    found = assess([trim(case, 0)], baseline, vehicle)
+    changed = found.verdict != "unchanged"
+    named = [(c.effect, int(c.parameters[0][2]) if c.effect == "weak_rotor" else 0) for c in found.changes]
+    errors = [np.nan, np.nan]
+    if len(case.losses) == 1 and right(case, named):
+        values = {name: value for name, _, value, _ in found.changes[0].parameters}
+        (j,) = case.losses
+        errors = [abs(values["loss"] - case.losses[j]), abs(values["drag_loss"] - case.drag_losses[j])]
+    hidden = bool(case.losses) or case.mass > 0.0 or case.shift != (0.0, 0.0)
+    return changed, right(case, named) if changed else not hidden, errors[0], errors[1]
+
+
 def table(each: int = 12) -> str:
     """The campaign as Markdown."""
-    done: dict[str, list[tuple[bool, bool, float]]] = {}
+    done: dict[str, dict[str, list[tuple[bool, bool, float, float]]]] = {}
     for k, case in enumerate(cases(each)):
-        vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
-        profile = ("hover", "gentle", "excited")[k % 3]
-        baseline = [trim(vehicle, Case("", 0), 1000 * k + i, profile) for i in range(1, BASELINES + 1)]
-        found = assess([trim(vehicle, case, 1000 * k, profile)], baseline, vehicle)
-        changed = found.verdict != "unchanged"
-        named = [(c.effect, int(c.parameters[0][2]) if c.effect == "weak_rotor" else 0) for c in found.changes]
-        first = next((p[2] for c in found.changes for p in c.parameters if p[0] == "loss"), np.nan)
-        error = abs(first - max(case.losses.values())) if len(case.losses) == 1 and right(case, named) else np.nan
-        done.setdefault(case.group, []).append((changed, right(case, named) if changed else not _hidden(case), error))
-    lines = ["| hidden | called changed | right answer | median error of the loss |", "|---|---|---|---|"]
-    for group, rows in done.items():
-        changed, correct, errors = np.array(rows).T
-        error = f"{100.0 * np.nanmedian(errors):.1f} %" if np.isfinite(errors).any() else "–"
-        counts = (f"{int(sum(v))} of {len(rows)}" for v in (changed, correct))
-        lines.append(f"| {group} | " + " | ".join(counts) + f" | {error} |")
+        for name, simulate in SIMULATORS.items():
+            rows = done.setdefault(case.group, {}).setdefault(name, [])
+            rows.append(_judged(case, k, simulate))
+    heads = [f"{name}: {what}" for name in SIMULATORS for what in ("changed", "right", "error of loss, of drag loss")]
+    lines = ["| hidden | of | " + " | ".join(heads) + " |", "|---" * (2 + len(heads)) + "|"]
+    for group, by in done.items():
+        cells: list[str] = []
+        for rows in by.values():
+            changed, correct, *errors = np.array(rows).T
+            sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
+            cells += [f"{int(sum(changed))}", f"{int(sum(correct))}", f"{', '.join(sizes)} %" if sizes else "–"]
+        lines.append(f"| {group} | {len(rows)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _hidden(case: Case) -> bool:
-    return bool(case.losses) or case.mass > 0.0 or case.shift != (0.0, 0.0)
