@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from quadid.health.comparison import Explained, compare, distance, p_healthy
 from quadid.health.hypotheses import hypotheses
@@ -20,6 +20,8 @@ FloatArray = NDArray[np.float64]
 
 SIGNIFICANT = 0.01
 """A change is one that healthy flights make less often than this."""
+HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
+"""The score beyond which a flight is changed."""
 _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
 _UNEXPLAINED = 1e-3

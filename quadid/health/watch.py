@@ -181,7 +181,8 @@ class HealthWatch:
         return healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=flights)
 
     def _report(self, t: float, now: FloatArray, against: Healthy, verdict: str) -> HealthReport:
-        change, changes = now - against.mean, ()
+        change = now - against.mean
+        changes: tuple[Change, ...] = ()
         if verdict == "changed":
             shares = np.mean(self._shares[-RECENT:], axis=0)
             changes = changes_of(change, against, 1, self._vehicle, shares, changed=True)

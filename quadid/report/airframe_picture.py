@@ -75,7 +75,7 @@ def _rotor(j: int, x: float, y: float, more: float, weak: JsonDict | None, centr
     if weak is not None:
         below = y + _DISC + _LARGEST + 12.0 if y > centre else y - _DISC - _LARGEST - 2.0
         low, high = next(p["ci95"] for p in weak["parameters"] if p["name"] == "loss")
-        words = f"thrust −{100.0 * _value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
+        words = f"loss {100.0 * _value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
         out.append(_text(x, below, words.replace("-", "−"), "loss" + kind))
     return Markup("").join(out)
 

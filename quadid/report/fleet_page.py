@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from quadid.health.changes import HEALTHY_SCORE
 from quadid.report.figures import trace
 from quadid.report.health_page import change_words
 from quadid.report.page import number
@@ -89,9 +90,11 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
         score = np.array([row["score"] for row in own])
         line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=[row["log"] for row in own])
         data.append({**line, "x": [_date(row["started"]) for row in own]})
+    limit = {"y0": HEALTHY_SCORE, "y1": HEALTHY_SCORE}
     layout = {
         "xaxis": {"type": "date"}, "yaxis": {"title": {"text": "healthy spreads"}, "rangemode": "tozero"},
         "hovermode": "closest", "showlegend": True,
+        "shapes": [{"type": "line", "x0": 0, "x1": 1, "xref": "paper", "role": "floor", **limit}],
     }  # fmt: skip
     views = [{"label": "", "data": data, "layout": layout}]
     figure = {"id": "fleet-health", "title": "Distance from healthy", "views": views, "height": 280}
@@ -103,7 +106,7 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
                 row["unit"],
                 row["log"],
                 number(row["score"], 2),
-                "; ".join(map(change_words, row["changes"])) or "unknown",
+                _what_changed(row),
             ]
             for row in changed[-MOST_ROWS:]
         ],
@@ -111,7 +114,7 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
     count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
     intro = (
         f"Each flight against the first {min(count.values())} to {max(count.values())} of its vehicle, which are taken "
-        "for healthy. A healthy flight stays below about 3.6."
+        f"for healthy. 99 of 100 healthy flights stay below {HEALTHY_SCORE:.1f}, the line."
     )
     return {
         "id": "health", "title": "Health over flights", "intro": intro, "figures": [figure],

@@ -15,6 +15,10 @@ _WORDS = {
     "mass_change": "mass", "cg_offset": "centre of gravity", "thrust_drop": "thrust of all rotors",
     "weak_rotor": "rotor",
 }  # fmt: skip
+_INTROS = {
+    "changed": "", "unknown": "Nothing that has a name.",
+    "unchanged": "Nothing beyond what healthy flights differ by. If anything:",
+}  # fmt: skip
 _STEPS = {
     "weak_rotor": "Look at the propeller (cuts, tape, loose on its shaft) and the motor of rotor {rotor}; "
     "exchange the propeller and fly again.",
@@ -156,7 +160,7 @@ def health_page(
             {"id": "airframe", "title": "Airframe", "intro": caption, "picture": picture, "figures": [], "tables": []},
             {
                 "id": "changes", "title": "What changed", "figures": [], "tables": changes if result["changes"] else [],
-                "intro": "" if result["changes"] else "Nothing that has a name.",
+                "intro": _INTROS[result["verdict"]],
             },
             {
                 "id": "trim", "title": "Trim", "intro": trims.title, "figures": list(history),

@@ -106,16 +106,18 @@ def health_html(done: HealthOutcome, command: str = LIBRARY) -> str:
     """The HTML report of a comparison with healthy flights."""
     import numpy as np
 
+    from quadid.health.comparison import distance
     from quadid.health.trims import AXES
     from quadid.report.airframe_picture import airframe_picture
     from quadid.report.health_page import health_page, trim_figure
     from quadid.report.page import render
 
-    found = done.found
+    found, healthy = done.found, done.found.healthy
     now = np.mean([flight.shares for flight in found.flights], axis=0)
-    picture = airframe_picture(done.vehicle, now.tolist(), found.healthy.shares.tolist(), done.result["changes"])
+    marked = done.result["changes"] if found.verdict == "changed" else ()
+    picture = airframe_picture(done.vehicle, now.tolist(), healthy.shares.tolist(), marked)
     rows = [
-        (role, flight.name, ((flight.mean - found.healthy.mean) / found.healthy.deviation).tolist())
+        (role, flight.name, distance(flight.mean - healthy.mean, healthy.predictive(1), healthy.freedom).tolist())
         for role, part in (("measured", found.baseline), ("after", found.flights))
         for flight in part
     ]

@@ -86,17 +86,38 @@ def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a fleet of two vehicles, one of which wears."""
+    """The report of a fleet of two vehicles, one of which wears; of two others one has a propeller cut."""
     import numpy as np
 
     from quadid.report.fleet_page import fleet_page as build
     from quadid.report.fleet_summary import summarise
     from quadid.report.page import render
+    from quadid.workflow.fleet_health import health_trend
+    from tests.cli.test_fleet_health import PELICAN_X, fleet
     from tests.report.test_fleet_page import rows
 
     rng = np.random.default_rng(1)
     worn = 1.0 - 0.002 * np.arange(60)
     logs, parameters = rows({n: s + 0.01 * rng.standard_normal(60) for n, s in (("one", np.ones(60)), ("two", worn))})
+    health = health_trend(*fleet(), dict.fromkeys("ab", PELICAN_X.to_yaml()))
     file = tmp_path_factory.mktemp("fleet") / "fleet.html"
-    file.write_text(render(build(summarise(logs, parameters, []), logs, parameters, [], "Report of a fleet")))
+    file.write_text(render(build(summarise(logs, parameters, []), logs, parameters, [], "Report of a fleet", health)))
     return file
+
+
+@pytest.fixture(scope="session")
+def health_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a vehicle with a damaged rotor against healthy flights; a log's name tries to run something."""
+    from quadid_replay import write_csv
+
+    import quadid
+    from quadid.vehicle import Vehicle
+    from studies.health.flights import Wrong, hover
+
+    pelican, folder = Vehicle.shipped("pelican_x"), tmp_path_factory.mktemp("health")
+    flown = {"now<img src=x onerror=alert(1)>.csv": hover(pelican, Wrong({3: 0.2}, {3: 0.2}), 99)}
+    flown |= {f"healthy{k}.csv": hover(pelican, None, k) for k in range(5)}
+    for name, recording in flown.items():
+        write_csv(folder / name, recording)
+    paths = [folder / name for name in flown]
+    return quadid.health(paths[0], paths[1:], vehicle=pelican).report(folder / "health.html")

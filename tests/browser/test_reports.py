@@ -16,6 +16,16 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 Scheme = Literal["light", "dark"]
 
 
+_CUT_OFF = """(() => {
+    const frame = document.querySelector('svg.airframe').getBoundingClientRect();
+    return [...document.querySelectorAll('svg.airframe text')].filter((t) => {
+        const box = t.getBoundingClientRect();
+        return box.left < frame.left || box.right > frame.right || box.bottom > frame.bottom || box.top < frame.top;
+    }).map((t) => t.textContent);
+})()"""
+"""Words of the airframe's picture that reach beyond it."""
+
+
 class Opened:
     """A page with everything it complained about."""
 
@@ -211,18 +221,28 @@ def test_hostile_names_in_a_log_stay_text(chromium: Browser, hostile_page: Path,
         assert one.complaints == []
 
 
-@pytest.mark.parametrize("name", ["failure_page", "fleet_page"])
-@pytest.mark.parametrize("width", [390, 1440])
+@pytest.mark.parametrize("name", ["failure_page", "fleet_page", "health_page"])
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1280, "dark")])
 def test_the_other_reports_too(
-    chromium: Browser, request: pytest.FixtureRequest, shots: Path, name: str, width: int
+    chromium: Browser, request: pytest.FixtureRequest, shots: Path, name: str, width: int, scheme: Scheme
 ) -> None:  # fmt: skip
     file: Path = request.getfixturevalue(name)
-    with opened(chromium, file, width) as one:
+    with opened(chromium, file, width, scheme) as one:
         one.unfold()
-        one.page.screenshot(path=shots / f"{name}-{width}-light.png", full_page=True)
+        one.page.screenshot(path=shots / f"{name}-{width}-{scheme}.png", full_page=True)
         assert one.page.locator(".plot").count() >= 1
         assert one.page.evaluate("document.documentElement.scrollWidth") <= width
         assert one.complaints == []
+
+
+def test_the_airframe_names_the_damaged_rotor_within_its_picture(chromium: Browser, health_page: Path) -> None:
+    with opened(chromium, health_page, 390) as one:
+        page = one.page
+        assert page.locator("svg.airframe .disc").count() == 4
+        assert page.locator("svg.airframe .disc.damaged").count() == 1
+        assert "loss 2" in (page.locator("svg.airframe .loss.damaged").text_content() or "")
+        assert page.evaluate(_CUT_OFF) == []
+        assert page.locator("main img").count() == 0
 
 
 def test_an_injected_script_is_refused_by_the_policy(chromium: Browser, hostile_page: Path, tmp_path: Path) -> None:

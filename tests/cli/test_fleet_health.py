@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from studies.health.flights import Wrong, hover
 PELICAN_X = Vehicle.shipped("pelican_x")
 
 
-def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
+def fleet() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of the logs and of the trims of two vehicles; a propeller of vehicle a is cut after the seventh flight."""
     logs, trims = [], []
     for unit, cut_after in (("a", 6), ("b", 99)):
         for k in range(9):
@@ -29,6 +31,11 @@ def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
             logs.append({"name": name, "unit": unit, "started": started, "status": "refused", "reason": "gentle",
                          "dated_by": "log", "mse_initial": None, "mse_fitted": None, "verdict": None})  # fmt: skip
             trims.append({"log": name, "trim": json.dumps(flight_to_dict(flown))})
+    return logs, trims
+
+
+def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
+    logs, trims = fleet()
     text = PELICAN_X.to_yaml()
     order = np.random.default_rng(1).permutation(len(logs))
     rows = health_trend([logs[i] for i in order], trims, {"a": text, "b": text})
