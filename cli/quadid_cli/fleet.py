@@ -134,7 +134,7 @@ def show(result: dict[str, Any], quiet: bool) -> None:
             )  # fmt: skip
             table.add_row(*head, *tail)
     console.print(table)
-    tables.print_verdict(console, fleet_verdict(result))
+    tables.print_verdict(console, fleet_verdict(result, result["health"]))
     for reason in result["reasons"][:10]:
         console.print(f"{reason['logs']} {reason['status']}: {reason['reason']}", soft_wrap=True)
     console.print(f"{result['worked']} of {result['logs']} logs worked on in {result['seconds']:.1f} s")

@@ -37,7 +37,7 @@ def fleet_page(
     return {
         "title": title,
         "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
-        "verdict": asdict(fleet_verdict(summary)),
+        "verdict": asdict(fleet_verdict(summary, health)),
         "sections": [s for s in (
             _health(health), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
             _common(summary), _unusable(summary),
@@ -46,24 +46,29 @@ def fleet_page(
     }  # fmt: skip
 
 
-def fleet_verdict(summary: JsonDict) -> Verdict:
-    """How many logs gave an answer, and what needs attention."""
+def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict:
+    """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
     counts = summary["counts"]
     total, done = sum(counts.values()), counts.get("done", 0)
-    level: Level = "good" if done == total else "fair" if done >= 0.5 * total else "poor"
+    last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
+    changed = [row for row in last.values() if row["verdict"] != "unchanged"]
+    level: Level = "good" if done == total and not changed else "fair" if done >= 0.5 * total else "poor"
     headline = f"{done} of {total} logs gave parameters."
     words = (
         ("refused", "cannot support an answer"),
         ("unreadable", "cannot be read or used"),
         ("failed", "stopped this program"),
     )
-    details = [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+    details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
+    details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
     details += [
         f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
         f"in {d['days']:.3g} days."
         for d in summary["drifts"][:3]
     ]
     steps = []
+    if changed:
+        steps.append(f"How sure that is: `quadid health {changed[0]['log']}` against its first flights.")
     if summary["drifts"]:
         steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
     if summary["outliers"]:
@@ -112,8 +117,9 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
         ],
     }
     count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
+    most = "up to " * (len(set(count.values())) > 1) + str(max(count.values()))
     intro = (
-        f"Each flight against the first {min(count.values())} to {max(count.values())} of its vehicle, which are taken "
+        f"Each flight against the first {most} of its vehicle, which are taken "
         f"for healthy. 99 of 100 healthy flights stay below {HEALTHY_SCORE:.1f}, the line."
     )
     return {
@@ -123,7 +129,7 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
 
 
 def _what_changed(row: JsonDict) -> str:
-    return "; ".join(map(change_words, row["changes"])) or "unknown"
+    return "; ".join(map(change_words, row["changes"])) or "by nothing that has a name"
 
 
 def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:

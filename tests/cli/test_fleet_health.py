@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.health import flight_trim
 from quadid.health.stored import flight_to_dict
-from quadid.report.fleet_page import fleet_page
+from quadid.report.fleet_page import fleet_page, fleet_verdict
 from quadid.report.fleet_summary import summarise
 from quadid.report.page import render
 from quadid.vehicle import Vehicle
@@ -44,6 +44,9 @@ def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
     changed = [row for row in rows if not row["baseline"] and row["verdict"] == "changed"]
     assert [row["log"] for row in changed] == ["a/7.mcap", "a/8.mcap"]
     assert {row["changes"][0]["parameters"][0]["value"] for row in changed} == {3}
+    verdict = fleet_verdict(summarise(logs, [], []), rows)
+    assert verdict.details[0].startswith("a has changed: rotor 3: 2")
+    assert not any(text.startswith("b ") for text in verdict.details)
     page = render(fleet_page(summarise(logs, [], []), logs, [], [], "Fleet", rows))
     assert "Health over flights" in page
     assert "a/7.mcap" in page
