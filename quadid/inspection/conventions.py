@@ -12,6 +12,7 @@ from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import sample_period
 from quadid.resampling_plan import GAP
+from quadid.turning import turn
 from quadid.vehicle import GRAVITY
 from quadid.window import Channel, Recording
 
@@ -221,14 +222,7 @@ def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, Flo
     """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
     keep = _usable_steps(t, gyro.t)
     mean = np.diff(_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
-    w, v = q[:, :1], q[:, 1:]
-    scalar = np.sum(q[1:] * q[:-1], axis=1)
-    vector = w[:-1] * v[1:] - w[1:] * v[:-1] - np.cross(v[:-1], v[1:])
-    vector *= np.where(scalar < 0.0, -1.0, 1.0)[:, None]
-    sine = np.linalg.norm(vector, axis=1)
-    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
-    factor = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)
-    return mean, vector[keep] * factor[keep, None] / np.diff(t)[keep, None]
+    return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
 
 
 def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:

@@ -132,6 +132,10 @@ class Estimator:
         """A nominal parameter, the best at hand."""
         return float(self.theta[NOMINAL_NAMES.index(name)])
 
+    @property
+    def _stated(self) -> dict[str, tuple[float, float]]:
+        return {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
+
     def start_from(self, known: OnlineSet) -> None:
         """Starts the search from a restored set instead of the vehicle file's guess."""
         for p in known.parameters:
@@ -234,6 +238,7 @@ class Estimator:
     def case(
         self, parameters: ParameterSet, quality: Quality, reply: FitReply, in_force: OnlineSet | None,
         baseline: OnlineSet | None, approval: str, most: int, seen: float, unexplained: str,
+        unproven: str,
     ) -> Case:  # fmt: skip
         """What the gate needs to know about the present estimate.
 
@@ -247,6 +252,7 @@ class Estimator:
             most: windows whose agreement is asked for.
             seen: end of the data that the set in force rests on [s]; minus infinity for none of this flight.
             unexplained: as in `Case`.
+            unproven: as in `Case`.
         """
         fused = self.fusion.estimate()
         assert fused is not None
@@ -255,7 +261,7 @@ class Estimator:
         ratio = self._thrust_ratio()
         return Case(
             parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval,
-            self.fusion.counted - seen, unexplained,
+            self.fusion.counted - seen, unexplained, unproven, self._stated, self._walked(max(most, 3)),
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:
@@ -281,6 +287,18 @@ class Estimator:
         spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.fusion.drift**2)
         j = int(np.argmax(np.abs(window.z - fused.z) / spread))
         return f"{NOMINAL_NAMES[j]} differs by {np.expm1(window.z[j] - fused.z[j]):+.1%} in one of them"
+
+    def _walked(self, most: int) -> dict[str, tuple[float, float]]:
+        """Change of torque over inertia (log) from the oldest to the newest of the windows, and its deviation."""
+        windows = self.fusion.disjoint(most)
+        newest, oldest = self.fusion.alone(windows[0]), self.fusion.alone(windows[-1])
+        out = {}
+        for name in ("J_xx", "J_yy") if len(windows) > 1 else ():
+            share = np.zeros(len(newest.z))
+            share[0], share[NOMINAL_NAMES.index(name)] = 1.0, -1.0
+            variance = share @ (newest.covariance + oldest.covariance) @ share
+            out[name] = float(share @ (newest.z - oldest.z)), math.sqrt(variance)
+        return out
 
     def _held_out(self, in_force: OnlineSet | None, seen: float) -> tuple[float, ...]:
         """Gain over the set in force in disjoint windows after `seen` [s], by estimates that had not seen them."""

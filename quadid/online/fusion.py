@@ -147,7 +147,7 @@ class Fusion:
         limit = exceeded(CHANGE_PROBABILITY, len(self._mean))
         if earlier is None:
             return Verdict(0.0, limit, known=False)
-        before, own = self._solve(earlier), self._alone(window)
+        before, own = self._solve(earlier), self.alone(window)
         spread = before.covariance + own.covariance + np.diag(self.drift**2)
         difference = own.z - before.z
         return Verdict(float(difference @ np.linalg.solve(spread, difference)), limit)
@@ -195,7 +195,7 @@ class Fusion:
             return 1.0
         total = 0.0
         for window in windows:
-            own = self._alone(window)
+            own = self.alone(window)
             difference = own.z - z
             total += float(difference @ np.linalg.solve(own.covariance, difference))
         freedom = len(z) * (len(windows) - 1)
@@ -203,14 +203,15 @@ class Fusion:
 
     def distance(self, window: WindowEstimate, z: FloatArray) -> float:
         """Squared Mahalanobis distance of a window's own estimate from `z`, honest drift allowed."""
-        own = self._alone(window)
+        own = self.alone(window)
         difference = own.z - z
         return float(difference @ np.linalg.solve(own.covariance + np.diag(self.drift**2), difference))
 
     def _before(self, start: float) -> _Sum | None:
         return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)
 
-    def _alone(self, window: WindowEstimate) -> Fused:
+    def alone(self, window: WindowEstimate) -> Fused:
+        """What a window says with nothing but the prior."""
         matrix = window.scale * window.information
         vector = window.scale * (window.information @ window.z - window.score)
         return self._solve(_Sum(window.stop, matrix, vector))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -32,6 +32,8 @@ class GateSettings(BaseModel):
         creep: largest change from the last set that a person approved, or the first of this flight.
         agility: largest change of torque over inertia from the set in force, relative: what a controller's gain margin
             has to bear.
+        reference: largest change of torque over inertia from that set, from the vehicle file before the first, and
+            between windows, that is published without a person: rotor speeds wrong by a factor change it.
         inertia_slack: how far the triangle inequality of the inertias may be broken.
         gain: deviance per held-out window that counts as a real gain over the set in force.
         sharper: a set is also published when the interval of a parameter has shrunk to this share,
@@ -48,6 +50,7 @@ class GateSettings(BaseModel):
     step: float = Field(default=0.25, gt=0.0, le=2.0)
     creep: float = Field(default=0.4, gt=0.0, le=4.0)
     agility: float = Field(default=0.4, gt=0.0, le=4.0)
+    reference: float = Field(default=0.04, gt=0.0, le=4.0)
     inertia_slack: float = Field(default=1.5, ge=1.0, le=3.0)
     gain: float = Field(default=6.0, gt=0.0)
     sharper: float = Field(default=0.8, gt=0.0, lt=1.0)
@@ -72,6 +75,10 @@ class Case:
         approval: auto or manual, now.
         age: time since the data that the set in force rests on [s].
         unexplained: what the model misses and why it is not known yet, or empty.
+        unproven: what is still to be known of the sensors, or empty.
+        stated: value and standard deviation of the parameters that the vehicle file claims to know.
+        walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
+            deviation, by the inertia's name.
     """
 
     parameters: ParameterSet
@@ -86,6 +93,9 @@ class Case:
     approval: str
     age: float = math.inf
     unexplained: str = ""
+    unproven: str = ""
+    stated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    walked: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -109,6 +119,9 @@ def decide(case: Case, settings: GateSettings) -> Decision:
         if name == "step_limit" and _step(case, _doubled(settings)) is None:
             return Decision(SetState.PENDING, name, f"{reason}: a person must approve it")
         return Decision(SetState.REJECTED, name, reason)
+    moved = _reference(case, settings)
+    if moved is not None:
+        return Decision(SetState.PENDING, "reference", f"{moved}: a person must approve it")
     story = f"{case.agreeing} windows agree; {_gain_text(case)}"
     if case.approval != "auto":
         return Decision(SetState.PENDING, "approval", f"waits for approval: {story}")
@@ -127,6 +140,10 @@ def _quality(case: Case, settings: GateSettings) -> str | None:
 
 def _flying(case: Case, settings: GateSettings) -> str | None:
     return case.quality.grounded or None
+
+
+def _sensors(case: Case, settings: GateSettings) -> str | None:
+    return case.unproven or None
 
 
 def _excitation(case: Case, settings: GateSettings) -> str | None:
@@ -177,6 +194,9 @@ def _agreement(case: Case, settings: GateSettings) -> str | None:
         return f"windows disagree: {case.disagreement}"
     if case.agreeing < settings.windows:
         return f"{case.agreeing} of {settings.windows} windows without a common sample agree so far: keep flying"
+    for name, (change, sigma) in case.walked.items():
+        if _far(change, sigma, settings):
+            return f"torque over inertia ({name}) walks: {math.expm1(change):+.0%} from the first to the last of them"
     return None
 
 
@@ -235,6 +255,29 @@ def _agility(case: Case, settings: GateSettings) -> str | None:
     return None
 
 
+def _reference(case: Case, settings: GateSettings) -> str | None:
+    """Torque over inertia against what was trusted first; mass and accelerometer leave it as it is."""
+    known, what = case.stated, "the vehicle file"
+    if case.baseline is not None:
+        known = {p.name: (p.value, p.sigma) for p in case.baseline.parameters if p.status not in UNKNOWN}
+        what = "the first accepted or last approved set"
+    for name in ("J_xx", "J_yy"):
+        change, variance = 0.0, 0.0
+        for p, sign in ((case.parameters["b"], 1.0), (case.parameters[name], -1.0)):
+            if p.name in known:
+                value, sigma = known[p.name]
+                change += sign * math.log(p.value / value)
+                variance += (p.sigma / p.value) ** 2 + (sigma / value) ** 2
+        if _far(change, math.sqrt(variance), settings):
+            off = f"torque over inertia ({name}) is {math.expm1(change):+.0%} off {what}"
+            return f"{off}, allowed {settings.reference:.0%}: rotor speeds wrong by a factor look like this"
+    return None
+
+
+def _far(change: float, sigma: float, settings: GateSettings) -> bool:
+    return abs(change) > math.log1p(settings.reference) + 2.0 * sigma
+
+
 def _gain_text(case: Case) -> str:
     total, n = float(np.sum(case.held_out)), len(case.held_out)
     if n == 0:
@@ -250,6 +293,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("physical_bounds", _bounds),
     ("interval_width", _width),
     ("agreement", _agreement),
+    ("sensors", _sensors),
     ("held_out_gain", _held_out),
     ("step_limit", _step),
 )

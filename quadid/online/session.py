@@ -24,6 +24,7 @@ from quadid.health.trims import FlightTrim
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor
+from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.grid_buffer import Cut, GridBuffer
@@ -78,11 +79,14 @@ class Session:
         self._outbox = Outbox(self.resampler.time.stamp)
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
         self._store = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
+        self._consistency = Consistency()
         self._change_supervisor = ChangeSupervisor(vehicle, self._store)
         self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
         self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed, self.settings.diagnose > 0.0)
-        self._supervisor = Supervisor(self._estimator, self.active_set, self._outbox, self.settings.gate)
+        self._supervisor = Supervisor(
+            self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency
+        )
         self._cut = Cut((), 0.0, 0)
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
@@ -225,6 +229,7 @@ class Session:
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
             self._refits.clear()
             self._supervisor.interrupted(first)
+            self._consistency.restart()
             self._change_supervisor.restart()
             self._outbox.say(first, "info", "stream", "a stream of data begins")
         self._store.add(rows)
@@ -232,6 +237,11 @@ class Session:
 
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
+        self._consistency.add(self._store.span(tick - self._tick - _EPS, tick - _EPS))
+        if not self._supervisor.trusts(tick):
+            self._change_supervisor.restart()
+            return
+        yield
         seen = yield from self._change_supervisor.look(tick, self._tick, self._estimator)
         if seen is not None:
             self._outbox.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")

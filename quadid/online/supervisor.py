@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from quadid.online.active_set import ActiveSet
 from quadid.online.background_diagnosis import BackgroundDiagnosis, DiagnosisReply, DiagnosisRequest
+from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
@@ -30,8 +31,11 @@ class Supervisor:
         waits: why the cause of a misfit is not known yet.
     """
 
-    def __init__(self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings) -> None:
+    def __init__(
+        self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings, consistency: Consistency
+    ) -> None:
         """Works on the estimate of `estimator` and the sets of `active_set`, speaks through `outbox`."""
+        self._consistency = consistency
         self._estimator, self._active_set, self._outbox, self._gate = estimator, active_set, outbox, gate
         self.learn_from = -math.inf
         self.quality = Quality()
@@ -42,6 +46,17 @@ class Supervisor:
     def interrupted(self, t: float) -> None:
         """The stream begins anew at `t` [s]."""
         self.learn_from, self._odd_since = max(self.learn_from, t), None
+
+    def trusts(self, t: float) -> bool:
+        """Whether the sensors agree at `t` [s]; while they do not, nothing is learned, and what was is forgotten."""
+        why = self._consistency.fault
+        if why:
+            self.quality = Quality(fault=why)
+            if self._estimator.learned:
+                self.relearn(t, "sensors disagree")
+            self.interrupted(t)
+            self._outbox.note(t, Phase.BLOCKED, why)
+        return not why
 
     def relearn(self, start: float, why: str) -> None:
         """Forgets what was learned; learns from `start` [s] on."""
@@ -157,7 +172,7 @@ class Supervisor:
         active_set, outbox = self._active_set, self._outbox
         case = self._estimator.case(
             parameters, self.quality, reply, active_set.in_force, active_set.baseline, active_set.approval,
-            self._gate.windows, active_set.seen, self.unexplained,
+            self._gate.windows, active_set.seen, self.unexplained, self._consistency.unproven,
         )  # fmt: skip
         decision = decide(case, self._gate)
         mse, unseen = self._estimator.scores()

@@ -10,8 +10,11 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
 from quadid.online.fault_isolation import ChangeRequest
@@ -23,6 +26,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Sample
 from tests.online.test_gate import TRUE
 
+FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 Worker = Callable[[Job], JobReply | None]
 """Answers a request; None: it is still at work."""
@@ -41,15 +45,22 @@ def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop:
     square = PELICAN.hover_speed(TRUE["b"]) ** 2 * (1.0 + 0.08 * np.sin(3.1 * t))[:, None]
     square = square + wanted @ np.linalg.pinv(arms)
     lift = TRUE["b"] * square.sum(axis=1) * np.where(t < drop_at, 1.0, 1.0 - drop) / PELICAN.mass
-    half = -0.45 / turn * np.cos(np.outer(t, turn)) + 0.001 * rng.normal(size=(len(t), 3))
+    attitude = flown_attitude(-0.9 / turn, rate) + 0.001 * rng.normal(size=(len(t), 4))
     channels = {
         "gyro": rate + 0.02 * rng.normal(size=rate.shape),
         "accel": np.column_stack([np.zeros_like(t), np.zeros_like(t), -lift]) + 0.1 * rng.normal(size=rate.shape),
-        "attitude": np.column_stack([np.sqrt(1.0 - np.sum(half**2, axis=1)), half]),
+        "attitude": attitude / np.linalg.norm(attitude, axis=1, keepdims=True),
         "rotor_speed": np.sqrt(square),
     }
     rows = {name: values.tolist() for name, values in channels.items()}
     return tuple(Sample(s, name, tuple(rows[name][k])) for k, s in enumerate(t.tolist()) for name in channels)
+
+
+def flown_attitude(first: FloatArray, rate: FloatArray) -> FloatArray:
+    """Attitudes at 50 Hz, shape (n, 4), from a first rotation vector [rad] and body rates [rad/s], shape (n, 3)."""
+    turns = Rotation.from_rotvec(0.01 * (rate[1:] + rate[:-1]))
+    path = list(accumulate(turns, lambda a, b: a * b, initial=Rotation.from_rotvec(first)))
+    return np.asarray(Rotation.concatenate(path).as_quat(scalar_first=True))
 
 
 PIECES = 5000

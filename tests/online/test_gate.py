@@ -95,19 +95,67 @@ def test_a_moderate_step_waits_for_a_person_even_in_auto() -> None:
     assert "person" in decision.reason
 
 
-@pytest.mark.parametrize("name", ["b", "J_xx", "J_yy"])
-def test_small_steps_do_not_creep_past_the_baseline(name: str, happened: Happened) -> None:
-    settings, baseline = GateSettings(), online_set(TRUE)
-    force = baseline
+def crept(names: tuple[str, ...]) -> float:
+    """Factor at which steps of 2 % of these parameters are no longer accepted by themselves."""
+    baseline = force = online_set(TRUE)
     factor = 1.0
     for _ in range(40):
         factor *= 1.02
-        case = good(parameters=parameter_set(scaled(**{name: factor})), in_force=force, baseline=baseline)
-        if decide(case, settings).state is not SetState.ACCEPTED:
+        moved = scaled(**dict.fromkeys(names, factor))
+        case = good(parameters=parameter_set(moved), in_force=force, baseline=baseline)
+        if decide(case, GateSettings()).state is not SetState.ACCEPTED:
             break
-        force = online_set(scaled(**{name: factor}))
-    assert 1.3 < factor < 1.0 + settings.creep + 0.05
+        force = online_set(moved)
+    return factor
+
+
+def test_small_steps_do_not_creep_past_the_baseline(happened: Happened) -> None:
+    factor = crept(NOMINAL_NAMES)
+    assert 1.3 < factor < 1.0 + GateSettings().creep + 0.05
+    happened(17, f"all parameters in steps of 2 %: stopped at {factor - 1.0:+.0%} of the approved baseline")
+
+
+@pytest.mark.parametrize("name", ["b", "J_xx", "J_yy"])
+def test_torque_over_inertia_creeps_no_further_than_sensors_may_err(name: str, happened: Happened) -> None:
+    factor = crept((name,))
+    assert 1.04 < factor < 1.09
     happened(17, f"{name} in steps of 2 %: stopped at {factor - 1.0:+.0%} of the approved baseline")
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"baseline": online_set(scaled(b=1.25))}, "first accepted or last approved set"),
+        ({"stated": {"b": (1.25 * TRUE["b"], 1e-7)}}, "the vehicle file"),
+    ],
+)
+def test_rotor_speeds_that_may_be_wrong_wait_for_a_person(changes: dict[str, Any], word: str) -> None:
+    decision = decide(good(**changes), GateSettings())
+    assert (decision.state, decision.check) == (SetState.PENDING, "reference")
+    assert word in decision.reason
+    assert "-20%" in decision.reason
+    assert "a person must approve it" in decision.reason
+
+
+def test_a_guess_of_the_vehicle_file_and_a_wide_deviation_are_no_reference() -> None:
+    assert decide(good(stated={"b": (1.25 * TRUE["b"], 0.2 * TRUE["b"])}), GateSettings()).state is SetState.ACCEPTED
+
+
+def test_mass_leaves_torque_over_inertia_as_it_is() -> None:
+    lighter = online_set(scaled(**dict.fromkeys(NOMINAL_NAMES, 1.2)))
+    assert decide(good(baseline=lighter, in_force=lighter), GateSettings()).state is SetState.ACCEPTED
+
+
+def test_windows_whose_torque_over_inertia_walks_do_not_agree() -> None:
+    decision = decide(good(walked={"J_xx": (0.08, 0.01)}), GateSettings())
+    assert (decision.state, decision.check) == (SetState.REJECTED, "agreement")
+    assert "+8%" in decision.reason
+    assert decide(good(walked={"J_xx": (0.08, 0.03)}), GateSettings()).state is SetState.ACCEPTED
+
+
+def test_sensors_that_are_not_compared_yet_are_waited_for() -> None:
+    decision = decide(good(unproven="roll turn = 1.0 +- 0.1"), GateSettings())
+    assert (decision.state, decision.check) == (SetState.REJECTED, "sensors")
 
 
 def test_a_sharper_set_is_news() -> None:

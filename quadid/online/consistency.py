@@ -1,0 +1,157 @@
+"""Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle.
+
+* Gyro against attitude, axis by axis: what the gyro adds up to over `TURN`, against the turn of the attitude.  The
+  change of rate over the turn is a second regressor: it takes up a delay between the two, so that the factor is the
+  ratio of their sizes.
+* Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays small.
+
+Every factor is a weighted mean over the last `MEMORY` of data that tell it, with its standard deviation; 1 is what it
+ought to be.  A factor that is not 1 has two channels that may be to blame: both are named.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.online.resampler import Rows
+from quadid.turning import down, integrated, turn
+from quadid.vehicle import GRAVITY
+
+FloatArray = NDArray[np.float64]
+
+ALLOWED = 0.03
+"""Calibrated sensors differ by less than this share."""
+ERRORS = 2.0
+"""... and these many standard deviations, when they are compared."""
+MEMORY = 30.0
+"""Time constant of forgetting [s] of data that tell a factor."""
+TURN = 0.2
+"""Gyro and attitude are compared over turns of this length [s]."""
+MOVING = 0.1
+"""An axis that turns slower than this on average [rad/s] tells nothing: gyro noise would make the factor too small."""
+VERTICAL = 1.5
+"""Vertical velocity of a flight [m/s], as standard deviation."""
+FEWEST = 10.0
+"""Turns that tell a factor, at least,"""
+KNOWN = 0.05
+"""... and the standard deviation from which on it is told: noise makes a ratio of small turns too large."""
+AXES = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Size of one channel over that of another.
+
+    Attributes:
+        what: the two, in words.
+        value: 1 where they agree; sigma: its standard deviation, infinite where nothing tells it.
+    """
+
+    what: str
+    value: float
+    sigma: float
+
+    @property
+    def known(self) -> bool:
+        """Whether it says anything."""
+        return self.sigma <= KNOWN
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether it is known, and cannot be 1."""
+        return self.known and abs(self.value - 1.0) > ALLOWED + ERRORS * self.sigma
+
+    def __str__(self) -> str:
+        return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
+
+
+class Consistency:
+    """Factors of the channels of one stream."""
+
+    def __init__(self) -> None:
+        """Knows nothing yet."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins anew: another stream."""
+        # Moments of (1, turn by gyro, change of rate, turn by attitude), an axis each.
+        self._turns = np.zeros((3, 4, 4))
+        self._weight = self._force = 0.0
+
+    def add(self, rows: Rows | None) -> None:
+        """Takes in rows of a second or so."""
+        if rows is None or len(rows.t) < 2 or "attitude" not in rows.columns:
+            return
+        step, q = float(rows.t[1] - rows.t[0]), rows.columns["attitude"]
+        if "gyro" in rows.columns:
+            self._add_turns(rows.columns["gyro"], q, step)
+        if "accel" in rows.columns:
+            force = -np.sum(down(q) * rows.columns["accel"], axis=1)
+            force = force[np.isfinite(force)]
+            fade = math.exp(-len(force) * step / MEMORY)
+            self._weight = fade * self._weight + len(force) * step
+            self._force = fade * self._force + float(force.sum()) * step
+
+    def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
+        long = max(round(TURN / step), 1)
+        starts = np.arange(0, len(gyro) - long, long)
+        if not len(starts):
+            return
+        by_gyro = integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step)
+        by_attitude = turn(q[starts], q[starts + long])
+        change = gyro[starts + long] - gyro[starts]
+        good = np.isfinite(by_gyro + by_attitude + change).all(axis=1)
+        if not good.any():
+            return
+        rows = np.stack([np.ones_like(change), by_gyro, change, by_attitude], axis=-1)[good]
+        moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
+        fade = math.exp(-len(rows) * long * step / MEMORY)
+        for axis in np.flatnonzero(moving):
+            self._turns[axis] = fade * self._turns[axis] + rows[:, axis].T @ rows[:, axis]
+
+    def factors(self) -> tuple[Factor, ...]:
+        """Every factor of which there are data: of the gyro by axis, of the accelerometer."""
+        found = [_gyro_factor(axis, m) for axis, m in zip(AXES, self._turns, strict=True) if m.any()]
+        if self._weight > 0.0:
+            # The mean of an acceleration is a change of velocity over a time.
+            sigma = math.sqrt(2.0) * VERTICAL / self._weight / GRAVITY
+            mean = self._force / self._weight / GRAVITY
+            found.append(Factor("accelerometer over gravity by the attitude", mean, sigma))
+        return tuple(found)
+
+    @property
+    def fault(self) -> str:
+        """Which channels contradict each other, and what is waited for; empty where none do."""
+        wrong = [f for f in self.factors() if f.disagrees]
+        if not wrong:
+            return ""
+        worst = max(wrong, key=lambda f: abs(f.value - 1.0))
+        return f"sensors disagree: {worst}, allowed 1 +- {ALLOWED:g}; nothing is learned until they agree"
+
+    @property
+    def unproven(self) -> str:
+        """Which comparison is still too uncertain to say that the sensors agree; empty where none is.
+
+        Yaw may turn too little for ever; a stream without an attitude allows no comparison at all.
+        """
+        vague = [f for f in self.factors() if not f.known and not f.what.startswith("yaw")]
+        return f"{vague[0]}, wanted +- {KNOWN:g}: whether the sensors agree is not known yet" if vague else ""
+
+
+def _gyro_factor(axis: str, moments: FloatArray) -> Factor:
+    what = f"{axis} turn by the attitude over that by the gyro"
+    count = float(moments[0, 0])
+    if count < FEWEST:
+        return Factor(what, math.nan, math.inf)
+    mean = moments[0, 1:] / count
+    centred = moments[1:, 1:] - count * np.outer(mean, mean)
+    cross = centred[:2, 2]
+    slope = np.linalg.lstsq(centred[:2, :2], cross, rcond=None)[0]
+    explained = max(float(slope @ cross), 0.0)
+    left = max(float(centred[2, 2]) - explained, 0.0) / (count - 3.0)
+    ratio = math.sqrt(explained / centred[0, 0])
+    return Factor(what, math.copysign(ratio, slope[0]), math.sqrt(left / centred[0, 0]))

@@ -1,0 +1,51 @@
+"""Turns of a body: between two attitudes, and what a gyro adds up to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def turn(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Rotation vectors [rad] in the body axes of `before`, shape (n, 3), the shorter way round to `after`.
+
+    Both are unit quaternions, body to world, shape (n, 4).
+    """
+    w, v = before[:, :1], before[:, 1:]
+    scalar = np.sum(after * before, axis=1)
+    vector = w * after[:, 1:] - after[:, :1] * v - np.cross(v, after[:, 1:])
+    vector *= np.where(scalar < 0.0, -1.0, 1.0)[:, None]
+    sine = np.linalg.norm(vector, axis=1)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)[:, None])
+
+
+def integrated(rate: FloatArray, step: float) -> FloatArray:
+    """Rotation vectors [rad], shape (n, 3), that body rates [rad/s] of shape (k, n, 3), `step` [s] apart, add up to.
+
+    Each step turns about the mean of the rates at its ends.
+    """
+    level = np.zeros((rate.shape[1], 4))
+    level[:, 0] = 1.0
+    q = level
+    for mean in 0.5 * (rate[1:] + rate[:-1]):
+        q = _product(q, _exp(mean * step))
+    return turn(level, q)
+
+
+def down(q: FloatArray) -> FloatArray:
+    """The world's downward direction in body axes, shape (n, 3), of unit quaternions (n, 4), body to world."""
+    w, x, y, z = q.T
+    return np.column_stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+
+
+def _exp(vector: FloatArray) -> FloatArray:
+    half = 0.5 * np.linalg.norm(vector, axis=1)
+    return np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector])
+
+
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    w = a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1)
+    return np.column_stack([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])])
