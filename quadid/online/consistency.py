@@ -1,8 +1,8 @@
 """Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle.
 
-* Gyro against attitude, axis by axis: what the gyro adds up to over `TURN`, against the turn of the attitude.  The
-  change of rate over the turn is a second regressor: it takes up a delay between the two, so that the factor is the
-  ratio of their sizes.
+* Gyro against attitude, axis by axis: what the gyro adds up to over `TURN`, against the turn of the attitude.  Two more
+  regressors take up what attitude filters do: the change of rate a delay, so that the factor is a ratio of sizes, and
+  the tilt the pull of the accelerometer, which reads level in flight however the vehicle tilts.
 * Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays small.
 
 Every factor is a weighted mean over the last `MEMORY` of data that tell it, with its standard deviation; 1 is what it
@@ -35,7 +35,7 @@ MOVING = 0.1
 """An axis that turns slower than this on average [rad/s] tells nothing: gyro noise would make the factor too small."""
 VERTICAL = 1.5
 """Vertical velocity of a flight [m/s], as standard deviation."""
-FEWEST = 10.0
+FEWEST = 25.0
 """Turns that tell a factor, at least,"""
 KNOWN = 0.05
 """... and the standard deviation from which on it is told: noise makes a ratio of small turns too large."""
@@ -78,8 +78,8 @@ class Consistency:
 
     def restart(self) -> None:
         """Begins anew: another stream."""
-        # Moments of (1, turn by gyro, change of rate, turn by attitude), an axis each.
-        self._turns = np.zeros((3, 4, 4))
+        # Moments of (1, turn by gyro, change of rate, tilt, turn by attitude), an axis each.
+        self._turns = np.zeros((3, 5, 5))
         self._weight = self._force = 0.0
 
     def add(self, rows: Rows | None) -> None:
@@ -104,10 +104,12 @@ class Consistency:
         by_gyro = integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step)
         by_attitude = turn(q[starts], q[starts + long])
         change = gyro[starts + long] - gyro[starts]
+        x, y, _ = 0.5 * (down(q[starts]) + down(q[starts + long])).T
+        tilt = np.column_stack([y, -x, np.zeros_like(x)])
         good = np.isfinite(by_gyro + by_attitude + change).all(axis=1)
         if not good.any():
             return
-        rows = np.stack([np.ones_like(change), by_gyro, change, by_attitude], axis=-1)[good]
+        rows = np.stack([np.ones_like(change), by_gyro, change, tilt, by_attitude], axis=-1)[good]
         moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
         fade = math.exp(-len(rows) * long * step / MEMORY)
         for axis in np.flatnonzero(moving):
@@ -149,9 +151,9 @@ def _gyro_factor(axis: str, moments: FloatArray) -> Factor:
         return Factor(what, math.nan, math.inf)
     mean = moments[0, 1:] / count
     centred = moments[1:, 1:] - count * np.outer(mean, mean)
-    cross = centred[:2, 2]
-    slope = np.linalg.lstsq(centred[:2, :2], cross, rcond=None)[0]
-    explained = max(float(slope @ cross), 0.0)
-    left = max(float(centred[2, 2]) - explained, 0.0) / (count - 3.0)
-    ratio = math.sqrt(explained / centred[0, 0])
-    return Factor(what, math.copysign(ratio, slope[0]), math.sqrt(left / centred[0, 0]))
+    gram, cross = centred[:3, :3], centred[:3, 3]
+    inverse = np.linalg.pinv(gram, hermitian=True)
+    slope = inverse @ cross
+    left = max(float(centred[3, 3] - slope @ cross), 0.0) / (count - 4.0)
+    size = math.sqrt(float(slope[:2] @ gram[:2, :2] @ slope[:2]) / gram[0, 0])
+    return Factor(what, math.copysign(size, slope[0]), math.sqrt(left * inverse[0, 0]))

@@ -96,4 +96,8 @@ FAULTS: dict[int, Fault] = {
         "second source under the vehicle's own ids, another address or merged into one stream; peers that come once",
         "refused or nothing believed, and said; only who is heard again and again is answered",
     ),
+    28: Fault(
+        "a sensor wrong by a factor, at once or slowly: gyro, accelerometer, attitude, rotor speeds",
+        "while sensors contradict each other nothing is learned or published, and it is said; rotor speeds are bounded",
+    ),
 }

@@ -1,0 +1,131 @@
+"""Sensors against each other: what contradicts stops learning and publishing, what agrees delays nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.online import Phase, Session
+from quadid.online.consistency import ALLOWED, Consistency, Factor
+from quadid.online.grid_buffer import GridBuffer
+from quadid.online.records import SetState
+from quadid.online.resampler import Resampler
+from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.window import Recording
+from studies.poisoning.flying import Poison
+from tests.faults.evidence import Happened
+from tests.online.driving import flight, published, samples
+from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
+from tests.online.test_gate import TRUE
+
+FLIGHT = light_flight(60.0)
+
+
+def factors_of(recording: Recording, vehicle: Vehicle = PELICAN) -> tuple[Factor, ...]:
+    """Factors at the end of a flight, as a session finds them."""
+    resampler, store, found = Resampler(vehicle, 50.0), GridBuffer(50.0, 20.0), Consistency()
+    tick = 1.0
+    for sample in samples(recording):
+        resampler.push(sample)
+        while (rows := resampler.next_rows()) is not None:
+            store.add(rows)
+            while rows.t[-1] >= tick:
+                found.add(store.span(tick - 1.0, tick))
+                tick += 1.0
+    return found.factors()
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        (), (("attitude_delay", "delay", 0.05),), (("imu_lag", "cutoff", 8.0),),
+        (("ahrs_acceleration_error", "k", 0.5),), (("accel_bias", "z", 0.2),), (("gyro_bias", "x", 0.05),),
+    ],
+)  # fmt: skip
+def test_what_healthy_sensors_do_is_no_contradiction(effect: tuple[tuple[str, str, float], ...]) -> None:
+    """Delays, the pull of an attitude filter, and biases leave the factors at 1."""
+    found = factors_of(flight(40.0, 5, effects=effect).recording)
+    assert len(found) == 4
+    for factor in found:
+        assert factor.known
+        assert not factor.disagrees, str(factor)
+        assert abs(factor.value - 1.0) < ALLOWED
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_gyro_axis_is_measured_against_the_attitude(axis: int) -> None:
+    found = factors_of(Poison("gyro", axis, 1.25, 0.0, 0.0).spoil(flight(40.0, 5).recording))
+    assert [f.disagrees for f in found] == [k == axis for k in range(4)]
+    assert found[axis].value == pytest.approx(1.0 / 1.25, abs=4.0 * found[axis].sigma)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_an_accelerometer_is_measured_against_gravity_and_an_attitude_against_the_gyro(factor: float) -> None:
+    made = flight(40.0, 5).recording
+    found = factors_of(Poison("accel", None, factor, 0.0, 0.0).spoil(made))
+    assert [f.disagrees for f in found] == [False, False, False, True]
+    assert found[3].value == pytest.approx(factor, abs=2.0 * found[3].sigma)
+    tilted = factors_of(Poison("attitude", None, factor, 0.0, 0.0).spoil(made))
+    assert [f.disagrees for f in tilted[:2]] == [True, True]
+
+
+def test_an_axis_that_hardly_turns_tells_nothing() -> None:
+    found = factors_of(flight(30.0, 3, "hover").recording)
+    assert ["gravity" in f.what for f in found] == [True]
+
+
+SPOILT = [("gyro", 0, 1.1), ("gyro", 1, 0.8), ("accel", None, 1.2), ("attitude", None, 0.9)]
+
+
+@pytest.mark.parametrize(("channel", "column", "factor"), SPOILT)
+@pytest.mark.parametrize("begin", [0.0, 25.0])
+def test_while_sensors_contradict_each_other_nothing_is_learned_or_published(
+    channel: str, column: int | None, factor: float, begin: float, happened: Happened
+) -> None:
+    stream = []
+    for s in FLIGHT:
+        values = np.array(s.values)
+        if s.channel == channel and s.t >= begin:
+            if channel == "attitude":
+                half = values[1:] * factor
+                values = np.array([np.sqrt(1.0 - half @ half), *half])
+            else:
+                values[slice(None) if column is None else column] *= factor
+        stream.append(replace(s, values=tuple(values.tolist())))
+    session = Session(PELICAN, QUICK)
+    early = works(session, between(stream, 0.0, begin + 12.0), tells())
+    late = works(session, between(stream, begin + 12.0, 60.0), tells(b=1.03))
+    assert not published(late)
+    if begin == 0.0:
+        assert not published(early)
+    status = session.status()
+    assert status.phase is Phase.BLOCKED
+    assert "sensors disagree" in status.reason
+    assert "until they agree" in status.reason
+    happened(28, f"{channel} × {factor:g} from {begin:g} s on: nothing published; '{status.reason[:90]}'")
+
+
+def test_a_vehicle_file_that_knows_b_limits_the_first_set(happened: Happened) -> None:
+    """All rotor speeds wrong by one factor look like another b: only what was known before tells."""
+    knows = PELICAN.parameters | {"b": ParameterPrior(initial=TRUE["b"] * 1.2, sigma=TRUE["b"] * 0.02)}
+    session = Session(PELICAN.model_copy(update={"parameters": knows}), QUICK)
+    actions = works(session, between(FLIGHT, 0.0, 12.0), tells())
+    assert not published(actions)
+    waits = session.active_set.pending
+    assert waits is not None
+    assert (waits.state, waits.check) == (SetState.PENDING, "reference")
+    assert "rotor speeds wrong by a factor" in waits.reason
+    happened(28, f"all rotor speeds × 1.1, b known to 2 %: '{waits.reason[:90]}'")
+
+
+def test_in_flight_rotor_speeds_cannot_walk_away_from_the_first_set(happened: Happened) -> None:
+    session = Session(PELICAN, QUICK.model_copy(update={"gate": GATE}))
+    sets = published(works(session, between(FLIGHT, 0.0, 12.0), tells()))
+    for k in range(12):
+        piece = between(FLIGHT, 12.0 + 4.0 * k, 16.0 + 4.0 * k)
+        sets += published(works(session, piece, tells(b=1.01**k)))
+    furthest = max(abs(s.parameters["b"].value / TRUE["b"] - 1.0) for s in sets)
+    assert 0.01 < furthest < 0.06
+    happened(28, f"all rotor speeds drifting, b by 1 % in 4 s up to 12 %: published up to {furthest:+.1%}")
