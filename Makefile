@@ -133,6 +133,10 @@ faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/res
 	rm -f docs/results/faults.json
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser" --faults-page docs/results/faults.md tests
 
+.PHONY: poisoning
+poisoning: venv ## every sensor wrong by a factor, at once or slowly: what is published, into docs/results/poisoning.md (half an hour)
+	$(STUDY) studies.poisoning --fresh --out docs/results
+
 .PHONY: fuzz
 fuzz: $(DEV) ## mutated logs of seven formats through their readers for an hour; goes on where it stopped, into docs/results/fuzz.md
 	OPENBLAS_NUM_THREADS=1 nice -n 19 $(BIN)/python -m tests.fuzz

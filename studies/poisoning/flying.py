@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.online import Job, Publish, Session, SessionSettings
+from quadid.online import Job, Publish, Session
 from quadid.online.records import OnlineSet
-from quadid.vehicle import Vehicle
 from quadid.window import Block, Recording
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +22,7 @@ class Poison:
     """One channel wrong by a factor.
 
     Attributes:
-        channel: name of the channel; column: which of it, None for all (of the attitude: its angle from level).
+        channel: name of the channel; column: which of it, None for all (of the attitude: roll and pitch).
         factor: what it is multiplied by in the end.
         begin: when it begins [s]; ramp: how long it grows [s], 0 for a step.
     """
@@ -69,16 +68,18 @@ def turned(q: FloatArray, factor: FloatArray) -> FloatArray:
     ])  # fmt: skip
 
 
-def fly_online(
-    recording: Recording, vehicle: Vehicle, settings: SessionSettings, restored: OnlineSet | None = None
-) -> tuple[list[OnlineSet], Session]:
-    """Sets that a session puts on the parameter topic while it hears the recording, every job done at once."""
-    session = Session(vehicle, settings, restored)
+def fly_online(session: Session, recording: Recording, start: float, stop: float) -> list[OnlineSet]:
+    """Sets that a session puts on the parameter topic while it hears a stretch of a recording, every job done at once.
+
+    Args:
+        session: it hears, and is changed.
+        recording: times in seconds.
+        start: first time heard [s].
+        stop: last one [s].
+    """
     sets: list[OnlineSet] = []
-    begin = min(float(c.t[0]) for c in recording.channels.values())
-    end = max(float(c.t[-1]) for c in recording.channels.values())
-    edges = np.arange(begin, end + STEP, STEP)
-    places = {n: np.searchsorted(c.t, edges) for n, c in recording.channels.items()}
+    edges = np.arange(start, stop + 0.5 * STEP, STEP)
+    places = {n: np.searchsorted(c.t, edges - 1e-6) for n, c in recording.channels.items()}
     for k in range(len(edges) - 1):
         for name, place in places.items():
             a, b = int(place[k]), int(place[k + 1])
@@ -86,7 +87,7 @@ def fly_online(
             if b > a:
                 session.push_block(Block(channel.t[a:b], ((name, channel.values[a:b]),)))
         _answer(session, sets)
-    return sets, session
+    return sets
 
 
 def _answer(session: Session, sets: list[OnlineSet]) -> None:
