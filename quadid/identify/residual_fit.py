@@ -1,16 +1,18 @@
 """What a physical model leaves of a flight, learnt as terms beyond the catalogue.
 
 Runs from measured states, up to half a second ahead, are linear enough in the coefficients of small forces and moments:
-the errors of all runs give normal equations for every candidate term at once, block by block.  Terms are selected
-forwards by what each takes off the summed error with the others adjusted (orthogonal matching pursuit: Pati, Rezaiifar
-and Krishnaprasad 1993, doi:10.1109/ACSSC.1993.342465), the equations are made anew where the fit has gone, and how many
-terms are worth having is decided on flights, or halves of one, that were not fitted.  The physics never changes.
+the errors of all runs give normal equations for every candidate term at once.  Terms are selected forwards by what each
+takes off the summed error with the others adjusted (orthogonal matching pursuit: Pati, Rezaiifar and Krishnaprasad
+1993, doi:10.1109/ACSSC.1993.342465), single signals first, then products of two as well; the equations are made anew
+where the fit has gone, and how many terms are worth having is decided on flights, or pieces of them, that were not
+fitted.  The physics never changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement, islice
 
 import numpy as np
 
@@ -18,23 +20,36 @@ from quadid.identify.run_errors import STAGES, RunErrors
 from quadid.model.layout import Layout
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
-SIZES = (6, 15, 30, 60)
-"""Numbers of terms that are tried."""
+PLAIN = (6, 15, 30)
+"""Numbers of terms that are tried without products of two signals."""
+RICH = (60, 120, 200)
+"""Numbers of terms that are tried with them."""
+SIZES = (0, *PLAIN, *RICH)
 RIDGE = 1e-3
 """Curvature that holds coefficients of typical size back, relative to a mean error of one."""
 SIMPLER = 0.02
-"""A smaller model is preferred when its error on data not fitted is larger by no more than this share."""
+"""Share of the error on data not fitted that more terms must take off; less ends the trials."""
 WORTH = 0.97
 """Terms are kept when they bring the error on data not fitted below this share."""
-MOST_RUNS = 600
-"""Runs that the equations are made of; every n-th of more."""
-_SHORTEST = 5.0
-"""A flight is cut in two only into halves at least so long [s]."""
+MOST_RUNS = 500
+"""Runs that terms are fitted and judged on; every n-th of more."""
+SELECT_RUNS = 250
+"""Runs that terms are selected by."""
+_BLOCK = 84
+"""Candidates whose slopes are taken at once: each of their runs evaluates all of them."""
+FOLDS = 3
+"""Parts of the data, each predicted once by what the others taught."""
+_SHORTEST = 4.0
+"""Shortest piece of a flight that is such a part [s]."""
+STEPS = 2
+"""Steps that a larger model takes from one selection."""
 _STEPS = (1.0, 0.5, 0.25, 0.125)
 """Shares of a linear step that are tried; the first that lowers the error is taken."""
+
+Terms = tuple[ResidualTerm, ...]
 
 
 @dataclass(frozen=True)
@@ -51,15 +66,18 @@ class ResidualFit:
 
 
 def candidate_terms(flown: bool = True) -> tuple[ResidualTerm, ...]:
-    """A constant and every signal by itself, on every force and moment, and drag with the speed; coefficients zero.
+    """Terms that may be chosen, on every force and moment, coefficients zero.
 
-    Without a measured velocity (`flown` False) neither forces nor what depends on the velocity can be learnt.
+    A constant, every signal by itself, drag with the speed, then the products of two signals.  Without a measured
+    velocity (`flown` False) neither forces nor what depends on the velocity can be learnt.
     """
-    products = [(), *((name,) for name in SIGNALS if name != "V"), ("V", "v_x"), ("V", "v_y"), ("V", "v_z")]
+    plain = [name for name in SIGNALS if name != "V"]
+    products = [(), *((name,) for name in plain), ("V", "v_x"), ("V", "v_y"), ("V", "v_z")]
+    products += combinations_with_replacement(plain, 2)
     if not flown:
         products = [p for p in products if not any(SIGNALS[name] == "m/s" for name in p)]
     targets = [target for target in TARGETS if flown or target.startswith("moment")]
-    return tuple(ResidualTerm(acts_on=target, product=p, value=0.0) for target in targets for p in products)
+    return tuple(ResidualTerm(acts_on=target, product=p, value=0.0) for p in products for target in targets)
 
 
 def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
@@ -72,91 +90,117 @@ def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
     Raises:
         NotIdentifiableError: no run of half a second fits into any window, or the physics run away at once.
     """
-    flown = any(w.velocity is not None for w in windows)
-    wide = vehicle.model_copy(update={"residual": candidate_terms(flown)})
+    candidates = candidate_terms(any(w.velocity is not None for w in windows))
+    physical = vehicle.model_copy(update={"residual": ()})
     folds = _folds(windows)
     if len(folds) < 2:  # too short for a part to learn from and another to judge
         return ResidualFit((), {})
-    unseen: dict[int, list[float]] = {}
-    for held in range(len(folds)):
-        judge = RunErrors(folds[held], wide, STAGES[-1], MOST_RUNS)
-        rest = [w for i, fold in enumerate(folds) if i != held for w in fold]
-        unseen.setdefault(0, []).append(judge.share(Layout(wide).initial(wide)))
-        for size, theta, _ in _path(rest, wide, SIZES[-1]):
-            unseen.setdefault(size, []).append(judge.share(theta))
-    errors = {size: float(np.mean(shares)) for size, shares in unseen.items()}
-    best = min(errors.values())
-    size = min(n for n, error in errors.items() if error <= (1.0 + SIMPLER) * best)
+    others = [[w for i, fold in enumerate(folds) if i != held for w in fold] for held in range(len(folds))]
+    paths = zip(*(_path(rest, physical, candidates) for rest in others), strict=True)
+    errors: dict[int, float] = {}
+    for size, fits in zip(SIZES, paths, strict=True):
+        shares = [_share(fold, physical, terms, STAGES[-1]) for fold, terms in zip(folds, fits, strict=True)]
+        errors[size] = float(np.mean(shares))
+        if size > SIZES[1] and errors[size] > (1.0 - SIMPLER) * errors[SIZES[SIZES.index(size) - 1]]:
+            break  # more terms predict no better
+    size = min(errors, key=lambda n: errors[n] * (1.0 + SIMPLER) ** SIZES.index(n))
     if size == 0 or not errors[size] < WORTH * errors[0]:
         return ResidualFit((), errors)
-    _, theta, chosen = _path(windows, wide, size)[-1]
-    values = theta[_first(wide) + np.array(chosen)]
-    terms = [wide.residual[i].model_copy(update={"value": float(v)}) for i, v in zip(chosen, values, strict=True)]
-    return ResidualFit(tuple(terms), errors)
-
-
-def _first(vehicle: Vehicle) -> int:
-    """Index of the first term in the full vector."""
-    return Layout(vehicle).size - len(vehicle.residual)
+    final = _path(windows, physical, candidates)
+    return ResidualFit(next(islice(final, SIZES.index(size), None)), errors)
 
 
 def _folds(windows: Sequence[Window]) -> list[list[Window]]:
-    """Flights in two groups of about the same length, or the halves of one flight."""
+    """Flights in `FOLDS` groups of about the same length; fewer flights in pieces, short ones in fewer."""
     flights: dict[tuple[str, tuple[float, float]], list[Window]] = {}
     for w in windows:
         flights.setdefault((w.name, w.log_span), []).append(w)
-    if len(flights) == 1:
-        halves: list[list[Window]] = [[], []]
-        for w in windows:
-            middle = len(w) // 2
-            if middle * w.dt < _SHORTEST:
-                halves[len(halves[0]) > len(halves[1])].append(w)
-            else:
-                halves[0].append(w.slice(0, middle))
-                halves[1].append(w.slice(middle, len(w)))
-        return [half for half in halves if half]
-    groups: list[list[Window]] = [[], []]
-    for flight in sorted(flights.values(), key=lambda part: -sum(map(len, part))):
-        min(groups, key=lambda group: sum(map(len, group))).extend(flight)
+    parts = list(flights.values())
+    if len(parts) < FOLDS:
+        parts = [[piece] for w in windows for piece in _pieces(w, -(-FOLDS // len(parts)))]
+    groups: list[list[Window]] = [[] for _ in range(FOLDS)]
+    for part in sorted(parts, key=lambda part: -sum(map(len, part))):
+        min(groups, key=lambda group: sum(map(len, group))).extend(part)
     return [group for group in groups if group]
 
 
-def _path(windows: Sequence[Window], vehicle: Vehicle, most: int) -> list[tuple[int, FloatArray, list[int]]]:
-    """Fits of growing size: number of terms, full vector, the terms in the order in which they came."""
-    theta = Layout(vehicle).initial(vehicle)
-    chosen: list[int] = []
-    path = []
-    problems = [RunErrors(windows, vehicle, seconds, MOST_RUNS) for seconds in STAGES]
-    for problem in problems:
-        theta, chosen = _grown(problem, vehicle, theta, chosen, SIZES[0])
-    for size in SIZES:
-        if size > most:
-            break
-        theta, chosen = _grown(problems[-1], vehicle, theta, chosen, size)
-        path.append((size, theta, list(chosen)))
-    return path
+def _pieces(w: Window, most: int) -> list[Window]:
+    """A window in at most so many pieces of the same length, none shorter than `_SHORTEST`."""
+    n = max(min(most, int(len(w) * w.dt / _SHORTEST)), 1)
+    return [w.slice(i * len(w) // n, (i + 1) * len(w) // n) for i in range(n)]
 
 
-def _grown(
-    problem: RunErrors, vehicle: Vehicle, theta: FloatArray, chosen: list[int], size: int
-) -> tuple[FloatArray, list[int]]:
-    """Adds terms until there are `size`, and takes one step in all of them."""
-    first, layout = _first(vehicle), Layout(vehicle)
-    typical = np.array([layout.entries[f"residual.{i + 1}"].typical for i in range(len(vehicle.residual))])
-    step = np.zeros((len(typical), len(theta)))
-    step[np.arange(len(typical)), first + np.arange(len(typical))] = typical
-    h, g = problem.equations(theta, step)
-    z = theta[first:] / typical
-    chosen = _selected(h, g, z, chosen, size)
-    change = np.zeros(len(typical))
-    change[chosen] = _solved(h, g, z, chosen)
-    before = problem.share(theta)
+def _path(windows: Sequence[Window], physical: Vehicle, candidates: Terms) -> Iterator[Terms]:
+    """Fits of growing size, terms in the order in which they came: the sizes of `SIZES`."""
+    plain = tuple(term for term in candidates if len(term.product) < 2 or "V" in term.product)
+    terms: Terms = ()
+    yield terms
+    for seconds in STAGES[:-1]:
+        terms = _fitted(windows, physical, _selected(windows, physical, terms, plain, PLAIN[0], seconds), seconds)
+    for size in SIZES[1:]:
+        offered = plain if size in PLAIN else candidates
+        terms = _selected(windows, physical, terms, offered, size, STAGES[-1])
+        for _ in range(STEPS):
+            terms = _fitted(windows, physical, terms, STAGES[-1])
+        yield terms
+
+
+def _share(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> float:
+    """Mean error as a share of no change."""
+    vehicle = physical.model_copy(update={"residual": terms})
+    return RunErrors(windows, vehicle, seconds, MOST_RUNS).share(Layout(vehicle).initial(vehicle))
+
+
+def _slopes(
+    windows: Sequence[Window], physical: Vehicle, terms: Terms, more: Terms, seconds: Sequence[float], runs: int
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes (len(terms + more), M) of all runs along terms of typical size, and their errors (M,)."""
+    blocks = [terms] if terms else []
+    blocks += [more[i : i + _BLOCK] for i in range(0, len(more), _BLOCK)]
+    rows, errors = [], np.zeros(0)
+    for block in blocks:
+        wide = physical.model_copy(update={"residual": terms if block is terms else (*terms, *block)})
+        theta, sizes = Layout(wide).initial(wide), _typical(wide)
+        directions = np.zeros((len(block), len(theta)))
+        places = np.arange(len(block))
+        directions[places, len(theta) - len(block) + places] = sizes[len(sizes) - len(block) :]
+        slopes, errors = RunErrors(windows, wide, seconds, runs).slopes(theta, directions)
+        rows.append(slopes)
+    return np.concatenate(rows), errors
+
+
+def _typical(vehicle: Vehicle) -> FloatArray:
+    """Sizes at which the residual terms of a vehicle matter."""
+    return np.array([term.typical(vehicle.mass * GRAVITY, vehicle.arm) for term in vehicle.residual])
+
+
+def _selected(
+    windows: Sequence[Window], physical: Vehicle, terms: Terms, candidates: Terms, size: int, seconds: Sequence[float]
+) -> Terms:
+    """Adds candidates, with coefficients of zero, until there are `size` terms."""
+    have = {(term.acts_on, term.product) for term in terms}
+    more = tuple(c for c in candidates if (c.acts_on, c.product) not in have)
+    j, errors = _slopes(windows, physical, terms, more, seconds, SELECT_RUNS)
+    z = np.array([t.value for t in terms]) / _typical(physical.model_copy(update={"residual": terms}))
+    z = np.concatenate([z, np.zeros(len(more))])
+    chosen = _pursued(j @ j.T, j @ errors, z, list(range(len(terms))), size)
+    return tuple((*terms, *more)[i] for i in chosen)
+
+
+def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> Terms:
+    """Takes one step in all coefficients, as long a part of it as lowers the error."""
+    typical = _typical(physical.model_copy(update={"residual": terms}))
+    values = np.array([t.value for t in terms])
+    j, errors = _slopes(windows, physical, terms, (), seconds, MOST_RUNS)
+    change = _solved(j @ j.T, j @ errors, values / typical, list(range(len(terms)))) * typical
+    before = _share(windows, physical, terms, seconds)
     for part in _STEPS:
-        moved = theta.copy()
-        moved[first:] += part * change * typical
-        if problem.share(moved) < before:
-            return moved, chosen
-    return theta, chosen
+        moved = tuple(
+            term.model_copy(update={"value": float(v)}) for term, v in zip(terms, values + part * change, strict=True)
+        )
+        if _share(windows, physical, moved, seconds) < before:
+            return moved
+    return terms
 
 
 def _solved(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int]) -> FloatArray:
@@ -165,7 +209,7 @@ def _solved(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int]) -> F
     return np.asarray(np.linalg.solve(inner, -(g[chosen] + RIDGE * z[chosen])))
 
 
-def _selected(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int], size: int) -> list[int]:
+def _pursued(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int], size: int) -> list[int]:
     """Adds the term that lowers the linear problem's error most, the others adjusted, until there are `size`."""
     chosen = list(chosen)
     curvature = np.diag(h) + RIDGE

@@ -1,7 +1,7 @@
 """Errors of runs from measured states, as a share of what predicting no change would miss by in the same flight.
 
-The error that a prediction is judged by: Euclidean, a tenth to half a second after a measured state.  Its normal
-equations serve whoever makes it small.
+The error that a prediction is judged by: Euclidean, a tenth to half a second after a measured state.  Its slopes serve
+whoever makes it small.
 """
 
 from __future__ import annotations
@@ -63,27 +63,26 @@ class RunErrors:
         ]
         return float(np.mean(mean_of_known(np.concatenate(shares))[self._counts > 0]))
 
-    def equations(self, theta: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Curvature (P, P) and half the slope (P,) of the summed errors along `directions` (P, size).
+    def slopes(self, theta: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Slopes (P, M) along `directions` (P, size) and errors (M,), both weighted so that squares sum up the errors.
 
         An error weighs by its own inverse, so that squares stand for lengths (Weiszfeld); runs that went away are left
         out.
         """
         p = len(directions)
-        ends = np.concatenate([theta[None], theta + _STEP * directions, theta - _STEP * directions])
-        h, g = np.zeros((p, p)), np.zeros(p)
+        ends = np.concatenate([theta[None], theta + _STEP * directions])
+        slopes, errors = [np.zeros((p, 0))], [np.zeros(0)]
         for loop, scale in zip(self._loops, self._scales, strict=True):
             misses = loop.misses(ends, self.at)
             usable = np.asarray(np.isfinite(misses).all(axis=(0, 4)))
             share = lengths(misses[0]) / scale
             weight = np.where(usable, 1.0 / np.maximum(share, _NEAR), 0.0) / np.maximum(self._counts, 1)
             root = (np.sqrt(weight) / scale)[..., None]
-            residual = np.where(usable[..., None], misses[0], 0.0) * root
             with np.errstate(invalid="ignore"):
-                slope = (misses[1 : 1 + p] - misses[1 + p :]) / (2.0 * _STEP)
-            j = (np.where(usable[..., None], slope, 0.0) * root).reshape(p, -1)
-            h, g = h + j @ j.T, g + j @ residual.ravel()
-        return h, g
+                slope = (misses[1:] - misses[0]) / _STEP
+            slopes.append((np.where(usable[..., None], slope, 0.0) * root).reshape(p, -1))
+            errors.append((np.where(usable[..., None], misses[0], 0.0) * root).ravel())
+        return np.concatenate(slopes, axis=1), np.concatenate(errors)
 
 
 def _scales(loops: Sequence[OpenLoop], at: NDArray[np.intp]) -> list[FloatArray]:

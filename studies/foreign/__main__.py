@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 import quadid
 from quadid.errors import QuadidError
@@ -19,36 +17,20 @@ from quadid.identify.open_loop import QUANTITIES, mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.workflow.loading import Log, load_vehicle
+from quadid.workflow.loading import load_vehicle
 from studies.foreign.learning import FEATURES, network, ridge, runs_of, shares
+from studies.foreign.page import AHEAD, Row, page, section
 from studies.foreign.sets import SETS, FlightSet
-from studies.page import put_section
 
-AHEAD = 0.5
 RATE = 100.0
 """Grid of the scores [Hz]."""
-COMMAND = "make foreign"
-
-
-@dataclass(frozen=True)
-class Row:
-    """What one set gave.
-
-    Attributes:
-        identified, diagnosed: JSON results; None with the reason in `failed`.
-        prediction: half-second errors as shares of no change by what predicts them, each of the four quantities.
-        seconds: wall time.
-    """
-
-    identified: dict[str, Any] | None
-    diagnosed: dict[str, Any] | None
-    prediction: dict[str, list[float]]
-    seconds: float
-    failed: str = ""
+SOON = 0.1
+"""Time [s] after which the rate of `crazyflie rpm` is wanted below 0.35 of no change."""
+_KEPT = ("parameters", "verdict", "validation", "findings")
 
 
 def main() -> None:
-    """Runs the sets that were asked for, or all, prints and writes the table."""
+    """Runs the sets that were asked for, or all, prints them and writes the page from all results so far."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
@@ -57,11 +39,14 @@ def main() -> None:
     unknown = [n for n in given.names if n not in SETS]
     if unknown:
         sys.exit(f"no set called {unknown[0]}; there are {', '.join(SETS)}")
+    kept = given.out / "foreign.json"
     for name in given.names or SETS:
         row = measured(SETS[name], given.data)
-        text = section(name, SETS[name], row)
-        print(text, flush=True)
-        put_section(given.out / "foreign.md", "Vehicles of others", f"foreign {name}", text)
+        print(section(name, SETS[name], row), flush=True)
+        rows = json.loads(kept.read_text()) if kept.exists() else {}
+        rows[name] = dataclasses.asdict(row)
+        kept.write_text(json.dumps(rows, indent=1) + "\n")
+        (given.out / "foreign.md").write_text(page({n: Row(**rows[n]) for n in SETS if n in rows}))
 
 
 def measured(one: FlightSet, data: Path) -> Row:
@@ -78,64 +63,35 @@ def measured(one: FlightSet, data: Path) -> Row:
     if found.prediction is not None:
         files["prediction file"] = found.prediction
     prediction: dict[str, list[float]] = {}
+    soon: dict[str, float] = {}
     if one.unseen:
-        finer = [[quadid.load(str(data / log), vehicle, rate=RATE) for log in part] for part in (one.train, one.unseen)]
-        prediction = predicted(files, *finer)
-    return Row(identified, found.result, prediction, time.perf_counter() - begin)
+        seen, new = ([w for log in part for w in _fine(data, log, vehicle)] for part in (one.train, one.unseen))
+        prediction = {name: _share(new, v, AHEAD) for name, v in files.items()} | learners(seen, new)
+        soon = {name: _share(new, v, SOON)[3] for name, v in files.items()}
+    answers = ({key: result[key] for key in _KEPT if key in result} for result in (identified, found.result))
+    terms = () if found.prediction is None else tuple(t.formula for t in found.prediction.residual)
+    return Row(*answers, prediction, time.perf_counter() - begin, terms=terms, soon=soon)
 
 
-def predicted(files: dict[str, Vehicle], train: Sequence[Log], unseen: Sequence[Log]) -> dict[str, list[float]]:
-    """Errors half a second ahead on unseen flights, as shares of no change."""
-    windows = [w for log in unseen for w in log.windows]
-    out = {name: _share(windows, vehicle) for name, vehicle in files.items()}
-    seen, new = ([w for log in part for w in log.windows] for part in (train, unseen))
-    if any(w.velocity is not None for w in new):
-        learn, test = runs_of(seen), runs_of(new)
-        learners = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES), "network": network(learn)}
-        out |= {name: shares(predict, test).tolist() for name, predict in learners.items()}
-    return out
+def _fine(data: Path, log: str, vehicle: Vehicle) -> Sequence[Window]:
+    return quadid.load(str(data / log), vehicle, rate=RATE).windows
 
 
-def _share(windows: Sequence[Window], vehicle: Vehicle) -> list[float]:
-    steps = round(AHEAD / windows[0].dt)
+def learners(seen: Sequence[Window], new: Sequence[Window]) -> dict[str, list[float]]:
+    """Errors of ridge, random features and network half a second ahead, as shares of no change."""
+    if all(w.velocity is None for w in new):
+        return {}
+    learn, test = runs_of(seen), runs_of(new)
+    guesses = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES), "network": network(learn)}
+    return {name: shares(guess, test).tolist() for name, guess in guesses.items()}
+
+
+def _share(windows: Sequence[Window], vehicle: Vehicle, seconds: float) -> list[float]:
+    """Errors so long after a measured state, as shares of no change."""
+    steps = round(seconds / windows[0].dt)
     errors = mean_errors(windows, vehicle, Layout(vehicle).initial(vehicle), steps)
     still = no_change(windows, vehicle, steps)
     return [errors[q] / still[q] for q in QUANTITIES]
-
-
-def section(name: str, one: FlightSet, row: Row) -> str:
-    """Markdown of one set."""
-    lines = [f"## {name}", "", f"`{COMMAND}` ({row.seconds:.0f} s), trained on {', '.join(one.train)}.", ""]
-    if row.identified is None or row.diagnosed is None:
-        return "\n".join([*lines, f"Refused: {row.failed}"])
-    lines += ["| parameter | truth | identify | status | diagnose | status |", "|---|---|---|---|---|---|"]
-    after = {p["name"]: p for p in row.diagnosed.get("parameters", [])}
-    for p in row.identified["parameters"]:
-        low, high = one.truth.get(p["name"], (np.nan, np.nan))
-        truth = "" if np.isnan(low) else f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        cells = [_cell(p), p["status"], *((_cell(q), q["status"]) if (q := after.get(p["name"])) else ("", ""))]
-        lines.append(f"| {p['name']} | {truth} | {' | '.join(cells)} |")
-    lines += [
-        "",
-        f"Verdict `{row.diagnosed['verdict']}`, error on data not fitted "
-        f"{row.diagnosed['validation']['mse_nominal']:.3g} → {row.diagnosed['validation']['mse_extended']:.3g} "
-        "noise variances. Found: " + (", ".join(_finding(f) for f in row.diagnosed["findings"]) or "nothing") + ".",
-    ]
-    if row.prediction:
-        lines += ["", f"Error {AHEAD:g} s ahead on {', '.join(one.unseen)}, as a share of no change:", "",
-                  "| | " + " | ".join(QUANTITIES) + " |", "|---|---|---|---|---|"]  # fmt: skip
-        lines += [f"| {who} | " + " | ".join(f"{s:.2f}" for s in s4) + " |" for who, s4 in row.prediction.items()]
-    return "\n".join(lines)
-
-
-def _cell(p: dict[str, Any]) -> str:
-    low, high = p["ci95"]
-    return f"{p['value']:.3g} [{low:.3g}, {high:.3g}]"
-
-
-def _finding(f: dict[str, Any]) -> str:
-    numbers = ", ".join(f"{p['name']} {p['value']:.3g} {p['unit']}".strip() for p in f["parameters"])
-    return f"{f['effect']} ({numbers}{'' if f['confident'] else '; not confident'})"
 
 
 if __name__ == "__main__":

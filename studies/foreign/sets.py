@@ -47,12 +47,12 @@ SETS: dict[str, FlightSet] = {
         "ardupilot_sitl/sitl_x.yaml", ("ardupilot_sitl/x.bin",), (), _X, "ArduPilot's own physics",
     ),
     "brushed rpm": FlightSet(
-        "brushed/vehicle.yaml", ("brushed/jana00.csv@:13", "brushed/jana02.csv@:11"),
-        ("brushed/jana00.csv@13:", "brushed/jana02.csv@11:"), _BRUSHED, "thrust stand; published inertias",
+        "brushed/vehicle.yaml", ("brushed/jana00.csv@:6", "brushed/jana02.csv@:5"),
+        ("brushed/jana00.csv@6:", "brushed/jana02.csv@5:"), _BRUSHED, "thrust stand; published inertias",
     ),
     "brushed PWM": FlightSet(
-        "brushed/vehicle_pwm.yaml", ("brushed/jana00_pwm.csv@:13", "brushed/jana02_pwm.csv@:11"),
-        ("brushed/jana00_pwm.csv@13:", "brushed/jana02_pwm.csv@11:"), {}, "",
+        "brushed/vehicle_pwm.yaml", ("brushed/jana00_pwm.csv@:6", "brushed/jana02_pwm.csv@:5"),
+        ("brushed/jana00_pwm.csv@6:", "brushed/jana02_pwm.csv@5:"), {}, "",
     ),
     "nanobench PWM": FlightSet(
         "nanobench/vehicle.yaml", ("nanobench/B2_circle_fast_rep1.csv@:10", "nanobench/B9_trefoil_fast_rep10.csv@:8"),

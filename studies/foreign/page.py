@@ -1,0 +1,129 @@
+"""The page of `make foreign`: tables over all sets, then what each gave."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from quadid.identify.open_loop import QUANTITIES
+from studies.foreign.sets import SETS, FlightSet
+
+AHEAD = 0.5
+COMMAND = "make foreign"
+SHOWN = 6
+"""Residual terms that are printed."""
+_LEARNT = ("ridge", "random features")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one set gave.
+
+    Attributes:
+        identified, diagnosed: JSON results; None with the reason in `failed`.
+        prediction: half-second errors as shares of no change by what predicts them, each of the four quantities.
+        seconds: wall time.
+        terms: formulas of the prediction file.
+        soon: error of the rate after 0.1 s by the same predictors, as a share of no change.
+        date: of the measurement.
+    """
+
+    identified: dict[str, Any] | None
+    diagnosed: dict[str, Any] | None
+    prediction: dict[str, list[float]]
+    seconds: float
+    failed: str = ""
+    terms: tuple[str, ...] = ()
+    soon: dict[str, float] = field(default_factory=dict)
+    date: str = field(default_factory=lambda: datetime.date.today().isoformat())
+
+
+def page(rows: Mapping[str, Row], notes: str = "") -> str:
+    """Markdown of all sets measured so far; `notes` stand before the sets."""
+    parts = ["# Vehicles of others", _ahead(rows), _kept(rows), notes]
+    return "\n\n".join([p for p in parts if p] + [section(n, SETS[n], row) for n, row in rows.items()]) + "\n"
+
+
+def _ahead(rows: Mapping[str, Row]) -> str:
+    """Half-second errors of all sets beside each other."""
+    lines = [
+        f"Errors {AHEAD:g} s ahead on unseen flights as shares of no change, {' / '.join(QUANTITIES)}; in bold what is "
+        "below ridge and random features.", "",
+        "| data | physical file | prediction file | ridge | random features | noise variances, validation |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, row in rows.items():
+        if "ridge" not in row.prediction or row.diagnosed is None:
+            continue
+        ours = row.prediction.get("prediction file", row.prediction["physical file"])
+        rivals = np.min([row.prediction[who] for who in _LEARNT], axis=0)
+        best = [f"**{a:.2f}**" if a < b else f"{a:.2f}" for a, b in zip(ours, rivals, strict=True)]
+        cells = [" / ".join(f"{s:.2f}" for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
+        cells.insert(1, " / ".join(best))
+        lines.append(f"| {name} | {' | '.join(cells)} | {row.diagnosed['validation']['mse_extended']:.3g} |")
+    return "\n".join(lines) if len(lines) > 4 else ""
+
+
+def _kept(rows: Mapping[str, Row]) -> str:
+    """How many numbers called identified hold their known truth."""
+    lines = ["| data | by | identified, truth known | inside 95 % | outside |", "|---|---|---|---|---|"]
+    total = inside = 0
+    for name, row in rows.items():
+        for by, answer in (("identify", row.identified), ("diagnose", row.diagnosed)):
+            named = [p for p in (answer or {}).get("parameters", []) if p["status"] == "identified"]
+            known = [p for p in named if p["name"] in SETS[name].truth]
+            out = [p["name"] for p in known if not _holds(p["ci95"], SETS[name].truth[p["name"]])]
+            total, inside = total + len(known), inside + len(known) - len(out)
+            if known:
+                lines.append(f"| {name} | {by} | {len(known)} | {len(known) - len(out)} | {', '.join(out)} |")
+    if not total:
+        return ""
+    return "\n".join([*lines, "", f"In all {inside} of {total} ({inside / total:.0%}; wanted 90 %)."])
+
+
+def _holds(interval: list[float], truth: tuple[float, float]) -> bool:
+    return interval[0] <= truth[1] and truth[0] <= interval[1]
+
+
+def section(name: str, one: FlightSet, row: Row) -> str:
+    """Markdown of one set."""
+    lines = [f"## {name}", "", f"`{COMMAND}` ({row.seconds:.0f} s), trained on {', '.join(one.train)}.", ""]
+    if row.identified is None or row.diagnosed is None:
+        return "\n".join([*lines, f"Refused: {row.failed}"])
+    lines += ["| parameter | truth | identify | status | diagnose | status |", "|---|---|---|---|---|---|"]
+    after = {p["name"]: p for p in row.diagnosed.get("parameters", [])}
+    for p in row.identified["parameters"]:
+        low, high = one.truth.get(p["name"], (np.nan, np.nan))
+        truth = "" if np.isnan(low) else f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        cells = [_cell(p), p["status"], *((_cell(q), q["status"]) if (q := after.get(p["name"])) else ("", ""))]
+        lines.append(f"| {p['name']} | {truth} | {' | '.join(cells)} |")
+    lines += [
+        "",
+        f"Verdict `{row.diagnosed['verdict']}`, error on data not fitted "
+        f"{row.diagnosed['validation']['mse_nominal']:.3g} → {row.diagnosed['validation']['mse_extended']:.3g} "
+        "noise variances. Found: " + (", ".join(_finding(f) for f in row.diagnosed["findings"]) or "nothing") + ".",
+    ]
+    if row.prediction:
+        lines += ["", f"Error {AHEAD:g} s ahead on {', '.join(one.unseen)}, as a share of no change:", "",
+                  "| | " + " | ".join(QUANTITIES) + " |", "|---|---|---|---|---|"]  # fmt: skip
+        lines += [f"| {who} | " + " | ".join(f"{s:.2f}" for s in s4) + " |" for who, s4 in row.prediction.items()]
+    if row.soon:
+        lines += ["", "Rate after 0.1 s: " + ", ".join(f"{who} {share:.2f}" for who, share in row.soon.items()) + "."]
+    if row.terms:
+        shown = "; ".join(f"`{t}`" for t in row.terms[:SHOWN])
+        lines += ["", f"The prediction file adds {len(row.terms)} terms, first {shown}."]
+    return "\n".join([*lines, "", f"Measured {row.date}."])
+
+
+def _cell(p: dict[str, Any]) -> str:
+    low, high = p["ci95"]
+    return f"{p['value']:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def _finding(f: dict[str, Any]) -> str:
+    numbers = ", ".join(f"{p['name']} {p['value']:.3g} {p['unit']}".strip() for p in f["parameters"])
+    return f"{f['effect']} ({numbers}{'' if f['confident'] else '; not confident'})"
