@@ -68,9 +68,9 @@ def measured(one: FlightSet, data: Path) -> Row:
         seen, new = ([w for log in part for w in _fine(data, log, vehicle)] for part in (one.train, one.unseen))
         prediction = {name: _share(new, v, AHEAD) for name, v in files.items()} | learners(seen, new)
         soon = {name: _share(new, v, SOON)[3] for name, v in files.items()}
-    answers = ({key: result[key] for key in _KEPT if key in result} for result in (identified, found.result))
+    first, second = ({key: r[key] for key in _KEPT if key in r} for r in (identified, found.result))
     terms = () if found.prediction is None else tuple(t.formula for t in found.prediction.residual)
-    return Row(*answers, prediction, time.perf_counter() - begin, terms=terms, soon=soon)
+    return Row(first, second, prediction, time.perf_counter() - begin, terms=terms, soon=soon)
 
 
 def _fine(data: Path, log: str, vehicle: Vehicle) -> Sequence[Window]:
