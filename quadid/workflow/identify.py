@@ -136,11 +136,13 @@ def identify(
     """
     from quadid.identify.controller_gains import find_autopilot
     from quadid.identify.result import answered, identify_result
+    from quadid.model.supply import with_reference_voltage
 
     check_optimizer(optimizer)
     given = settled(logs, validate, vehicle)
-    described, train, held = given.vehicle, given.train, given.held
+    train, held = given.train, given.held
     windows = [w for log in train for w in log.windows]
+    described = with_reference_voltage(given.vehicle, windows)
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
     seconds = time.perf_counter() - begin

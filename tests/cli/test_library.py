@@ -149,3 +149,11 @@ def test_the_import_is_cheap_and_reads_no_logs() -> None:
         "assert quadid.identify.fit.fit and callable(quadid.identify) and callable(quadid.diagnose)\n"
     )
     subprocess.run([sys.executable, "-c", text], check=True, timeout=120)
+
+
+def test_a_fitted_file_knows_the_voltage_that_it_was_fitted_at(tmp_path: Path) -> None:
+    made = quadid.simulate(seconds=20.0, extras=["battery"])
+    log = quadid.load(made.save(tmp_path / "sagging.csv"), "pelican")
+    volts = np.concatenate([np.ravel(w.battery) for w in log.windows if w.battery is not None])
+    fit = quadid.identify(log)
+    assert fit.vehicle.reference_voltage == pytest.approx(np.nanmean(volts), rel=1e-3)
