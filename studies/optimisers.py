@@ -16,7 +16,6 @@ import copy
 import json
 import os
 import time
-from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from quadid.baselines.optimisers import NAMES, minimise
 from quadid.flight import draw_truth, fly
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import NUMBERS, Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
@@ -145,7 +144,7 @@ class LateAndSaturated(Problem):
         # A copy with other commands: checking and preparing a new window would take longer than simulating it.
         window, rollout = copy.copy(self.window), copy.copy(self.plain)
         object.__setattr__(window, "rotor_speed", np.minimum(late, point[7] * self.hover))
-        rollout.window, rollout._tables = window, OrderedDict()
+        rollout.window, rollout._number = window, next(NUMBERS)
         return rollout
 
     def simulate(self, points: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, default_prior, polish
 from quadid.identify.global_search import Progress, swarm_search
+from quadid.identify.long_logs import spread
 from quadid.identify.noise_estimation import flexible_names as flexible_names
 from quadid.identify.noise_estimation import noise_floor as noise_floor
 from quadid.identify.noise_estimation import residual_noise as residual_noise
@@ -33,9 +34,6 @@ SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SHORT_SEGMENTS = 1000
 """Most short segments of the first polish, whose result only starts the last one."""
-MOST_SEGMENTS = 10_000
-"""Most segments of the last polish, spread evenly: three hours of flight tell every parameter to a hundredth of a per
-cent, and beyond them memory would grow with the log."""
 SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
 """Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
 MOMENT_MISFIT = 1.5
@@ -137,6 +135,7 @@ def fit(
     options = options or FitOptions()
     report = progress or (lambda stage, share: None)
     check_windows(windows)
+    windows, said = spread(windows)
     layout = Layout(vehicle)
     free_names = list(names or NOMINAL_NAMES)
     theta = layout.initial(vehicle)
@@ -154,17 +153,14 @@ def fit(
     free = short.free(free_names)
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
     moments = _slow_moments(short, theta, first, free)
-    aside: tuple[str, ...] = ()
     if moments is not None:
         # Longer segments would only let the missing moments in again.
         final, result = moments
-        spent, aside = 0, (_SET_ASIDE,)
+        spent, said = 0, (*said, _SET_ASIDE)
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
-        whole = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
-        final = whole.at_most(MOST_SEGMENTS)
-        aside = _thinned(whole, final)
+        final = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
         result = polish(final, first.theta, final.free(free_names), robust=options.robust)
     if not np.isfinite(result.cost):
         final, result = short, first
@@ -173,18 +169,7 @@ def fit(
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     judge = None if set(INERTIAS) & set(out_of_reach or ()) else first
     found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, judge)
-    return final_answer(replace(found, warnings=(*aside, *found.warnings)), out_of_reach or {})
-
-
-def _thinned(whole: Shooting, used: Shooting) -> tuple[str, ...]:
-    """Says that not all of a long log was used."""
-    if used.count == whole.count:
-        return ()
-    hours, every = whole.count * whole.seconds / 3600.0, round(whole.count / used.count)
-    return (
-        f"{hours:.1f} h of flight are more than the parameters need: they come from every {every}. stretch of "
-        f"{whole.seconds:.3g} s, spread evenly",
-    )
+    return final_answer(replace(found, warnings=(*said, *found.warnings)), out_of_reach or {})
 
 
 def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> tuple[Shooting, Polished] | None:

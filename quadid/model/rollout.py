@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ from quadid.model import layout as ix
 from quadid.model.kernel import Flight
 from quadid.model.layout import places, residual_terms
 from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
+from quadid.model.recent import Recent
 from quadid.model.rollout_kernel import N_TANGENT, roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
@@ -37,9 +38,12 @@ CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + 
 
 TAU, SLOWER = places("motor_lag")
 (OFFSET,) = places("thrust_curve.offset")
-_TABLES_KEPT = 4
 _PART_ROWS = 800
 """Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
+_TABLES = Recent(64 << 20)
+"""Rotor moments kept for the next calls, of all windows together: four tables of a log of 500 s take 26 MB."""
+NUMBERS = itertools.count()
+"""Of simulations: what is kept of one is found by it."""
 _FORGOTTEN = 40.0
 """Time constants after which nothing is left in double precision: exp(-40) = 4e-18."""
 
@@ -144,7 +148,7 @@ class Rollout:
         )  # fmt: skip
         self._mask = self.valid.astype(np.float64)
         self.flight = Flight(self.mass, self.reach, hub, plan, window.t0, window.dt, *window.log_span)
-        self._tables: OrderedDict[tuple[bytes, float, bool], FloatArray] = OrderedDict()
+        self._number = next(NUMBERS)
 
     def __len__(self) -> int:
         return len(self.window)
@@ -300,14 +304,12 @@ class Rollout:
         own = np.concatenate(
             [theta[0, list(ROTOR_ENTRIES)], theta[0, ix.LOSS : ix.LOSS + 2 * len(self.geometry)]]
         ).tobytes()
-        key = own, theta[0, ix.B] if theta[0, OFFSET] else 0.0, need.hub
-        table = self._tables.get(key)
+        key = self._number, own, theta[0, ix.B] if theta[0, OFFSET] else 0.0, need.hub
+        table = _TABLES.get(key)
         if table is None:
             table = np.empty((len(self.window), 2 * ALL_MOMENTS))
             rotor_table(self.drive, need, theta, table)
-            self._tables[key] = table
-            while len(self._tables) > _TABLES_KEPT:
-                self._tables.popitem(last=False)
+            _TABLES.keep(key, table)
         return table
 
     def _run(

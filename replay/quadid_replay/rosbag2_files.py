@@ -20,6 +20,8 @@ from quadid_replay.mcap_records import McapFile
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 5000
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError)
+"""The second comes where SQLite's message quotes bytes that are no text."""
 
 
 class Bag(Protocol):
@@ -49,7 +51,7 @@ class Database:
             self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
             self._connection.execute("PRAGMA trusted_schema=OFF")
             self.topics: dict[int, Topic] = self._read_topics()
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise self._damaged(error) from error
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:
@@ -60,7 +62,7 @@ class Database:
             for number, stamp, data in self._connection.execute(query):
                 if isinstance(stamp, int) and isinstance(data, bytes):
                     yield number, stamp, data
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise self._damaged(error) from error
 
     def damage(self) -> list[str]:
@@ -80,12 +82,14 @@ class Database:
         )
         out = {}
         for number, name, kind, encoding in rows:
+            if not isinstance(number, int):
+                continue
             text = usable_definition(str(kind), *definitions.get(str(kind), ("", "")))
             shown = plain(str(kind)) if text else ""
-            out[int(number)] = Topic(plain(str(name)), shown, text, plain(str(encoding)))
+            out[number] = Topic(plain(str(name)), shown, text, plain(str(encoding)))
         return out
 
-    def _damaged(self, error: sqlite3.Error) -> LogError:
+    def _damaged(self, error: Exception) -> LogError:
         return LogError(
             f"{self._path.name}: a damaged SQLite database ({plain(str(error), 80)})", "a whole rosbag2 database",
             "sqlite3 FILE .recover, or copy it again after the recorder has stopped",

@@ -108,7 +108,8 @@ def read_usd(path: Path) -> Recording:
         used = {"id", "t"}
         for source in SOURCES:
             if _holds(rows, source) and source.channel not in {entry.name for entry in raw}:
-                values = np.column_stack([rows[v].astype(np.float64) for v in source.variables])
+                with np.errstate(invalid="ignore"):  # what is no number is dropped further on
+                    values = np.column_stack([rows[v].astype(np.float64) for v in source.variables])
                 shown = " ".join(source.variables)
                 raw.append(RawChannel(source.channel, t[accepted], source.convert(values), shown, refused))
                 used |= set(source.variables)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 import time
 import warnings
@@ -18,11 +19,12 @@ from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
 from tests.faults.evidence import Happened
+from tests.fuzz import rosbag2_format
 from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import header
 from tests.replay.test_ulog import Ulog
-from tests.replay.test_usd import Usd
+from tests.replay.test_usd import Usd, controller_log
 
 
 def opened(tmp_path: Path, data: bytes) -> Path:
@@ -114,6 +116,31 @@ def test_a_throttle_that_signals_nan_passes_without_a_warning(tmp_path: Path) ->
         warnings.simplefilter("error")
         reference = open_log(opened(tmp_path, bytes(log.data))).channels["attitude_reference"]
     assert len(reference.t) == 9, "the sample without a throttle is dropped"
+
+
+def test_a_database_whose_schema_is_no_text_is_refused(tmp_path: Path) -> None:
+    data = rosbag2_format.finish(rosbag2_format.row("topics", 1, "imu", "sensor_msgs/msg/Imu", "cdr", ""))
+    damaged = data.replace(b"CREATE TABLE messages", b"CREATE TABLE\xff\xe5essages")
+    with pytest.raises(LogError, match="damaged SQLite database"):
+        open_log(opened(tmp_path, damaged))
+
+
+def test_a_topic_without_a_number_is_passed_over(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "log") as bag:
+        bag.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+        bag.execute("CREATE TABLE messages (id, topic_id, timestamp, data)")
+        bag.execute("INSERT INTO topics VALUES (NULL, 'imu', 'sensor_msgs/msg/Imu', 'cdr')")
+    with pytest.raises(LogError, match="no topic to read"):
+        open_log(tmp_path / "log")
+
+
+def test_numbers_of_a_usd_log_that_signal_nan_pass_without_a_warning(tmp_path: Path) -> None:
+    data = bytearray(controller_log(20).closed())
+    at = data.rindex(struct.pack("<f", 40000.0))
+    data[at : at + 4] = struct.pack("<I", 0x7F800001)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(open_log(opened(tmp_path, bytes(data))).channels["mixer_input"].t) == 19
 
 
 def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> None:

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth
-from quadid.identify import fit as fitting
+from quadid.identify import long_logs
 from quadid.identify.fit import FitOptions, fit
 from tests.identify.flights import PELICAN, flown, guessed, values_of
 
 
 def test_the_last_polish_takes_a_bounded_part_of_the_log_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "MOST_SEGMENTS", 20)
+    monkeypatch.setattr(long_logs, "MOST_SECONDS", 20.0)
+    monkeypatch.setattr(long_logs, "STRETCH", 5.0)
     truth = draw_truth(PELICAN, 3)
     window, vehicle = flown(3).window, guessed(truth)
     found = fit([window], vehicle, FitOptions(iterations=0))
     assert found.warnings[0].startswith("0.0 h of flight are more than the parameters need")
-    assert "every 3. stretch of 1 s" in found.warnings[0]
+    assert "from 4 of 12 stretches of 5 s" in found.warnings[0]
     error = np.log(found.theta[:6] / values_of(truth))
     assert np.all(np.abs(error) < 4.0 * found.uncertainty.sigma)
     monkeypatch.undo()
