@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 from quadid.online.active_set import ActiveSet
 from quadid.online.background_diagnosis import BackgroundDiagnosis, DiagnosisReply, DiagnosisRequest
-from quadid.online.consistency import Consistency
+from quadid.online.consistency import ALLOWED, Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
 from quadid.online.model_vehicle import extended
 from quadid.online.outbox import Outbox
 from quadid.online.quality import Quality
-from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 
@@ -42,6 +42,7 @@ class Supervisor:
         self.fits = self.rejected = 0
         self.waits = ""
         self._odd_since: float | None = None
+        self._scale = ""
 
     def interrupted(self, t: float) -> None:
         """The stream begins anew at `t` [s]."""
@@ -78,7 +79,9 @@ class Supervisor:
 
     @property
     def unexplained(self) -> str:
-        """What the model misses and why the cause is not known; empty where it misses nothing or was extended."""
+        """What speaks against the model: a sensor's scale, or what it misses for a cause not known; empty: nothing."""
+        if self._scale:
+            return f"the diagnosis stands: {self._scale}"
         if self._estimator.extended or not self._estimator.misses:
             return ""
         share = self._estimator.lack.share
@@ -92,6 +95,7 @@ class Supervisor:
         Returns:
             The model was extended: what was flown since has to be fitted again.
         """
+        self._scale = next((f.evidence for f in reply.findings if f.confident and _wrong_scale(f)), "")
         told = diagnosis.news(asked, reply, self._outbox.stamp)
         if told is not None:
             self._outbox.act(told)
@@ -197,6 +201,10 @@ class Supervisor:
             return Phase.PENDING
         force = self._active_set.in_force
         return Phase.ACCEPTED if force is not None and force.state is not SetState.STALE else Phase.CANDIDATE
+
+
+def _wrong_scale(finding: OnlineFinding) -> bool:
+    return finding.effect == "gyro_scale" and max(map(abs, finding.values.values())) > ALLOWED
 
 
 def _unrevealed(reply: FitReply) -> str:

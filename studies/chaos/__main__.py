@@ -141,6 +141,10 @@ def judge(
                 wrong.append(f"set {sequence}: {WIRE[name]} off by {error:+.1%}")
             if name == "QI_B" and not any(n == sequence and abs(b / value - 1.0) < 1e-5 for n, b in rows):
                 wrong.append(f"set {sequence}: on the wire, in no history")
+    values: dict[int, set[float]] = {}
+    for number, b in rows:
+        values.setdefault(number, set()).add(b)
+    wrong += [f"set {number}: the number of {len(v)} sets" for number, v in values.items() if len(v) > 1]
     return sorted(set(wrong)), len(sets)
 
 

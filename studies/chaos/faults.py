@@ -33,6 +33,8 @@ class Scene:
 
 
 Fault = Callable[[Scene], str]
+COMMIT_LIMIT = 120.0
+"""A service that finds a set in its history numbers it anew within this time of a start [s]."""
 START_LIMIT = 300.0
 """A second service has to say within this time [s] that it is refused; starting took a minute on a crowded machine."""
 
@@ -72,6 +74,22 @@ def power_cut(scene: Scene) -> str:
     scene.service.end(signal.SIGKILL)
     scene.service.start()
     return "kill -9, started again"
+
+
+def killed_at_commit(scene: Scene) -> str:
+    """Kill -9 as soon as a numbered set is on the disk: its publication follows the commit by milliseconds."""
+    scene.service.end(signal.SIGKILL)
+    before, until = scene.service.newest_number(), time.monotonic() + COMMIT_LIMIT
+    scene.service.start()  # what is in force gets a new number at the start
+    while scene.service.newest_number() <= before:
+        if time.monotonic() > until:
+            return f"no numbered set within {COMMIT_LIMIT:.0f} s of a start"
+        time.sleep(0.0005)
+    told, number = len(scene.vehicle.told), scene.service.newest_number()
+    scene.service.end(signal.SIGKILL)
+    heard = any(name == "QI_SEQ" and round(value) == number for _, name, value in scene.vehicle.told[told:])
+    scene.service.start()
+    return f"kill -9 after the commit of set {number}, which was {'' if heard else 'not '}heard on the wire"
 
 
 def history_locked(scene: Scene) -> str:
@@ -225,7 +243,8 @@ def history_removed(scene: Scene) -> str:
 FAULTS: dict[str, tuple[int, Fault]] = {
     "fit process killed": (11, worker_killed), "fit process stopped": (11, worker_stopped),
     "fit process out of memory": (11, worker_out_of_memory), "SIGTERM or SIGINT": (13, terminated),
-    "power cut": (13, power_cut), "history locked": (12, history_locked), "history damaged": (12, history_damaged),
+    "power cut": (13, power_cut), "kill between commit and publication": (23, killed_at_commit),
+    "history locked": (12, history_locked), "history damaged": (12, history_damaged),
     "history deleted": (12, history_removed), "disk full": (12, disk_full), "link silent": (9, link_silent),
     "vehicle reboots": (7, vehicle_reboots), "sensor not a number": (6, sensor_not_a_number),
     "sensor stuck": (6, sensor_stuck), "wrong units": (10, wrong_units), "wrong sign": (17, wrong_sign),

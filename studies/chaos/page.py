@@ -21,7 +21,8 @@ def page(
         f"a signing key, a signed vehicle flying over MAVLink in real time; {len(entries)} faults in {minutes:.0f} min "
         f"on {os.cpu_count()} cores, load average {np.mean([e['load'] for e in entries] or [0]):.0f} (mean).", "",
         f"* Crashes, unasked ends, tracebacks, no recovery: **{len(crashes)}**",
-        f"* Wrong publications (b, J_xx or J_yy more than 5 % off the truth, or in no history): **{len(wrong)}**, "
+        "* Wrong publications (b, J_xx or J_yy more than 5 % off the truth, in no history, or under another set's "
+        f"number): **{len(wrong)}**, "
         f"among {sets} sets on the wire", "",
         "Recovery: from the end of the fault to the next estimate in the history; a window of 5 s has to be flown "
         "first.", "",

@@ -98,6 +98,15 @@ class Running:
             return 0.0
         return float(wall or 0.0)
 
+    def newest_number(self) -> int:
+        """Largest number of a set in the history; 0 for none."""
+        try:
+            address = f"{self.history.as_uri()}?mode=ro"
+            with contextlib.closing(sqlite3.connect(address, uri=True, timeout=0.2)) as db:
+                return int(db.execute("SELECT max(sequence) FROM sets").fetchone()[0] or 0)
+        except sqlite3.Error:
+            return 0
+
     def _read(self, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
         for line in child.stdout:

@@ -44,7 +44,8 @@ def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop:
     arms = np.column_stack([-PELICAN.rotor_positions[:, 1], PELICAN.rotor_positions[:, 0]])
     square = PELICAN.hover_speed(TRUE["b"]) ** 2 * (1.0 + 0.08 * np.sin(3.1 * t))[:, None]
     square = square + wanted @ np.linalg.pinv(arms)
-    lift = TRUE["b"] * square.sum(axis=1) * np.where(t < drop_at, 1.0, 1.0 - drop) / PELICAN.mass
+    lift = TRUE["b"] * square.sum(axis=1) / PELICAN.mass
+    square = square / np.where(t < drop_at, 1.0, 1.0 - drop)[:, None]  # the vehicle stays up, so its rotors turn faster
     attitude = flown_attitude(-0.9 / turn, rate) + 0.001 * rng.normal(size=(len(t), 4))
     channels = {
         "gyro": rate + 0.02 * rng.normal(size=rate.shape),

@@ -72,6 +72,24 @@ def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> 
     assert len(events(actions, "change")) == 1
 
 
+def test_a_set_that_a_person_approved_is_said_to_be_out_of_date_too() -> None:
+    """With `approval: manual` as with `auto`, also for who subscribes later: the topic keeps the newest."""
+    manual = QUICK.model_copy(update={"gate": QUICK.gate.model_copy(update={"approval": "manual"})})
+    session = Session(PELICAN, manual)
+
+    def work(request: Job) -> JobReply | None:
+        return ChangeReply(request.number, finding=MASS) if isinstance(request, ChangeRequest) else tells()(request)
+
+    assert not published(works(session, between(DROPPED, 0.0, 12.0), work))
+    assert session.approve("ann").done
+    (approved,) = published(session.poll())
+    (said,) = published(works(session, between(DROPPED, 12.0, 19.0), work))
+    assert (said.outdated, said.approved_by) == (MASS.evidence, "ann")
+    assert said.sequence > approved.sequence
+    assert said.parameters.values.tobytes() == approved.parameters.values.tobytes()
+    assert session.active_set.in_force == said
+
+
 def test_while_a_change_is_explained_the_session_waits() -> None:
     session = Session(PELICAN, QUICK)
 
@@ -148,6 +166,17 @@ def test_a_minute_is_studied_beside_the_fits_and_told_half_a_minute_later() -> N
     assert told.stop == session.resampler.time.stamp(study.stop)
     jobs = [a.number for a in actions + rest if isinstance(a, Job)]
     assert jobs == list(range(1, session.status().fits + 2)), "one count for all jobs"
+
+
+@pytest.mark.parametrize(("scale", "check"), [(0.04, "model"), (0.01, "held_out_gain")])
+def test_while_a_diagnosis_calls_a_sensor_wrong_nothing_is_published(scale: float, check: str) -> None:
+    gyro = replace(MASS, effect="gyro_scale", values={"x": scale}, evidence="gyro x reads too much")
+    session = Session(PELICAN, STUDYING)
+    (study,) = studies(works(session, between(LONG, 0.0, 63.7), tells()))
+    session.deliver(DiagnosisReply(study.number, "", (gyro,), "explained"))
+    last = published(works(session, between(LONG, 63.7, 95.7), tells()), "candidate")[-1]
+    assert last.check == check
+    assert ("the diagnosis stands: gyro x reads too much" in last.reason) == (check == "model")
 
 
 @pytest.mark.parametrize("worker", ["failing", "blind", "off"])
