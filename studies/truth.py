@@ -1,4 +1,4 @@
-"""Does the fit tell the truth?  Errors against the Cramer-Rao bound, coverage of intervals, bias with noise, status.
+"""Does the fit tell the truth?  Errors against the Cramer-Rao bound, coverage, bias with noise, its memory, status.
 
     python -m studies.truth --out docs/results
     python -m studies.truth --parts noise --out docs/results
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from quadid.chi_square import Z95
 from quadid.diagnose.attribution import settle
 from quadid.flight import draw_truth, fly
+from quadid.flight.sensors import SensorNoise
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import FitOptions, fit
 from quadid.identify.noise_model import estimate_noise
@@ -36,6 +37,8 @@ from studies.page import put_section
 FloatArray = NDArray[np.float64]
 SEGMENT = 1.0
 NOISE_SCALES = (0.3, 1.0, 3.0)
+MEMORIES = (0.3, 0.66, 1.5, 3.0)
+"""Of the attitude noise [s]."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,41 @@ def status(seeds: int, processes: int) -> str:
     return "\n".join(["## Status", "", *text]).rstrip()
 
 
-PARTS = {"excited": excited, "noise": noise_levels, "status": status}
+def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
+    """Errors of the three gyro scales in standard deviations, and the memory found, of one seed and one memory."""
+    seed, memory = job
+    craft = Vehicle.shipped("pelican")
+    scale = dict(zip("xyz", np.random.default_rng([seed, 7]).uniform(-0.05, 0.05, 3).tolist(), strict=True))
+    flown = fly(
+        craft, draw_truth(craft, seed), 120.0, seed, effects={"gyro_scale": scale},
+        noise=SensorNoise(attitude_time=memory),
+    )  # fmt: skip
+    names = {f"gyro_scale.{axis}": value for axis, value in scale.items()}
+    found = fit([flown.window], craft, FitOptions(iterations=0), names=[*NOMINAL_NAMES, *names])
+    error = [(found.parameters[n].value - value) / found.parameters[n].sigma for n, value in names.items()]
+    return np.array(error), found.noise.slow_time
+
+
+def memories(seeds: int, processes: int) -> str:
+    """Section on attitude noise that is remembered for another time."""
+    text = [
+        f"## Memory of the attitude noise: {seeds} flights of 120 s each, gyro scale up to 5 % hidden and fitted", "",
+        "| memory s | found s, median (least … most) | coverage of gyro scale % | RMS error, standard deviations |",
+        "|---|---|---|---|",
+    ]  # fmt: skip
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for memory in MEMORIES:
+            part = pool.map(remembering, [(30_000 + s, memory) for s in range(seeds)])
+            z, found = np.array([error for error, _ in part]), np.array([time for _, time in part])
+            inside = 100.0 * np.mean(np.abs(z) <= Z95)
+            text.append(
+                f"| {memory:g} | {np.median(found):.2f} ({found.min():.2f} … {found.max():.2f}) | {inside:.1f} of "
+                f"{z.size} | {np.sqrt(np.mean(z**2)):.2f} |"
+            )
+    return "\n".join(text)
+
+
+PARTS = {"excited": excited, "noise": noise_levels, "status": status, "memory": memories}
 
 
 def main() -> None:
@@ -173,10 +210,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1000, help="flights of the part 'excited'")
     parser.add_argument("--noise-seeds", type=int, default=200, help="flights a noise level")
     parser.add_argument("--few", type=int, default=20, help="flights a profile of the part 'status'")
+    parser.add_argument("--memory-seeds", type=int, default=20, help="flights a memory of the attitude noise")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", default="")
     options = parser.parse_args()
-    counts = {"excited": options.seeds, "noise": options.noise_seeds, "status": options.few}
+    counts = {
+        "excited": options.seeds, "noise": options.noise_seeds, "status": options.few, "memory": options.memory_seeds,
+    }  # fmt: skip
     for name in options.parts.split(","):
         text = PARTS[name](counts[name], options.processes)
         print(text, flush=True)

@@ -24,6 +24,7 @@ from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
+from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
 from quadid.identify.shooting import Shooting
@@ -207,7 +208,9 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple
             break
         again = select(begun.schedule, begun.nominal, begun.listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    # Under less noise a cause may be nothing any more.
+    noise, _ = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
+    begun, search = _with_noise(noise, begun, search)
+    # Under other noise a cause may be nothing any more.
     return begun, replace(search, model=pruned(search.shooting, search.model))
 
 

@@ -18,6 +18,7 @@ from quadid.identify.noise_estimation import flexible_names as flexible_names
 from quadid.identify.noise_estimation import noise_floor as noise_floor
 from quadid.identify.noise_estimation import residual_noise as residual_noise
 from quadid.identify.noise_estimation import reweighted_fit
+from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.reliability import reliability
@@ -161,7 +162,10 @@ def fit(
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
         final = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
-        result = polish(final, first.theta, final.free(free_names), robust=options.robust)
+        result = polish(final, first.theta, free, robust=options.robust)
+        noise, more = with_memory(windows, final, result.theta, free_names)
+        final, spent = final.with_noise(noise), spent + more
+        result = polish(final, result.theta, free, states=result.states, robust=options.robust)
     if not np.isfinite(result.cost):
         final, result = short, first
     report("polish", 1.0)

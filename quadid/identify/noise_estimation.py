@@ -10,7 +10,7 @@ import numpy as np
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import FloatArray, Polished, polish
 from quadid.identify.initial_states import InitialStates
-from quadid.identify.noise_model import NoiseModel, estimate_noise
+from quadid.identify.noise_model import SLOW_TIME, NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
@@ -39,19 +39,22 @@ MOST_SEGMENTS = 4000
 _SETTLING = ("imu_lag.period", "rotor_drag.k_x")
 
 
-def residual_noise(shooting: Shooting, polished: Polished, parameters: int | None = None) -> NoiseModel:
+def residual_noise(
+    shooting: Shooting, polished: Polished, parameters: int | None = None, slow_time: float = SLOW_TIME
+) -> NoiseModel:
     """Noise from the residuals of a polish, all structure counted as noise (a starting point).
 
     Args:
         shooting: the problem.
         polished: its optimum.
         parameters: how many were fitted to these data; by default those of the polish.
+        slow_time: correlation time of the attitude's slow part [s].
     """
     lin = polished.lin
     used = float(lin.rows.sum())
     fitted = lin.gram.shape[1] if parameters is None else parameters
     freedom = max(used - fitted, 1.0) / max(used, 1.0)
-    return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom)
+    return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom, slow_time)
 
 
 def reweighted_fit(
@@ -148,11 +151,18 @@ def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterat
     """Fits the flexible model to some of the longer segments, evenly spread, and settles all; and vectors simulated."""
     second = polish(longer.at_most(LONG_SEGMENTS), theta, longer.free(names), iterations=iterations)
     simulated = second.iterations * (len(names) + 10)
-    # All of them: the level of the noise decides every score and interval.  Two parameters beside the initial states,
-    # so that segments are started and filters warmed up as for all.
-    settled = longer.free([n for n in _SETTLING if n in names])
-    second = polish(longer, second.theta, settled, iterations=3)
-    return second, simulated + second.iterations * (len(settled.entries) + 10)
+    second, more = _settled(longer, second.theta, names)
+    return second, simulated + more
+
+
+def _settled(shooting: Shooting, theta: FloatArray, names: Sequence[str]) -> tuple[Polished, int]:
+    """Initial states of all segments at `theta`, and vectors simulated: all of them tell the level of the noise.
+
+    Two parameters move beside the initial states, so that segments are started and filters warmed up as for all.
+    """
+    few = shooting.free([n for n in _SETTLING if n in names])
+    out = polish(shooting, theta, few, iterations=3)
+    return out, out.iterations * (len(few.entries) + 10)
 
 
 def _longest(
@@ -162,10 +172,8 @@ def _longest(
     out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
     if out.count < LINE_SEGMENTS:
         return longer, second.states, 0
-    settled = out.free([n for n in _SETTLING if n in names])
-    fitted = polish(out, second.theta, settled, iterations=3)
+    fitted, simulated = _settled(out, second.theta, names)
     noise = residual_noise(out, fitted, len(names))
-    simulated = fitted.iterations * (len(settled.entries) + 10)
     if np.any(noise.variance > STAYS * longer.noise.variance):
         return longer, second.states, simulated
     return out.with_noise(noise), fitted.states, simulated

@@ -23,11 +23,13 @@ _Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, .
 """A noise model as a key: white, slow, slow time, and the spectrum's shape and bytes."""
 
 SLOW_TIME = 0.66
-"""Correlation time of the slow AHRS error [s]: a pole of 0.97 at 50 Hz, safe also when the noise is white."""
+"""Correlation time of the slow attitude error [s] until it is estimated (`quadid.identify.noise_memory`)."""
+ATTITUDE = (3, 4, 5)
+"""Channels that may have a slow part; elsewhere slow structure is left for the diagnosis to see."""
 SHAPE_POINTS = 51
 """Frequencies on which a noise spectrum is kept."""
 _DEFAULT = np.array([0.02] * 3 + [0.005] * 3 + [0.2] * 3 + [0.1] * 3 + [0.05] * 3)
-_POLYNOMIAL = (1, 2, 0, 1, 2)
+TREND = (1, 2, 0, 1, 2)
 """Order of the trend that fitting a segment's initial state takes out of rate, attitude, specific force, velocity,
 position."""
 
@@ -107,7 +109,7 @@ def _whitener(numbers: _Numbers, length: int, dt: float) -> FloatArray:
     out = np.zeros((len(noise.white), length, length))
     for c, (white, slow) in enumerate(zip(noise.white, noise.slow, strict=True)):
         if slow > 0.0:
-            covariance = white**2 * np.eye(length) + slow**2 * _correlation(length, dt / noise.slow_time)
+            covariance = white**2 * np.eye(length) + slow**2 * correlation(length, dt / noise.slow_time)
         elif noise.shape is not None and np.ptp(noise.shape[c]) > 0.0:
             covariance = white**2 * _stationary(noise.shape[c], length)
         else:
@@ -131,13 +133,14 @@ def _stationary(shape: FloatArray, length: int) -> FloatArray:
 
 
 @lru_cache(maxsize=32)
-def _correlation(length: int, step: float) -> FloatArray:
+def correlation(length: int, step: float) -> FloatArray:
+    """Of Gauss-Markov noise between rows `step` correlation times apart, shape (length, length)."""
     lag = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     return np.asarray(np.exp(-step * lag))
 
 
 def estimate_noise(
-    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_channels: tuple[int, ...] = (3, 4, 5)
+    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME
 ) -> NoiseModel:
     """Estimates the noise from residuals of a fit flexible enough to leave only noise.
 
@@ -146,7 +149,7 @@ def estimate_noise(
         weights: 0 for samples to leave out, shape as residuals.
         dt: grid step [s].
         freedom: fraction of the residual's degrees of freedom left after the parameters were fitted, 0..1.
-        slow_channels: channels that may have a slow part; elsewhere slow structure is left for the diagnosis to see.
+        slow_time: correlation time of the slow part [s].
 
     Returns:
         The noise; a channel without enough data keeps the typical value.
@@ -156,12 +159,12 @@ def estimate_noise(
     white, slow = guess.white.copy(), np.zeros(channels)
     for c in range(channels):
         complete = np.all(weights[:, :, c] > 0.0, axis=1)
-        basis, forms = _forms(length, round(float(dt) / SLOW_TIME, 9), min(_POLYNOMIAL[c // 3], length - 2))
+        basis, forms = _forms(length, round(float(dt) / slow_time, 9), min(TREND[c // 3], length - 2))
         if np.count_nonzero(complete) < 5:
             used = weights[:, :, c] > 0.0
             if np.count_nonzero(used) > 20:
                 # Scattered samples: fitting the initial state takes `order` of each segment's samples.
-                order = _POLYNOMIAL[c // 3]
+                order = TREND[c // 3]
                 left = np.count_nonzero(used) - order * np.count_nonzero(used.any(axis=1))
                 white[c] = np.sqrt(np.sum(residuals[:, :, c][used] ** 2) / max(float(left), 1.0) / freedom)
             continue
@@ -173,12 +176,12 @@ def estimate_noise(
         keep = 1.0 if len(r) < 50 else _trim_gain(len(power), length - basis.shape[1])
         moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
         var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
-        if c in slow_channels and length >= 8:
+        if c in ATTITUDE and length >= 8:
             solution = np.linalg.solve(forms[2], moments)
             if solution[1] > 0.0 and solution[0] > 0.0:
                 var_white, var_slow = float(solution[0]), float(solution[1])
         white[c], slow[c] = np.sqrt(max(var_white, 1e-18)), np.sqrt(var_slow)
-    return NoiseModel(white, slow)
+    return NoiseModel(white, slow, slow_time)
 
 
 @lru_cache(maxsize=64)
@@ -187,7 +190,7 @@ def _forms(length: int, step: float, order: int) -> tuple[FloatArray, tuple[Floa
     t = np.linspace(-1.0, 1.0, length)
     basis = np.linalg.qr(np.vander(t, order, increasing=True))[0] if order else np.zeros((length, 0))
     project = np.eye(length) - basis @ basis.T
-    slow = _correlation(length, step)
+    slow = correlation(length, step)
     forms = [np.eye(length), slow]
     expectation = np.array([[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms])
     return basis, (forms[0], forms[1], expectation)
