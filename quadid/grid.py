@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.intersample import follow_feedback
 from quadid.mounting import in_body_axes
-from quadid.resample import COINCIDENT, sample_period
+from quadid.resample import COINCIDENT, measured_period
 from quadid.resampling_plan import REQUIRED, Plan, holes, make_plan, on_grid, reach
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.vehicle import Vehicle
@@ -147,10 +147,10 @@ def _report(
         dropped=len(dropped),
         seconds_dropped=sum(dropped),
         rotor_source=rotor.source,
-        rotor_rate=1.0 / sample_period(rotor.t),
+        rotor_rate=1.0 / measured_period(rotor.t, rotor.values),
         filtered=plan.filtered,
         bridged=sum(holes(plan.tracks[name].t, plan.step) for name in REQUIRED if name in plan.tracks),
-        notes=(*rotor.notes, *_notes(plan, rotor.t)),
+        notes=(*rotor.notes, *_notes(plan, measured_period(rotor.t, rotor.values))),
     )
 
 
@@ -212,9 +212,8 @@ def _log_span(recording: Recording) -> Span:
     return min(a for a, _ in ends), max(b for _, b in ends)
 
 
-def _notes(plan: Plan, rotor_times: FloatArray) -> list[str]:
+def _notes(plan: Plan, period: float) -> list[str]:
     notes = []
-    period = sample_period(rotor_times)
     if period > 1.5 * plan.step:
         notes.append(
             f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "

@@ -22,12 +22,46 @@ KAISER_BETA = 5.0
 """Window of the kernel: stop band about 53 dB down."""
 COINCIDENT = 5e-3
 """Samples this close to the grid, in steps, lie on it: they are passed on bit for bit."""
+INTERPOLATED = 0.5
+"""Share of moving rows on straight lines above which they were interpolated; logs as they were measured have none, a
+log whose lost rows were filled in a tenth, one brought from 10 to 100 Hz nine tenths."""
+ON_LINE, ROUNDED = 1e-3, 1e-6
+"""Share of the usual step, and of the largest value, that printed digits may put a row off its line."""
 _CHUNK = 4096
 
 
 def sample_period(t: FloatArray) -> float:
     """Returns the sample period [s]: the mean of the steps up to 1.5 times the median one; NaN below two samples."""
     return period_of(t[1:] - t[:-1])
+
+
+def measured_rows(t: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+    """Rows that were measured, shape (n,); the others were put on straight lines between them before they were logged.
+
+    Measured numbers do not lie on a line with both neighbours in every column while they move; where more than
+    `INTERPOLATED` of all steps that move lead on along one, only its ends were measured.
+
+    Args:
+        t: times [s], shape (n,).
+        values: columns at these times, shape (n, k).
+    """
+    out, step = np.ones(len(t), dtype=bool), np.diff(t)
+    if len(t) < 3 or step.min() <= 0.0:
+        return out
+    moved = np.diff(values, axis=0)
+    slope = moved / step[:, None]
+    room = ON_LINE * np.std(moved, axis=0) + ROUNDED * np.max(np.abs(values), axis=0)
+    bend: FloatArray = np.abs(np.diff(slope, axis=0)) * step[1:, None]
+    on_line = np.all(bend <= room, axis=1)
+    moves = np.any(moved[1:] != 0.0, axis=1)
+    if np.any(moves) and np.mean(on_line[moves]) > INTERPOLATED:
+        out[1:-1] = ~on_line
+    return out
+
+
+def measured_period(t: FloatArray, values: FloatArray) -> float:
+    """Period [s] at which `values` were measured, see `measured_rows` and `sample_period`."""
+    return sample_period(t[measured_rows(t, values)])
 
 
 def period_of(steps: FloatArray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.resample import sample_period
+from quadid.resample import measured_period, sample_period
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Sampling
 
@@ -64,7 +64,7 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
         values = vehicle.command.to_rotor_speed(channel.values)
         signal = RotorSignal(channel.t, values, vehicle.command.sampling, source, notes)
     _check_columns(recording, signal, vehicle)
-    rate = 1.0 / sample_period(signal.t)
+    rate = 1.0 / measured_period(signal.t, signal.values)
     if rate < SLOWEST_RATE:
         raise NotIdentifiableError(
             f"{recording.name}: rotor signal ({signal.source}) at {rate:.2g} Hz is too slow",

@@ -57,9 +57,7 @@ def with_memory(
         return noise, 0
     brief, long = (polish(s, theta, free, iterations=ITERATIONS) for s in (near, far))
     simulated = (brief.iterations + long.iterations) * (len(names) + 10)
-    if not np.isfinite(long.lin.residuals).all():
-        return noise, simulated
-    memory = attitude_memory(long.lin.residuals, long.lin.weights, far.dt)
+    memory = attitude_memory(long.lin.residuals, long.lin.weights, far.dt) if np.isfinite(long.cost) else None
     if memory is None:
         return noise, simulated
     found, drifted = (residual_noise(*both, slow_time=memory) for both in ((near, brief), (far, long)))

@@ -32,7 +32,7 @@ class ChannelFacts:
         name: key of `quadid.window.CHANNELS`.
         unit: of its values.
         source: topic, message or column names it came from.
-        rate: samples a second inside stretches without gaps [Hz].
+        rate: measured samples a second inside stretches without gaps, interpolated rows not counted [Hz].
         count: samples kept.
         first, last: times of the first and last one [s].
         jitter: standard deviation of the step over its median (gaps left out).

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
-from quadid.resample import sample_period
+from quadid.resample import measured_period
 from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
 from quadid.window import CHANNELS, Channel, Recording
@@ -17,6 +17,8 @@ _GRID = 0.02
 """Step of the grid [s] for which gaps are told, that of the fit."""
 _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
+FILLED = 1.5
+"""Rows for each measured one above which it is said."""
 _UNSTEADY = 0.25
 """Jitter above which the log's timing is worth a warning."""
 
@@ -36,7 +38,7 @@ def _facts(channel: Channel) -> ChannelFacts:
         name=channel.name,
         unit=CHANNELS[channel.name][1],
         source=channel.source,
-        rate=1.0 / sample_period(channel.t) if len(channel.t) > 1 else np.nan,
+        rate=1.0 / measured_period(channel.t, channel.values) if len(channel.t) > 1 else np.nan,
         count=len(channel.t),
         first=float(channel.t[0]),
         last=float(channel.t[-1]),
@@ -70,6 +72,11 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying:
         flying: time in flight [s].
     """
     checks = [_clock_check(recording, facts)]
+    for f in facts:
+        rows = (f.count - 1) / max(f.last - f.first, 1e-9)
+        if not f.gaps and rows > FILLED * f.rate:
+            message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
+            checks.append(Check("timing", Verdict.WARNING, message, "log it at this rate, or give the samples alone"))
     gaps = {f.name: f for f in facts if f.gaps}
     if gaps:
         worst = max(gaps.values(), key=lambda f: f.longest_gap)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from quadid.workflow.files import file_name, write_text
@@ -165,12 +166,14 @@ def diagnose(
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
     check_length(windows)
     found, workings = diagnose_windows(windows, described, unseen, seed, advance)
+    unreachable = out_of_reach(train)
+    found = _within_reach(found, unreachable)
     result = found.to_dict()
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
     # The error without the findings is the one that `quadid identify` states for these flights.
     nominal = search(
-        OPTIMIZERS[0], windows, described, seed, lambda _, share: advance("nominal fit", share), out_of_reach(train)
+        OPTIMIZERS[0], windows, described, seed, lambda _, share: advance("nominal fit", share), unreachable
     )
     sets = [
         scored(log, role, nominal, workings) for role, part in (("train", train), ("validate", held)) for log in part
@@ -190,3 +193,13 @@ def scored(log: Log, role: str, nominal: Fit, workings: Workings) -> ScoredSet:
     before = mse_score(log.windows, nominal.vehicle, nominal.theta, nominal.noise)
     after = mse_score(log.windows, nominal.vehicle, workings.search.model.theta, workings.decisive.noise)
     return ScoredSet(log.recording.name, role, before, after)
+
+
+def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis:
+    """The diagnosis without trust in numbers that the channels of its logs cannot show, by parameter, and why."""
+    from quadid.parameters import Status
+
+    trusted = [p.name for p in found.parameters if p.name in unreachable and p.status is not Status.PRIOR_DOMINATED]
+    told = [f"{name} is not to be used: {unreachable[name]}" for name in trusted]
+    parameters = tuple(replace(p, status=Status.UNRELIABLE) if p.name in trusted else p for p in found.parameters)
+    return replace(found, parameters=parameters, warnings=(*found.warnings, *told))

@@ -264,6 +264,15 @@ def test_stuck_clipped_and_jumping_sensors(clean: Recording, happened: Happened)
     happened(6, "inspection names a stuck gyro ('does not change for 2 s') and a clipped one")
 
 
+def test_a_signal_brought_to_a_faster_rate_counts_as_slow_as_it_was(clean: Recording) -> None:
+    speed = clean.channels["rotor_speed"]
+    few = np.column_stack([np.interp(speed.t, speed.t[::5], column[::5]) for column in speed.values.T])
+    found = inspect(changed(clean, "rotor_speed", lambda _: few), PELICAN)
+    assert next(c for c in found.channels if c.name == "rotor_speed").rate == pytest.approx(10.0, rel=0.05)
+    assert "rotor_speed: 50 rows a second were interpolated between samples at 10 Hz" in check(found, "timing").message
+    assert {p.parameter for p in found.parameters if p.possible} == {"b"}
+
+
 def test_faults_of_the_reader_are_counted(clean: Recording) -> None:
     gyro = replace(clean.channels["gyro"], faults={"duplicate": 3, "not_finite": 2})
     found = inspect(replace(clean, channels={**clean.channels, "gyro": gyro}))

@@ -17,6 +17,8 @@ from quadid.resample import (
     lowpass,
     lowpass_span,
     matching_rows,
+    measured_period,
+    measured_rows,
     moving_mean,
     sample_period,
     split_stretches,
@@ -24,6 +26,22 @@ from quadid.resample import (
 
 FloatArray = NDArray[np.float64]
 STEP = 0.02
+
+
+def test_interpolated_rows_are_told_from_measured_ones() -> None:
+    rng = np.random.default_rng(3)
+    slow, fast = 0.1 * np.arange(200.0), 0.01 * np.arange(1980.0)
+    values = np.rint(1500.0 + 40.0 * rng.standard_normal((len(slow), 4)))
+    values[50:60] = values[50]
+    filled: FloatArray = np.column_stack([np.round(np.interp(fast, slow, column), 3) for column in values.T])
+    assert measured_period(fast, filled) == pytest.approx(0.1, rel=0.05)
+    noisy: FloatArray = filled + 0.1 * rng.standard_normal(filled.shape)
+    assert measured_rows(fast, noisy).all(), "noise was measured"
+    staircase = values[np.searchsorted(slow, fast + 1e-9, side="right") - 1]
+    assert measured_rows(fast, staircase).all(), "held, not interpolated"
+    few_lost = rng.standard_normal((1000, 4)).cumsum(axis=0)
+    few_lost[10:-10:10] = 0.5 * (few_lost[9:-11:10] + few_lost[11:-9:10])
+    assert measured_rows(0.01 * np.arange(1000.0), few_lost).all(), "a filled gap is bridged like any other"
 
 
 def tone(t: FloatArray, hertz: float) -> FloatArray:
