@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
@@ -14,6 +15,7 @@ from quadid_replay.blackbox_frames import FrameDefinition, Reader
 
 from quadid.errors import LogError
 from tests.replay import blackbox_writer as writer
+from tests.replay.golden import summary
 
 FloatArray = NDArray[np.float64]
 
@@ -89,6 +91,13 @@ def test_units_and_frames(tmp_path: Path) -> None:
         )
     np.testing.assert_allclose(c["battery"].values[:, 0], column(table, "vbatLatest") * 0.01)
     assert recording.autopilot["motor_poles"] == 14.0
+
+
+def test_the_golden_log_reads_as_it_did() -> None:
+    """Bytes and numbers are kept apart from the writer, so that writer and reader cannot err together unseen."""
+    log_file = Path(__file__).with_name("golden.bbl")
+    expected = json.loads(log_file.with_name("golden_bbl.json").read_text(encoding="utf-8"))
+    assert json.loads(json.dumps(summary(open_log(log_file)))) == expected
 
 
 def test_damage_costs_the_frames_up_to_the_next_complete_one(tmp_path: Path) -> None:
