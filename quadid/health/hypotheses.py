@@ -21,8 +21,9 @@ FloatArray = NDArray[np.float64]
 
 LOSS = 0.2
 """Prior standard deviation of a rotor's loss of thrust."""
-DRAG_APART = 0.08
-"""Prior standard deviation of its loss of drag torque from that of thrust: a cut blade loses about as much of both."""
+DRAG_APART = ((0.04, 0.9), (0.15, 0.1))
+"""Prior standard deviations of its loss of drag torque from that of thrust, with their probabilities: a cut blade loses
+about as much of both (R^4 and R^5 of its length), one with tape or a bend may lose thrust and gain drag."""
 MASS = 0.1
 """Prior standard deviation of an added mass, as a fraction."""
 REACH = 0.7
@@ -77,7 +78,6 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
     """
     rotors = range(len(vehicle.rotors))
     single = [rotor_effect(vehicle, j, float(shares[j]), trim) for j in rotors]
-    block = np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + DRAG_APART**2]])
     out = []
     for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
         chosen = list(combinations(rotors, count))
@@ -85,8 +85,10 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
         for group in chosen:
             effect = np.hstack([single[j] for j in group])
             positive = tuple(range(0, 2 * count, 2))
-            prior = np.kron(np.eye(count), block)
-            out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, float(odds)))
+            for apart, part in DRAG_APART:
+                block = LOSS**2 * np.ones((2, 2)) + np.diag([0.0, apart**2])
+                log_odds, prior = float(odds + np.log(part)), np.kron(np.eye(count), block)
+                out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, log_odds))
     return [*out, *_of_mass()]
 
 

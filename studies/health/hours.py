@@ -113,33 +113,53 @@ def _row(what: str, loss: float, each: int, flown: Callable[[int], Found]) -> st
     return f"| {100 * loss:.0f} % | {what} | {soon} of {each} | {sum(rotors)} | {np.median(seconds):.0f} |"
 
 
+def quiet(hours: float, session: float) -> str:
+    """Alarms in healthy hover, as Markdown.
+
+    Args:
+        hours: of the watch, second by second.
+        session: of a whole session at 50 Hz.
+    """
+    rng = np.random.default_rng(11)
+    watch, flown = practised(rng), Flown(rng)
+    count, whole = (round(h * 3600.0 / FLIGHT) for h in (hours, session))
+    raised = sum(alarms(watch, rng, FLIGHT) for _ in range(count))
+    told = sum(report.verdict == "changed" for _ in range(whole) for report in flown.fly(FLIGHT))
+    return (
+        f"## Online\n`make health-hours`, seed 11. Healthy flights of {FLIGHT // 60} min after {HISTORY} others; "
+        "rotors, battery and load differ from flight to flight (1 %, 1 mm, 1 %: 1 sigma), thrust sags by 15 % an hour: "
+        f"**{raised} alarms in {count * FLIGHT / 3600.0:.0f} h** of the watch's seconds, **{told} in "
+        f"{whole * FLIGHT / 3600.0:.0f} h** of a whole session fed at 50 Hz."
+    )
+
+
+def soon(each: int) -> str:
+    """How soon losses of a rotor are named, as Markdown; `each`: of every size."""
+    rng = np.random.default_rng(12)
+    lines = [
+        f"### A loss in flight\n`make health-hours`, seed 12. A rotor loses thrust and drag torque after {ONSET} s.\n",
+        "| loss of one rotor | through | named within 5 s | alarm names the rotor | median seconds from onset |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [_row("watch", loss, each, partial(_practised, rng, loss)) for loss in (0.03, 0.05, 0.1, 0.2)]
+    session = Flown(rng)
+    return "\n".join([*lines, _row("session", 0.1, each, lambda j: session.named(j, 0.1))])
+
+
 def main() -> None:
-    """Measures, prints and writes a part of the health page."""
+    """Measures, prints and writes parts of the health page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     parser.add_argument("--hours", type=float, default=100.0, help="of the watch, second by second")
     parser.add_argument("--session", type=float, default=10.0, help="hours of a whole session at 50 Hz")
     parser.add_argument("--each", type=int, default=25, help="losses of each size")
+    parser.add_argument("--parts", nargs="+", choices=("online", "losses"), default=("online", "losses"))
     chosen = parser.parse_args()
-    rng = np.random.default_rng(11)
-    watch, session = practised(rng), Flown(rng)
-    count, whole = (round(hours * 3600.0 / FLIGHT) for hours in (chosen.hours, chosen.session))
-    raised = sum(alarms(watch, rng, FLIGHT) for _ in range(count))
-    told = sum(report.verdict == "changed" for _ in range(whole) for report in session.fly(FLIGHT))
-    lines = [
-        f"## Online\n`make health-hours`, seed 11. Healthy flights of {FLIGHT // 60} min after {HISTORY} others; "
-        "rotors, battery and load differ from flight to flight (1 %, 1 mm, 1 %: 1 sigma), thrust sags by 15 % an hour: "
-        f"**{raised} alarms in {count * FLIGHT / 3600.0:.0f} h** of the watch's seconds, **{told} in "
-        f"{whole * FLIGHT / 3600.0:.0f} h** of a whole session fed at 50 Hz.\n",
-        "| loss of one rotor | through | named within 5 s | alarm names the rotor | median seconds from onset |",
-        "|---|---|---|---|---|",
-    ]
-    for loss in (0.03, 0.05, 0.1, 0.2):
-        lines.append(_row("watch", loss, chosen.each, partial(_practised, rng, loss)))
-    lines.append(_row("session", 0.1, chosen.each, lambda j: session.named(j, 0.1)))
-    text = "\n".join(lines)
-    put_section(chosen.out / "health.md", "Health: what changed in this vehicle", "online", text)
-    print(text)
+    makers = {"online": lambda: quiet(chosen.hours, chosen.session), "losses": lambda: soon(chosen.each)}
+    for part in chosen.parts:
+        text = makers[part]()
+        put_section(chosen.out / "health.md", "Health: what changed in this vehicle", part, text)
+        print(text)
 
 
 if __name__ == "__main__":

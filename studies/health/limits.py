@@ -99,7 +99,7 @@ def _percent(values: Sequence[Flags]) -> str:
     return " | ".join(f"{100.0 * np.mean(v):.0f} %" for v in values)
 
 
-def text(judged: Sequence[Judged], draws: int = 100) -> str:
+def text(judged: Sequence[Judged], draws: int = 50) -> str:
     """The limits as Markdown."""
     slope = loss_per_mm(judged)
     single = [j for j in judged if is_single(j, 0.0, 99.0) and j.flown.rotors == {CUT + 1}]
