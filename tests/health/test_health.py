@@ -71,6 +71,17 @@ def test_a_weight_on_an_arm_is_a_payload_and_no_rotor() -> None:
     assert named(found)["cg_offset"]["y"] == pytest.approx(shift[1], rel=0.3)
 
 
+def test_a_light_weight_on_an_arm_is_mostly_no_rotor() -> None:
+    """Its look-alike, a rotor that lost thrust and no drag torque, is rare: blades lose both."""
+    called = []
+    for seed in range(70, 90):
+        place = PELICAN_X.rotors[seed % 4].position
+        called.append(
+            judged(PELICAN_X, Wrong(mass=0.05 * PELICAN_X.mass, place=place[:2]), seed=seed).changes[0].effect
+        )
+    assert called.count("weak_rotor") <= 10
+
+
 def test_more_speed_in_the_same_balance_is_a_mass_or_else_thrust() -> None:
     found = judged(PELICAN, Wrong(effort=0.15), seed=9)
     (change,) = found.changes
