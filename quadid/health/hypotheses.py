@@ -86,8 +86,8 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
             effect = np.hstack([single[j] for j in group])
             positive = tuple(range(0, 2 * count, 2))
             for apart, part in DRAG_APART:
-                block = LOSS**2 * np.ones((2, 2)) + np.diag([0.0, apart**2])
-                log_odds, prior = float(odds + np.log(part)), np.kron(np.eye(count), block)
+                block = np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]])
+                prior, log_odds = np.kron(np.eye(count), block), float(odds + np.log(part))
                 out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, log_odds))
     return [*out, *_of_mass()]
 
