@@ -100,4 +100,17 @@ FAULTS: dict[int, Fault] = {
         "a sensor wrong by a factor, at once or slowly: gyro, accelerometer, attitude, rotor speeds",
         "while sensors contradict each other nothing is learned or published, and it is said; rotor speeds are bounded",
     ),
+    29: Fault(
+        "the vehicle changes (mass, thrust) with a set in force, approved by itself or by a person",
+        "the set is published again at once, with the reason why it is out of date",
+    ),
+    30: Fault("fit process that hangs while it warms up", "given up after the promised time, and begun anew"),
+    31: Fault(
+        "two vehicles on one system id, an FMT defined anew, a shuffled MCAP, `1_0` and a wild first stamp in a CSV",
+        "refused, or read as it is meant; said",
+    ),
+    32: Fault(
+        "vehicle file with duplicate keys, merge bombs, deep nesting, 20,000 digits, `1:30`, mass 1e308",
+        "one line that names key, cause and mend",
+    ),
 }

@@ -10,6 +10,7 @@ import pytest
 from quadid.errors import VehicleError
 from quadid.vehicle import Vehicle
 from quadid.yaml_text import LARGEST, read_mapping
+from tests.faults.evidence import Happened
 
 TEXT = Vehicle.shipped("pelican").to_yaml()
 
@@ -48,7 +49,7 @@ SLIPS = {
 
 
 @pytest.mark.parametrize("name", [*TRAPS, *SLIPS])
-def test_it_is_answered_in_one_line(name: str) -> None:
+def test_it_is_answered_in_one_line(name: str, happened: Happened) -> None:
     text, answer = {**TRAPS, **SLIPS}[name]
     assert text != TEXT
     with pytest.raises(VehicleError) as error:
@@ -57,6 +58,7 @@ def test_it_is_answered_in_one_line(name: str) -> None:
     assert answer in said
     assert "\n" not in said
     assert len(said) < 600
+    happened(32, f"{name}: '{said[:110]}'")
 
 
 def test_what_people_write_is_read_as_they_mean_it() -> None:

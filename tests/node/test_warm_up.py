@@ -11,6 +11,7 @@ import pytest
 from quadid_node.warm_up import STILL, WORK, WarmUp, processor_seconds
 
 from quadid_node import warm_up
+from tests.faults.evidence import Happened
 
 
 @pytest.fixture
@@ -42,7 +43,9 @@ def test_a_child_that_stands_still_or_never_ends_is_given_up(work: dict[str, flo
     assert "of work" in child.given_up()
 
 
-def test_a_child_that_hangs_and_only_wakes_up_now_and_then_is_given_up(work: dict[str, float | None]) -> None:
+def test_a_child_that_hangs_and_only_wakes_up_now_and_then_is_given_up(
+    work: dict[str, float | None], happened: Happened
+) -> None:
     """Threads that wait use a tick of the processor a minute: it once kept a child for hours."""
     child = watch(work)
     given_up_at = 0
@@ -50,6 +53,7 @@ def test_a_child_that_hangs_and_only_wakes_up_now_and_then_is_given_up(work: dic
         given_up_at += 10
         work.update(now=float(given_up_at), used=3e-4 * given_up_at)
     assert STILL < given_up_at <= STILL + 10
+    happened(30, f"a child that only wakes up now and then is given up after {given_up_at} s, {STILL:g} s are promised")
 
 
 def test_where_the_system_tells_nothing_the_clock_decides(work: dict[str, float | None]) -> None:

@@ -15,6 +15,7 @@ from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action
 from quadid.online.records import OnlineFinding
 from quadid.window import Sample
+from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
     DROPPED,
@@ -72,7 +73,7 @@ def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> 
     assert len(events(actions, "change")) == 1
 
 
-def test_a_set_that_a_person_approved_is_said_to_be_out_of_date_too() -> None:
+def test_a_set_that_a_person_approved_is_said_to_be_out_of_date_too(happened: Happened) -> None:
     """With `approval: manual` as with `auto`, also for who subscribes later: the topic keeps the newest."""
     manual = QUICK.model_copy(update={"gate": QUICK.gate.model_copy(update={"approval": "manual"})})
     session = Session(PELICAN, manual)
@@ -88,6 +89,8 @@ def test_a_set_that_a_person_approved_is_said_to_be_out_of_date_too() -> None:
     assert said.sequence > approved.sequence
     assert said.parameters.values.tobytes() == approved.parameters.values.tobytes()
     assert session.active_set.in_force == said
+    told = f"set {approved.sequence} again as {said.sequence}, out of date: {said.outdated}"
+    happened(29, f"approval manual, thrust −15 %: {told}")
 
 
 def test_while_a_change_is_explained_the_session_waits() -> None:

@@ -18,6 +18,7 @@ from quadid_replay.mcap_records import MOST_DEFINITIONS, McapFile
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
+from tests.faults.evidence import Happened
 from tests.fuzz.seeds import seeds
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_tlog import Tlog, attitude, heartbeat, servo
@@ -45,19 +46,21 @@ def tlog() -> bytes:
 @pytest.mark.parametrize(
     "filler", [b"\xfe", b"\xfd", b"\xfd\xfe", struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\xff"]
 )
-def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: bytes) -> None:
+def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: bytes, happened: Happened) -> None:
     said = opened(tmp_path, tlog() + filler * ((12 << 20) // len(filler)))
     assert "bytes are damaged and were skipped" in said
+    happened(5, f"telemetry log of filler {filler[:2].hex()}: read in linear time")
 
 
-def test_a_ulog_without_sync_takes_linear_time(tmp_path: Path) -> None:
+def test_a_ulog_without_sync_takes_linear_time(tmp_path: Path, happened: Happened) -> None:
     bad = struct.pack("<HB", 1, 0xFF)  # records of no known kind, one after the other
     said = opened(tmp_path, seeds("ulog")[0] + bad * (4 << 20))
     assert "longer than" not in said
     assert "damaged" in said
+    happened(5, "ULog without sync marks: read in linear time")
 
 
-def test_an_mcap_that_inflates_a_hundredfold_is_refused(tmp_path: Path) -> None:
+def test_an_mcap_that_inflates_a_hundredfold_is_refused(tmp_path: Path, happened: Happened) -> None:
     path = tmp_path / "bomb.mcap"
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD, chunk_size=8 << 20)
@@ -69,6 +72,7 @@ def test_an_mcap_that_inflates_a_hundredfold_is_refused(tmp_path: Path) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
     with pytest.raises(LogError, match="would inflate to more than 50 times"):
         open_log(path)
+    happened(5, "MCAP that inflates a hundredfold: refused")
 
 
 @pytest.mark.parametrize("where", ["inside a chunk", "in the file"])
@@ -95,7 +99,7 @@ def test_channels_and_schemas_without_end_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("summary", [True, False])
-def test_an_mcap_is_read_in_log_time_whatever_its_order(tmp_path: Path, summary: bool) -> None:
+def test_an_mcap_is_read_in_log_time_whatever_its_order(tmp_path: Path, summary: bool, happened: Happened) -> None:
     path = tmp_path / "shuffled.mcap"
     order = np.random.default_rng(3).permutation(5000)
     with path.open("wb") as file:
@@ -110,6 +114,7 @@ def test_an_mcap_is_read_in_log_time_whatever_its_order(tmp_path: Path, summary:
         path.write_bytes(path.read_bytes()[:-40])
     times = [t for _, t, _ in McapFile(path).messages({channel})]
     np.testing.assert_array_equal(times, np.arange(5000))
+    happened(31, f"5000 messages shuffled, summary {summary}: all read, in the order of their log times")
 
 
 def test_ordering_keeps_little_waiting() -> None:
@@ -125,7 +130,7 @@ def test_ordering_keeps_little_waiting() -> None:
         assert taken - n <= 1020
 
 
-def test_two_vehicles_under_one_system_id_are_refused(tmp_path: Path) -> None:
+def test_two_vehicles_under_one_system_id_are_refused(tmp_path: Path, happened: Happened) -> None:
     one, two = Tlog(), Tlog()
     for k in range(200):
         for log, boot in ((one, 100.0), (two, 300.0)):
@@ -135,9 +140,10 @@ def test_two_vehicles_under_one_system_id_are_refused(tmp_path: Path) -> None:
     length = len(frames[0]) // 200
     mixed = b"".join(f[k * length : (k + 1) * length] for k in range(200) for f in frames)
     assert "two vehicles under one system id" in opened(tmp_path, mixed)
+    happened(31, "two autopilots with one id, frame by frame: refused as two vehicles")
 
 
-def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path) -> None:
+def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path, happened: Happened) -> None:
     log = Dataflash()
     columns = ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
     log.describe(140, "IMU", "QBffffff", ",".join(columns))
@@ -151,9 +157,10 @@ def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path)
     recording = open_log(path)
     np.testing.assert_allclose(recording.channels["gyro"].values, np.tile([0.1, 0.2, 0.3], (50, 1)), rtol=1e-6)
     assert any("IMU described anew" in w for w in recording.warnings)
+    happened(31, "IMU described anew with gyro and accelerometer swapped: read up to there, and said")
 
 
-def test_numbers_that_only_python_reads_are_dropped(tmp_path: Path) -> None:
+def test_numbers_that_only_python_reads_are_dropped(tmp_path: Path, happened: Happened) -> None:
     rows = "".join(f"{0.02 * k:.2f},0.1,0.2,0.3\n" for k in range(50))
     path = tmp_path / "a.csv"
     path.write_text(
@@ -162,9 +169,10 @@ def test_numbers_that_only_python_reads_are_dropped(tmp_path: Path) -> None:
     recording = open_log(path)
     np.testing.assert_allclose(recording.channels["gyro"].values[:, 0], 0.1)
     assert any("2 lines with missing or unreadable cells" in w for w in recording.warnings)
+    happened(31, "1_0 and a full-width digit in a CSV: these lines dropped and counted")
 
 
-def test_a_wild_first_stamp_moves_nothing(tmp_path: Path) -> None:
+def test_a_wild_first_stamp_moves_nothing(tmp_path: Path, happened: Happened) -> None:
     rows = "".join(f"{0.02 * k:.2f},0.1,0.2,0.3\n" for k in range(50))
     for wild in ("1e9", "-5000", "99999"):
         path = tmp_path / "a.csv"
@@ -173,6 +181,7 @@ def test_a_wild_first_stamp_moves_nothing(tmp_path: Path) -> None:
         np.testing.assert_allclose(recording.channels["gyro"].t, 0.02 * np.arange(50), atol=1e-9)
         assert recording.breaks == ()
         assert any("1 stamps that no neighbour confirms" in w for w in recording.warnings)
+    happened(31, "first stamp of 1e9, -5000 and 99999 s: dropped and said, the others keep their times")
 
 
 def test_decimal_commas_are_named(tmp_path: Path) -> None:
