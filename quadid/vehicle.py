@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
@@ -18,16 +17,27 @@ from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.proof import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
+from quadid.types import FloatArray
+from quadid.vehicle_parts import (
+    Command,
+    Coordinate,
+    Mounting,
+    Noise,
+    ParameterPrior,
+    PositiveFloat,
+    Rotor,
+    Spread,
+    Stabiliser,
+    Strict,
+    ThrustPoint,
+)  # fmt: skip
 from quadid.vehicle_size import impossible_hover, impossible_size
 from quadid.yaml_text import read_mapping
 
-FloatArray = NDArray[np.float64]
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
 STAND_ERROR = 0.02
 """Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
-DEFAULT_BOUND_FACTOR = 4.0
-"""A bare initial guess may be wrong by this factor each way."""
 MOST_ROTORS = 16
 
 MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
@@ -35,132 +45,8 @@ MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
 }
 """Mixers by name: rows are rotors, columns the inputs.  Crazyflie takes thrust, roll, pitch, yaw."""
 
-PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Coordinate = Annotated[float, Field(allow_inf_nan=False)]
-Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Rotor(_Strict):
-    """One rotor.
-
-    Attributes:
-        position: from the geometric centre, FRD [m].
-        spin: +1 or -1, its sign in Omega_r; +1 turns about -z and pushes the vehicle about +z.
-    """
-
-    position: tuple[Coordinate, Coordinate, Coordinate]
-    spin: Literal[-1, 1]
-
-
-class Command(_Strict):
-    """What the rotor columns of a log mean.
-
-    Attributes:
-        kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1], ``thrust`` [0..1, proportional to thrust, where the
-            flight controller undoes the motor's curve] or ``pwm`` [us].
-        sampling: ``held``: a row acts until the next; ``instant``: a reading, linear in between.
-        max_speed: rotor speed at full command [rad/s]; normalized and pwm need it, exports of hover thrust use it.
-        range: pulse widths of zero and full command [us], for pwm.
-    """
-
-    kind: Literal["rotor_speed", "normalized", "thrust", "pwm"] = "rotor_speed"
-    sampling: Literal["held", "instant"] = "held"
-    max_speed: PositiveFloat | None = None
-    range: tuple[PositiveFloat, PositiveFloat] = (1000.0, 2000.0)
-
-    @model_validator(mode="after")
-    def _complete(self) -> Command:
-        if self.kind != "rotor_speed" and self.max_speed is None:
-            raise ValueError(f"command kind '{self.kind}' needs max_speed [rad/s], the rotor speed at full command")
-        if self.range[1] <= self.range[0]:
-            raise ValueError(f"command range {list(self.range)} must rise, for example [1000, 2000]")
-        return self
-
-    def to_rotor_speed(self, values: FloatArray) -> FloatArray:
-        """Converts logged rotor columns, shape (n, rotors), to rotor speed [rad/s]."""
-        if self.kind == "rotor_speed":
-            return values
-        assert self.max_speed is not None
-        if self.kind == "pwm":
-            low, high = self.range
-            values = (values - low) / (high - low)
-        if self.kind == "thrust":
-            values = np.sqrt(np.maximum(values, 0.0))  # below zero a rotor stands still
-        return values * self.max_speed
-
-    def from_rotor_speed(self, speed: FloatArray) -> FloatArray:
-        """Converts rotor speeds [rad/s], shape (n, rotors), to logged rotor columns."""
-        if self.kind == "rotor_speed":
-            return speed
-        assert self.max_speed is not None
-        share = speed / self.max_speed
-        if self.kind == "thrust":
-            return share**2
-        low, high = self.range if self.kind == "pwm" else (0.0, 1.0)
-        return low + share * (high - low)
-
-
-class ParameterPrior(_Strict):
-    """Initial guess of one parameter: value, bounds, and standard deviation where known (same unit)."""
-
-    initial: PositiveFloat
-    bounds: tuple[PositiveFloat, PositiveFloat] | None = None
-    sigma: PositiveFloat | None = None
-
-    @model_validator(mode="after")
-    def _ordered(self) -> ParameterPrior:
-        if self.bounds is not None and not self.bounds[0] <= self.initial <= self.bounds[1]:
-            raise ValueError(f"initial {self.initial:g} lies outside bounds [{self.bounds[0]:g}, {self.bounds[1]:g}]")
-        return self
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Bounds, by default a factor of 4 each way."""
-        return self.bounds or (self.initial / DEFAULT_BOUND_FACTOR, self.initial * DEFAULT_BOUND_FACTOR)
-
-
-class Noise(_Strict):
-    """Known 1-sigma noise: gyro [rad/s], attitude [rad], accel [m/s^2], velocity [m/s], position [m]."""
-
-    gyro: PositiveFloat | None = None
-    attitude: PositiveFloat | None = None
-    accel: PositiveFloat | None = None
-    velocity: PositiveFloat | None = None
-    position: PositiveFloat | None = None
-
-
-class Stabiliser(_Strict):
-    """The on-board attitude stabiliser, where known.
-
-    Attributes:
-        gains: by name, as in `quadid.attitude_controller`.
-        rate: how often it runs [Hz]; None for once a log row.
-    """
-
-    gains: dict[str, float]
-    rate: PositiveFloat | None = None
-
-
-class Mounting(_Strict):
-    """The IMU in the body: rotation (roll, pitch, yaw) [rad] and position from the geometric centre, FRD [m]."""
-
-    rotation: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
-    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
-
-
-class ThrustPoint(_Strict):
-    """One reading of a thrust stand, one rotor: speed [rad/s], thrust [N]."""
-
-    speed: PositiveFloat
-    thrust: PositiveFloat
-
-
-class Vehicle(_Strict):
+class Vehicle(Strict):
     """Everything known about a vehicle before its log is read.
 
     Attributes:

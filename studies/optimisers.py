@@ -30,7 +30,8 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.model.rollout import NUMBERS, Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]

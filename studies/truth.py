@@ -21,16 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
-from quadid.diagnose.attribution import settle
 from quadid.flight import draw_truth, fly
 from quadid.flight.sensors import SensorNoise
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import FitOptions, fit
 from quadid.identify.noise_model import estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
+from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 from studies.page import put_section
 
@@ -67,11 +68,11 @@ def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
     shooting = Shooting.cut([window], vehicle, SEGMENT)
     theta = shooting.layout.neutral()
     theta[: len(truth)] = truth
-    lin = settle(shooting, theta, [])
+    lin = settle_states(shooting, theta)
     shooting = shooting.with_noise(estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0))
-    lin = settle(shooting, theta, [])
+    lin = settle_states(shooting, theta)
     shooting = shooting.with_noise(shaped_noise(shooting, theta, shooting.free([]), lin.states))
-    lin = settle(shooting, theta, [])
+    lin = settle_states(shooting, theta)
     return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES), lin.states).gram.sum(axis=0))
 
 

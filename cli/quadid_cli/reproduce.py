@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from quadid.chi_square import Z95
 from quadid_cli.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def parameters(done: Reproduced) -> JsonDict:
             "pso_seeds": [float(theta[i]) for theta in done.columns["pso"].others],
             "ci95": list(p.ci95),
             "status": p.status.value.replace("_", " ") + (f" to {p.relative_to}" if p.relative_to else ""),
-            "extended_ci95": [float(extended - 1.96 * sigma), float(extended + 1.96 * sigma)],
+            "extended_ci95": [float(extended - Z95 * sigma), float(extended + Z95 * sigma)],
         }
     return out
 

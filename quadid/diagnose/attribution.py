@@ -23,9 +23,8 @@ from quadid.diagnose.hypotheses import Candidate, all_names
 from quadid.diagnose.model import Model, as_model, free_names, settled_states, taken_out
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import polish
-from quadid.identify.initial_states import InitialStates
 from quadid.identify.parameterization import Free
-from quadid.identify.segment_cost import Linearised
+from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -212,27 +211,11 @@ def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = No
     """Deviance of each block of unseen data with parameters as fitted, and the independent rows."""
     point = model.theta if theta is None else theta
     names = [n for c in model.causes for n in c.names]
-    lin = settle(scorer, point, names)
+    lin = settle_states(scorer, point, names)
     labels = block_labels(lin)
     total = np.zeros(int(labels.max()) + 1)
     np.add.at(total, labels, lin.cost + lin.occam)
     return total, float(lin.rows.sum())
-
-
-def settle(scorer: Shooting, theta: FloatArray, names: Sequence[str], rounds: int = 3) -> Linearised:
-    """Fits the initial states of all segments at fixed parameters and returns the last linearisation.
-
-    Args:
-        scorer: the data.
-        theta: full vector.
-        names: entries in use (they decide whether velocity matters and filters must settle).
-        rounds: Gauss-Newton steps on the initial states.
-    """
-    free = scorer.free(list(names))
-    states: InitialStates | None = None
-    for _ in range(rounds):
-        states = scorer.linearise(theta, free, states).stepped()
-    return scorer.linearise(theta, free, states)
 
 
 class _Halves(NamedTuple):

@@ -7,7 +7,8 @@ import math
 from quadid.diagnose.model import Model
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 
 
 def extended_vehicle(vehicle: Vehicle, layout: Layout, model: Model) -> str:

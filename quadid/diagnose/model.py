@@ -22,6 +22,7 @@ from quadid.identify.gauss_newton import (
     scaled_difference,
 )
 from quadid.identify.initial_states import InitialStates
+from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -132,22 +133,14 @@ def as_model(
     return Model(causes, free, prior, result.theta, result.lin, result.cost, result.states, held_out)
 
 
-def settled_states(shooting: Shooting, model: Model, rounds: int = 2) -> InitialStates:
+def settled_states(shooting: Shooting, model: Model) -> InitialStates:
     """States of `model`, those that a linearisation of the whole catalogue begins at fitted to it.
 
     Filters and delays begin before a segment, where no fit without them has been; from states as measured there, the
     linear problem can promise more than there is to gain.
-
-    Args:
-        shooting: the problem.
-        model: whose parameters stay as they are.
-        rounds: Gauss-Newton steps on the initial states.
     """
-    anything = shooting.free(["imu_lag.period", "rotor_drag.k_x"])  # what begins early, what needs velocity
-    states = model.states
-    for _ in range(rounds):
-        states = shooting.linearise(model.theta, anything, states).stepped()
-    return states
+    anything = ("imu_lag.period", "rotor_drag.k_x")  # what begins early, what needs velocity
+    return settle_states(shooting, model.theta, anything, model.states).states
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
+from quadid.chi_square import Z95
 from quadid.health.comparison import Explained, compare, distance, p_healthy
 from quadid.health.hypotheses import hypotheses
 from quadid.health.spread import Healthy, healthy_spread
@@ -27,7 +28,6 @@ _SURE = 0.75
 _UNEXPLAINED = 1e-3
 """An explanation that leaves a rest less probable than this explains nothing."""
 _RIVALS = 3
-_Z95 = 1.959964
 
 
 class Rival(NamedTuple):
@@ -200,7 +200,7 @@ def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:
 
 
 def _interval(one: Explained, k: int, scale: float = 1.0) -> tuple[float, tuple[float, float]]:
-    value, half = float(one.value[k]) * scale, _Z95 * float(np.sqrt(one.covariance[k, k])) * scale
+    value, half = float(one.value[k]) * scale, Z95 * float(np.sqrt(one.covariance[k, k])) * scale
     return value, (value - half, value + half)
 
 

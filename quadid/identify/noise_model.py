@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quadid.chi_square import lower_mean
 from quadid.identify.elimination import Whitening
 from quadid.types import FloatArray
-from quadid.vehicle import Noise
+from quadid.vehicle_parts import Noise
 
 _Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None]
 """A noise model as a key: white, slow, slow time, and the spectrum's shape and bytes."""

@@ -16,7 +16,8 @@ from quadid.identify.prediction import HorizonScore
 from quadid.identify.score import SetScore
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 
 JsonDict = dict[str, Any]
 

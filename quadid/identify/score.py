@@ -124,14 +124,22 @@ def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> Noise
     return replace(noise, white=white, slow=slow, shape=shape)
 
 
-def settle_states(shooting: Shooting, theta: FloatArray) -> Linearised:
+def settle_states(
+    shooting: Shooting, theta: FloatArray, names: Sequence[str] = (), states: InitialStates | None = None
+) -> Linearised:
     """Fits the initial state of every segment at fixed `theta`; a step that makes a segment worse is not taken.
+
+    Args:
+        shooting: the data.
+        theta: full vector.
+        names: parameters in use, also at values without effect: they decide which initial states matter.
+        states: to begin with; as measured by default.
 
     Returns:
         The linearisation at the fitted states.
     """
-    none = shooting.free([])
-    lin = shooting.linearise(theta, none)
+    none = shooting.free(names)
+    lin = shooting.linearise(theta, none, states)
     power = _power(shooting, lin)
     for _ in range(STATE_STEPS):
         trial = shooting.linearise(theta, none, lin.stepped())

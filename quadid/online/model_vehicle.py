@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from quadid.effects import EFFECTS
 from quadid.model.layout import LOSS, Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import ParameterPrior
 
 FloatArray = NDArray[np.float64]
 

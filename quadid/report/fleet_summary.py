@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from quadid.chi_square import Z95
+
 JsonDict = Mapping[str, Any]
 
 FEWEST_FOR_DRIFT = 5
@@ -20,7 +22,6 @@ FALSE_ALARM = 0.01
 FAR = 4.5
 """Robust standard deviations from the vehicle's own median that make an outlier."""
 DAY = 86_400.0
-_SIGMA = 1.959964
 
 
 def summarise(logs: Sequence[JsonDict], parameters: Sequence[JsonDict], findings: Sequence[JsonDict]) -> dict[str, Any]:
@@ -111,7 +112,7 @@ def _outliers(series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str
             continue
         centre = _centre(rows)
         for row in rows:
-            own = (row["high"] - row["low"]) / (2.0 * _SIGMA)
+            own = (row["high"] - row["low"]) / (2.0 * Z95)
             scale = math.hypot(centre["spread"] * abs(centre["median"]), own)
             distance = (row["value"] - centre["median"]) / scale if scale > 0.0 else 0.0
             if abs(distance) > FAR:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, NEVER
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, settle_states
@@ -233,7 +234,7 @@ def _means(values: FloatArray, label: NDArray[np.intp], good: NDArray[np.bool_])
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = total.sum(axis=0) / samples
         scatter = np.sum((total - count * mean) ** 2, axis=0) / samples**2
-        error = 1.96 * np.sqrt(scatter * stretches / np.maximum(stretches - 1, 1))
+        error = Z95 * np.sqrt(scatter * stretches / np.maximum(stretches - 1, 1))
     return mean, np.where(stretches >= 4, error, np.nan)
 
 

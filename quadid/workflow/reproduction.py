@@ -157,7 +157,7 @@ def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
     from quadid.flight import fly as fly_once
     from quadid.model.layout import Layout
     from quadid.parameters import NOMINAL_NAMES
-    from quadid.vehicle import Stabiliser
+    from quadid.vehicle_parts import Stabiliser
     from quadid.workflow.files import write_text
     from quadid.workflow.loading import GRID, load, load_vehicle, write_recording
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from quadid.chi_square import Z95
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SetState
 from quadid.online.status import SessionStatus
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
-
-Z95 = 1.959963984540054
 
 
 def number(value: float | None) -> float | None:

@@ -15,7 +15,8 @@ import numpy as np
 from quadid.effects import EFFECTS
 from quadid.flight import OUTSIDE, draw_effect, draw_outside, draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 
 GUESS = 0.2

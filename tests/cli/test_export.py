@@ -15,7 +15,8 @@ import pytest
 from quadid.proof import Proof
 from quadid.report.programs import FORMATS, export
 from quadid.residual import ResidualTerm
-from quadid.vehicle import GRAVITY, Command, ParameterPrior, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import Command, ParameterPrior
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from quadid.diagnose.attribution import settle
 from quadid.diagnose.cross_validation import BLOCK_SECONDS, block_labels, held_out_deviance, paired_gain
 from quadid.diagnose.model import extend
 from quadid.identify.gauss_newton import polish
+from quadid.identify.score import settle_states
 from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import MEASURED, Shooting
 from quadid.model.rollout import Segments
@@ -96,7 +96,7 @@ def test_the_leave_out_step_is_that_of_full_refits_of_a_nonlinear_model() -> Non
     for block in (0, 4, 9):
         rest = without_block(problem.shooting, labels != block)
         theta = polish(rest, model.theta, model.free, iterations=8, tolerance=0.01).theta
-        lin = settle(problem.shooting, theta, list(model.free.names))
+        lin = settle_states(problem.shooting, theta, model.free.names)
         refitted = float(np.sum((lin.cost + lin.occam)[labels == block]))
         charge = refitted - inside[block]
         assert charge > 0.0

@@ -17,7 +17,8 @@ from quadid.flight import (
     pack_gains,
     stabiliser_step,
 )
-from quadid.vehicle import Stabiliser, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Stabiliser
 
 FloatArray = NDArray[np.float64]
 NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]

@@ -10,7 +10,8 @@ from quadid.health import Health, assess, flight_trim, healthy_spread
 from quadid.health.comparison import p_healthy
 from quadid.health.hypotheses import hypotheses
 from quadid.health.trims import trim_directions
-from quadid.vehicle import Command, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Command
 from quadid.window import Recording
 from studies.health.flights import Wrong, hover, squared_speeds
 

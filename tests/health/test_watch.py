@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from quadid.health.watch import ENOUGH, HealthWatch
-from quadid.vehicle import Command, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Command
 from studies.health.flights import Wrong, hover_seconds
 from studies.health.hours import alarms, named, practised
 

@@ -13,7 +13,8 @@ from quadid.flight import Flight, TruthParameters, draw_truth, fly
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]

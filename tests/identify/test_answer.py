@@ -11,7 +11,8 @@ from quadid.identify.answer import final_answer, possible_inertia
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.result import fitted_vehicle, parameter_entry
 from quadid.parameters import INERTIAS, ParameterSet, Status, at_bound, impossible_inertia
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from tests.identify.flights import PELICAN, flown, guessed
 
 

@@ -29,7 +29,7 @@ from quadid.identify.initial_states import InitialStates
 from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior
+from quadid.vehicle_parts import ParameterPrior
 from tests.identify.flights import PELICAN, at_truth, flown, guessed, values_of
 
 FloatArray = NDArray[np.float64]

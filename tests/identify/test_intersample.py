@@ -18,7 +18,8 @@ from quadid.intersample import find_feedback, follow_feedback
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Stabiliser, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Stabiliser
 from quadid.window import Window
 from tests.identify.fast_loop import EVERY, fly_fast
 

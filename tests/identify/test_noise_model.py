@@ -13,7 +13,7 @@ from quadid.identify.noise_model import SHAPE_POINTS, SLOW_TIME, NoiseModel, est
 from quadid.identify.noise_spectrum import LOWEST, shaped_noise
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
-from quadid.vehicle import Noise
+from quadid.vehicle_parts import Noise
 from tests.identify.flights import PELICAN, at_truth, flown, turned
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,8 @@ from quadid.errors import VehicleError
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES, Status
-from quadid.vehicle import ParameterPrior, ThrustPoint, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior, ThrustPoint
 from tests.identify.flights import PELICAN, flown, guessed
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,8 @@ from quadid.identify.open_loop import mean_errors
 from quadid.identify.residual_fit import candidate_terms, fit_residual
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from tests.identify.flights import PELICAN
 
 

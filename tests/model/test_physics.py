@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from quadid.vehicle import GRAVITY, Rotor, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import Rotor
 from tests.model.flights import lively_input, values_of
 from tests.model.independent import Input
 from tests.model.simulate import Trajectory, finer, held, simulate, state

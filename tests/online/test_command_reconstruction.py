@@ -13,7 +13,8 @@ from quadid.online import GateSettings, Publish, Session, SessionSettings
 from quadid.online.command_reconstruction import SOURCE
 from quadid.online.records import Phase, SetState
 from quadid.online.resampler import Resampler
-from quadid.vehicle import Stabiliser, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Stabiliser
 from quadid.window import Recording
 from tests.online.driving import drive, samples
 

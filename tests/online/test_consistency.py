@@ -12,7 +12,8 @@ from quadid.online.consistency import ALLOWED, Consistency, Factor
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.records import SetState
 from quadid.online.resampler import Resampler
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Recording
 from studies.poisoning.flying import Poison
 from tests.faults.evidence import Happened

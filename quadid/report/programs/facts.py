@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from quadid.chi_square import Z95
 from quadid.effects import rotor_losses
 from quadid.parameters import NOMINAL_UNITS
 from quadid.sanitise import LONGEST_LINE, plain
@@ -15,7 +16,6 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 FloatArray = NDArray[np.float64]
 
-Z95 = 1.96
 TO_FLU = np.diag([1.0, -1.0, -1.0])
 """Turns body FRD into body FLU (its own inverse)."""
 

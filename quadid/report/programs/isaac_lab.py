@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from quadid.report.programs.facts import TO_FLU, Z95, Facts
+from quadid.chi_square import Z95
+from quadid.report.programs.facts import TO_FLU, Facts
 from quadid.report.programs.rotorpy import SHORTEST_LAG
 
 CARRIED = ("cg_offset", "product_of_inertia", "motor_lag")
