@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.saturation import at_limit
+from quadid.types import FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 LEAST_COPIES = 0.03
 """Share of inertial rows that equal the row before exactly."""

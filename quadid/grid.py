@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.intersample import follow_feedback
@@ -20,10 +19,10 @@ from quadid.mounting import in_body_axes
 from quadid.resample import COINCIDENT, measured_period
 from quadid.resampling_plan import REQUIRED, Plan, holes, make_plan, on_grid, reach
 from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Window
 
-FloatArray = NDArray[np.float64]
 Span = tuple[float, float]
 
 SHORTEST = 1.0

@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from quadid.attitude_controller import mixer_matrix
 from quadid.chi_square import exceeded
 from quadid.rotation import euler
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 STRETCH_SECONDS = 10.0

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
-
-FloatArray = NDArray[np.float64]
 
 
 def mounting_matrix(rotation: tuple[float, float, float]) -> FloatArray:

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, nearest
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 class Status(StrEnum):

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 HALF_WIDTH = 4.0
 """Half-width of the low-pass kernel in steps of the new grid."""

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.resample import (
     COINCIDENT,
@@ -21,9 +20,8 @@ from quadid.resample import (
     sample_period,
     split_stretches,
 )
+from quadid.types import FloatArray
 from quadid.window import Recording, Sampling
-
-FloatArray = NDArray[np.float64]
 
 GAP = 3.5
 """A step longer than this many median ones is a gap."""

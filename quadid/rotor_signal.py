@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.resample import measured_period, sample_period
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Sampling
-
-FloatArray = NDArray[np.float64]
 
 SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal says nothing about what happened between its samples; it is refused."""

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LEAST_SHARE = 0.005
 """Share of samples at exactly the largest or smallest value that makes a saturated sensor …"""

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.errors import WindowError
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Sampling = Literal["held", "instant"]
 
 CHANNELS: dict[str, tuple[int | None, str]] = {

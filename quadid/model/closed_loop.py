@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.attitude_controller import mixer_matrix, pack_gains
 from quadid.errors import ParameterError, WindowError
@@ -17,10 +16,9 @@ from quadid.model.needs_kernel import needs_of
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
 from quadid.model.simd import LANES, aligned
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 class Flown(NamedTuple):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from quadid.model import layout as ix
 from quadid.model.needs_kernel import FACTOR_ENTRIES, HUB_ENTRIES, RARE_ENTRIES, ROTOR_ENTRIES, SOLID_ENTRIES
 from quadid.model.simd import LANES
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _AIR, _HUB, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(9)

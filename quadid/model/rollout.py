@@ -27,10 +27,9 @@ from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
 from quadid.model.simd import LANES, aligned
 from quadid.model.supply import relative_voltage
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
 """Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""

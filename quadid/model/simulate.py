@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)

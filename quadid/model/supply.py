@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 def _voltage(window: Window) -> FloatArray | None:
