@@ -18,7 +18,7 @@ from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from quadid.workflow.loading import load_vehicle
-from studies.foreign.learning import FEATURES, network, ridge, runs_of, shares
+from studies.foreign.learning import FEATURES, network, ridge, runs_of, shares, velocity_against_position
 from studies.foreign.page import AHEAD, Row, page, section
 from studies.foreign.sets import SETS, FlightSet
 
@@ -64,13 +64,15 @@ def measured(one: FlightSet, data: Path) -> Row:
         files["prediction file"] = found.prediction
     prediction: dict[str, list[float]] = {}
     soon: dict[str, float] = {}
+    velocity = (float("nan"), float("nan"))
     if one.unseen:
         seen, new = ([w for log in part for w in _fine(data, log, vehicle)] for part in (one.train, one.unseen))
         prediction = {name: _share(new, v, AHEAD) for name, v in files.items()} | learners(seen, new)
         soon = {name: _share(new, v, SOON)[3] for name, v in files.items()}
+        velocity = velocity_against_position(new)
     first, second = ({key: r[key] for key in _KEPT if key in r} for r in (identified, found.result))
     terms = () if found.prediction is None else tuple(t.formula for t in found.prediction.residual)
-    return Row(first, second, prediction, time.perf_counter() - begin, terms=terms, soon=soon)
+    return Row(first, second, prediction, time.perf_counter() - begin, terms=terms, soon=soon, velocity=velocity)
 
 
 def _fine(data: Path, log: str, vehicle: Vehicle) -> Sequence[Window]:

@@ -67,6 +67,29 @@ def _runs(w: Window, seconds: float) -> tuple[FloatArray, FloatArray] | None:
     return np.concatenate([*state, *inputs], axis=1), np.stack(changes, axis=1)
 
 
+def velocity_against_position(windows: Sequence[Window], seconds: float = 0.5) -> tuple[float, float]:
+    """How much larger the logged velocity is than the change of position, and what that alone costs.
+
+    Returns:
+        Scale of the velocity against the change of position, least squares; mean distance between the change of
+        position over `seconds` and the integral of the logged velocity, as a share of no change.  NaN without both.
+    """
+    moved, flown = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for w in windows:
+        steps = round(seconds / w.dt)
+        if w.position is None or w.velocity is None or len(w) <= steps:
+            continue
+        path = np.vstack([np.zeros(3), np.cumsum(0.5 * (w.velocity[1:] + w.velocity[:-1]) * w.dt, axis=0)])
+        both = np.hstack([w.position[steps:] - w.position[:-steps], path[steps:] - path[:-steps]])
+        both = both[np.isfinite(both).all(axis=1)]
+        moved, flown = [*moved, both[:, :3]], [*flown, both[:, 3:]]
+    p, v = np.concatenate(moved), np.concatenate(flown)
+    if not len(p):
+        return float("nan"), float("nan")
+    miss = np.linalg.norm(p - v, axis=1).mean() / np.linalg.norm(p, axis=1).mean()
+    return float(np.sum(v * p) / np.sum(p * p)), float(miss)
+
+
 Predictor = Callable[[FloatArray], FloatArray]
 
 

@@ -29,6 +29,7 @@ class Row:
         seconds: wall time.
         terms: formulas of the prediction file.
         soon: error of the rate after 0.1 s by the same predictors, as a share of no change.
+        velocity: scale of the logged velocity against the change of position, and the position error it makes.
         date: of the measurement.
     """
 
@@ -39,6 +40,7 @@ class Row:
     failed: str = ""
     terms: tuple[str, ...] = ()
     soon: dict[str, float] = field(default_factory=dict)
+    velocity: tuple[float, float] = (float("nan"), float("nan"))
     date: str = field(default_factory=lambda: datetime.date.today().isoformat())
 
 
@@ -53,8 +55,9 @@ def _ahead(rows: Mapping[str, Row]) -> str:
     lines = [
         f"Errors {AHEAD:g} s ahead on unseen flights as shares of no change, {' / '.join(QUANTITIES)}; in bold what is "
         "below ridge and random features.", "",
-        "| data | physical file | prediction file | ridge | random features | noise variances, validation |",
-        "|---|---|---|---|---|---|",
+        "| data | physical file | prediction file | ridge | random features | logged velocity alone: position, scale | "
+        "noise variances, validation |",
+        "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for name, row in rows.items():
         if "ridge" not in row.prediction or row.diagnosed is None:
@@ -64,6 +67,7 @@ def _ahead(rows: Mapping[str, Row]) -> str:
         best = [f"**{a:.2f}**" if a < b else f"{a:.2f}" for a, b in zip(ours, rivals, strict=True)]
         cells = [" / ".join(f"{s:.2f}" for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
         cells.insert(1, " / ".join(best))
+        cells.append(f"{row.velocity[1]:.2f}, {row.velocity[0]:.3f}")
         lines.append(f"| {name} | {' | '.join(cells)} | {row.diagnosed['validation']['mse_extended']:.3g} |")
     return "\n".join(lines) if len(lines) > 4 else ""
 
