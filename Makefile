@@ -76,7 +76,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: peers health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -85,6 +85,9 @@ cases: venv ## the independent simulated cases, diagnosed
 
 foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression and networks (half an hour)
 	$(STUDY) studies.foreign --out docs/results
+
+peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.tools' recipe, Kalman filters; hours)
+	$(STUDY) studies.peers --out docs/results
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results

@@ -1,0 +1,1 @@
+"""Other programs beside ours, on the same data: `make peers`."""

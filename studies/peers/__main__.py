@@ -1,0 +1,64 @@
+"""`make peers`: other programs beside ours on the same data, part by part, into docs/results/peers.md."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from studies.page import put_section
+from studies.peers import online, recipe, simulated
+
+PARTS = ("simulated", "recipe", "online")
+PACKAGES = ("mujoco", "filterpy", "numpy", "scipy", "numba")
+
+
+def machine() -> str:
+    """Versions and machine, for the foot of a section."""
+    packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    return f"_{packages}; Python {platform.python_version()}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}_"
+
+
+def main() -> None:
+    """Runs the parts asked for; simulated flights go on where their records stop."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
+    parser.add_argument("--seeds", type=int, default=200, help="simulated flights of each kind")
+    parser.add_argument("parts", nargs="*", help=", ".join(PARTS))
+    given = parser.parse_args()
+    for part in given.parts or PARTS:
+        if part == "simulated":
+            _simulated(given.out, given.seeds)
+        elif part == "recipe":
+            _put(given.out, "recipe", recipe.section(given.data))
+        else:
+            _put(given.out, "online", online.section())
+
+
+def _simulated(out: Path, seeds: int) -> None:
+    path = out / "peers.json"
+    records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    simulated.warm_up()
+    done = {(r["case"], r["seed"]) for r in records}
+    for seed in range(1, seeds + 1):
+        for case in simulated.CASES:
+            if (case, seed) not in done:
+                records.append(simulated.record(case, seed))
+                path.write_text(json.dumps(records) + "\n", encoding="utf-8")
+        _put(out, "simulated", simulated.section(records))
+
+
+def _put(out: Path, name: str, lines: list[str]) -> None:
+    text = "\n".join([*lines, "", machine()])
+    print(text, flush=True)
+    put_section(out / "peers.md", "Beside the peers", f"peers {name}", text)
+
+
+if __name__ == "__main__":
+    main()
