@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned, jit, lane_kernel
 from quadid.vehicle import Vehicle
 from quadid.window import Window

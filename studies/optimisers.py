@@ -28,7 +28,8 @@ from quadid.baselines.optimisers import NAMES, minimise
 from quadid.flight import draw_truth, fly
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
-from quadid.model.rollout import NUMBERS, Rollout, Segments
+from quadid.model.rollout import NUMBERS, Rollout
+from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior

@@ -23,7 +23,7 @@ from quadid.identify.noise_estimation import SPECTRUM_SECONDS
 from quadid.identify.noise_spectrum import LOWEST, mode_power
 from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.identify.shooting import Shooting
-from quadid.model.rollout import CHANNEL_NAMES
+from quadid.model.channels import CHANNEL_NAMES
 from quadid.types import FloatArray
 
 SMOOTH = 3

@@ -24,8 +24,8 @@ from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
+from quadid.model.channels import CHANNEL_NAMES
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

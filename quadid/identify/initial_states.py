@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from quadid.identify.initial_states import retract
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES, N_STATE
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window

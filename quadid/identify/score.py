@@ -15,7 +15,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

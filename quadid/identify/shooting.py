@@ -28,7 +28,8 @@ from quadid.identify.segment_jacobian import Columns
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
-from quadid.model.rollout import Rollout, Segments, shared_rollout
+from quadid.model.rollout import Rollout, shared_rollout
+from quadid.model.segments import Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window

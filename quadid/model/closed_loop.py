@@ -13,8 +13,9 @@ from quadid.model import layout as ix
 from quadid.model.closed_loop_kernel import OUTPUTS, fly_closed_loop
 from quadid.model.layout import residual_terms
 from quadid.model.needs_kernel import needs_of
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
 from quadid.model.rollout import _threads as worker_threads
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

@@ -7,17 +7,16 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import lru_cache
 from queue import SimpleQueue
 from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
+from quadid.model.channels import measurements
 from quadid.model.kernel import Flight
 from quadid.model.layout import places, residual_terms
 from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
@@ -25,15 +24,12 @@ from quadid.model.recent import Recent
 from quadid.model.rollout_kernel import N_TANGENT, roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.rows import ALL_MOMENTS, N_STATE
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.model.supply import relative_voltage
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
-"""Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
-CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
 TAU, SLOWER = places("motor_lag")
 (OFFSET,) = places("thrust_curve.offset")
@@ -50,46 +46,6 @@ _FORGOTTEN = 40.0
 @lru_cache(maxsize=1)
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="rollout")
-
-
-@dataclass(frozen=True)
-class Segments:
-    """How a window is cut for multiple shooting.
-
-    Attributes:
-        length: scored rows a segment.
-        lead: rows before the first scored one, available to roll in filters and delays.
-        starts: first scored row of each segment.
-    """
-
-    length: int
-    lead: int
-    starts: NDArray[np.int64]
-
-    @classmethod
-    def cut(cls, rows: int, length: int, lead: int = 1) -> Segments:
-        """Cuts `rows` rows into back-to-back segments of `length`, leaving `lead` rows before the first.
-
-        Raises:
-            WindowError: when not one segment fits.
-        """
-        starts = np.arange(lead, rows - length, length, dtype=np.int64)
-        if len(starts) == 0:
-            raise WindowError(f"window of {rows} rows", f"at least {length + lead + 1} rows", "use a longer stretch")
-        return cls(length, lead, starts)
-
-    def every(self, n: int) -> Segments:
-        """Returns every n-th segment, the first included."""
-        return self.at(np.arange(0, len(self.starts), n))
-
-    def at(self, places: NDArray[np.intp]) -> Segments:
-        """Returns the segments at `places`."""
-        return Segments(self.length, self.lead, self.starts[places])
-
-    def later(self, shift: int, rows: int) -> Segments:
-        """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
-        starts = self.starts + shift
-        return Segments(self.length, self.lead, starts[starts < rows - self.length])
 
 
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
@@ -138,7 +94,7 @@ class Rollout:
         self.channels = 9
         if window.velocity is not None or window.position is not None:
             self.channels = 15 if window.position is not None else 12
-        self.measured, self.valid = _measured(window, self.channels)
+        self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)
         slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
         self.drive = Drive(
@@ -352,19 +308,3 @@ def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
     if found is None:
         found = _SHARED[key] = Rollout(window, vehicle)
     return found
-
-
-def _measured(window: Window, channels: int) -> tuple[FloatArray, NDArray[np.bool_]]:
-    n = len(window)
-    measured = np.zeros((n, 16))
-    measured[:, 3] = 1.0
-    valid = np.zeros((n, channels), dtype=bool)
-    places = ((window.gyro, 0, 0), (window.attitude, 3, 3), (window.accel, 7, 6), (window.velocity, 10, 9),
-              (window.position, 13, 12))  # fmt: skip
-    for values, column, channel in places:
-        if values is None:
-            continue
-        good = np.isfinite(values).all(axis=1)
-        measured[good, column : column + values.shape[1]] = values[good]
-        valid[good, channel : channel + 3] = True
-    return measured, valid

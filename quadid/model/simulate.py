@@ -8,7 +8,8 @@ import numpy as np
 
 from quadid.errors import WindowError
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import SetScore
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 
 FloatArray = NDArray[np.float64]
 JsonDict = dict[str, Any]

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.parameters import ParameterSet
 from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure
 from quadid.report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth

@@ -19,8 +19,8 @@ from quadid.effects import EFFECTS, NEVER
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, settle_states
 from quadid.identify.shooting import Shooting
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import trace
 from quadid.vehicle import Vehicle
 from quadid.window import Window

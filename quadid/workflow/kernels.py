@@ -82,7 +82,8 @@ def _hover() -> tuple[Vehicle, Window]:
 
 def _simulation() -> None:
     from quadid.model.layout import Layout
-    from quadid.model.rollout import Rollout, Segments
+    from quadid.model.rollout import Rollout
+    from quadid.model.segments import Segments
 
     vehicle, window = _hover()
     rollout = Rollout(window, vehicle)

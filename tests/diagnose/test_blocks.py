@@ -15,7 +15,7 @@ from quadid.identify.gauss_newton import polish
 from quadid.identify.score import settle_states
 from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import MEASURED, Shooting
-from quadid.model.rollout import Segments
+from quadid.model.segments import Segments
 from tests.diagnose.problems import cause, fitted, window_with
 
 FloatArray = NDArray[np.float64]

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from quadid.identify.noise_model import SLOW_TIME, NoiseModel
 from quadid.identify.shooting import Free
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
 
 FloatArray = NDArray[np.float64]

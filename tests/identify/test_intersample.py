@@ -16,7 +16,8 @@ from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.score import mse_score
 from quadid.intersample import find_feedback, follow_feedback
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import Stabiliser

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling
 from tests.model.flights import fly, lively_input, values_of, vector

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import Entry, Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling, Window

@@ -10,7 +10,8 @@ from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.needs_kernel import needs_of
 from quadid.model.packing import packed, packing
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Rollout
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 from tests.model.flights import lively_input, values_of, vector

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments, shared_rollout
+from quadid.model.rollout import Rollout, shared_rollout
+from quadid.model.segments import Segments
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -14,7 +14,7 @@ import pytest
 
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import ChannelScore, Series, SetScore
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.diagnose_page import chance, diagnosis_part
 from quadid.report.identify_page import identify_page
 from quadid.report.page import code, fit, number, packed, render

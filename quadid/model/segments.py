@@ -1,0 +1,50 @@
+"""How a window is cut into segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.errors import WindowError
+
+
+@dataclass(frozen=True)
+class Segments:
+    """How a window is cut for multiple shooting.
+
+    Attributes:
+        length: scored rows a segment.
+        lead: rows before the first scored one, available to roll in filters and delays.
+        starts: first scored row of each segment.
+    """
+
+    length: int
+    lead: int
+    starts: NDArray[np.int64]
+
+    @classmethod
+    def cut(cls, rows: int, length: int, lead: int = 1) -> Segments:
+        """Cuts `rows` rows into back-to-back segments of `length`, leaving `lead` rows before the first.
+
+        Raises:
+            WindowError: when not one segment fits.
+        """
+        starts = np.arange(lead, rows - length, length, dtype=np.int64)
+        if len(starts) == 0:
+            raise WindowError(f"window of {rows} rows", f"at least {length + lead + 1} rows", "use a longer stretch")
+        return cls(length, lead, starts)
+
+    def every(self, n: int) -> Segments:
+        """Returns every n-th segment, the first included."""
+        return self.at(np.arange(0, len(self.starts), n))
+
+    def at(self, places: NDArray[np.intp]) -> Segments:
+        """Returns the segments at `places`."""
+        return Segments(self.length, self.lead, self.starts[places])
+
+    def later(self, shift: int, rows: int) -> Segments:
+        """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
+        starts = self.starts + shift
+        return Segments(self.length, self.lead, starts[starts < rows - self.length])
