@@ -6,7 +6,8 @@ import pytest
 
 from quadid.diagnose import Diagnosis, diagnose
 from quadid.flight import draw_truth, fly
-from quadid.vehicle import Command, Vehicle
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import Command
 from tests.diagnose.hidden import confident, number
 from tests.identify.flights import PELICAN, guessed
 
