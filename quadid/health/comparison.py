@@ -45,41 +45,41 @@ def p_healthy(change: FloatArray, deviation: FloatArray, freedom: FloatArray) ->
     return float(chdtrc(len(change), (distance(change, deviation, freedom) ** 2).sum()))
 
 
-def explain(change: FloatArray, healthy: Healthy, flights: int, hypothesis: Hypothesis) -> Explained:
-    """Evidence and posterior of one explanation.
+def _explain(change: FloatArray, healthy: Healthy, flights: int, alike: Sequence[Hypothesis]) -> list[Explained]:
+    """Evidence and posterior of explanations with as many parameters each.
 
     The change is Student-t with the spread's mean degrees of freedom v and p = 4 dimensions:
     log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = r' S^-1 r with r the
     change beyond the prior mean's, to a constant.  Parameters that cannot
     be negative restrict the Gaussian posterior; the restriction's odds (posterior over prior) count.
     """
-    deviation = healthy.predictive(flights)
-    noise = np.diag(deviation**2)
-    a, p, centre = hypothesis.effect, hypothesis.prior, hypothesis.centre
-    freedom = float(healthy.freedom.mean())
-    spread = noise + a @ p @ a.T
-    gain = np.linalg.solve(spread, a @ p).T
-    beyond = change - a @ centre
-    value = centre + gain @ beyond
-    quadratic = float(beyond @ np.linalg.solve(spread, beyond))
-    tail = (freedom + len(change)) / 2.0
-    scale = (freedom + quadratic) / (freedom + len(change))
-    covariance = scale * (p - gain @ a @ p)
-    evidence = -tail * np.log1p(quadratic / freedom) - 0.5 * float(np.linalg.slogdet(spread)[1])
-    for k in hypothesis.positive:
-        evidence += float(log_ndtr(value[k] / np.sqrt(covariance[k, k]))) + np.log(2.0)
-    return Explained(
-        hypothesis, evidence + hypothesis.log_odds, value, covariance, _along(change, deviation, a, freedom)
+    deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
+    a, p, centre = (
+        np.stack(part) for part in zip(*((one.effect, one.prior, one.centre) for one in alike), strict=True)
     )
+    spread = np.diag(deviation**2) + a @ p @ a.transpose(0, 2, 1)
+    gain = np.linalg.solve(spread, a @ p).transpose(0, 2, 1)
+    beyond = change - np.einsum("hkj,hj->hk", a, centre)
+    value = centre + np.einsum("hjk,hk->hj", gain, beyond)
+    quadratic = (beyond * np.linalg.solve(spread, beyond[..., None])[..., 0]).sum(axis=1)
+    scale = (freedom + quadratic) / (freedom + len(change))
+    covariance = scale[:, None, None] * (p - gain @ a @ p)
+    evidence = -0.5 * (freedom + len(change)) * np.log1p(quadratic / freedom) - 0.5 * np.linalg.slogdet(spread)[1]
+    odds = log_ndtr(value / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))) + np.log(2.0)
+    chances = _along(change / deviation, a / deviation[:, None], freedom)
+    return [
+        Explained(one, float(e + o[list(one.positive)].sum() + one.log_odds), v, c, float(chance))
+        for one, e, o, v, c, chance in zip(alike, evidence, odds, value, covariance, chances, strict=True)
+    ]
 
 
-def _along(change: FloatArray, deviation: FloatArray, a: FloatArray, freedom: float) -> float:
-    """F test of the part of the change that an explanation's free parameters account for."""
-    scaled, z = a / deviation[:, None], change / deviation
+def _along(z: FloatArray, scaled: FloatArray, freedom: float) -> FloatArray:
+    """F test of the part of the change that explanations' free parameters account for, shape (explanations,)."""
     basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
-    kept = basis[:, sizes > 1e-9 * sizes[0]]
-    part = float(((kept.T @ z) ** 2).sum())
-    return float(fdtrc(kept.shape[1], freedom, part / kept.shape[1]))
+    kept = sizes > 1e-9 * sizes[:, :1]
+    part = (np.einsum("hkj,k->hj", basis, z) ** 2 * kept).sum(axis=1)
+    count = kept.sum(axis=1)
+    return np.asarray(fdtrc(count, freedom, part / count))
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
@@ -87,10 +87,13 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
 
     The best is the most probable one of the most probable kind: a kind is not worth less because it has many members.
     """
-    groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
+    by_size: dict[int, list[Hypothesis]] = {}
     for hypothesis in offered:
-        mine = groups.setdefault((hypothesis.kind, hypothesis.rotors), [])
-        mine.append(explain(change, healthy, flights, hypothesis))
+        by_size.setdefault(len(hypothesis.centre), []).append(hypothesis)
+    groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
+    for alike in by_size.values():
+        for one in _explain(change, healthy, flights, alike):
+            groups.setdefault((one.hypothesis.kind, one.hypothesis.rotors), []).append(one)
     found = []
     for group in groups.values():
         best = max(group, key=lambda one: one.log_evidence)
