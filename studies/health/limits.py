@@ -36,12 +36,12 @@ class Power(NamedTuple):
 
 
 def loss_per_mm(judged: Sequence[Judged]) -> float:
-    """Loss of thrust per millimetre cut from one propeller, least squares through zero over all single cuts.
+    """Loss of thrust per millimetre cut from one propeller, least squares through zero over these single cuts.
 
-    Found or not; each change of trim is projected on what a cut does, weighted with the healthy spread.
+    Each change of trim is projected on what a cut does, weighted with the healthy spread.
     """
     pairs = []
-    for j in (one for one in judged if is_single(one, 0.0, 99.0)):
+    for j in judged:
         healthy = j.health.healthy
         effect = _effect(healthy, next(iter(j.flown.rotors)) - 1) / healthy.deviation
         change = (j.health.trim - healthy.mean) / healthy.deviation
@@ -101,13 +101,19 @@ def _percent(values: Sequence[Flags]) -> str:
 
 def text(judged: Sequence[Judged], draws: int = 50) -> str:
     """The limits as Markdown."""
-    slope = loss_per_mm(judged)
+    light, large = (
+        loss_per_mm([j for j in judged if is_single(j, low, high)]) for low, high in ((0.0, LARGE), (LARGE, 99.0))
+    )
     single = [j for j in judged if is_single(j, 0.0, 99.0) and j.flown.rotors == {CUT + 1}]
     sizes = sorted({j.flown.total for j in single} | set(SHOWN))
-    powers = {(a, size): power(judged, a, partial(_cut, slope * size), draws) for a in AIRFRAMES for size in sizes}
+    powers = {
+        (a, size): power(judged, a, partial(_cut, size * (light if size < LARGE else large)), draws)
+        for a in AIRFRAMES
+        for size in sizes
+    }
     lines = [
-        f"A cut costs {100.0 * slope:.1f} % of thrust a millimetre (least squares over all single cuts). If every cut "
-        "cost just that, and flights differed from the healthy mean as healthy flights do (one draw for an airframe, "
+        f"A single cut below {LARGE:g} mm costs {100.0 * light:.1f} % of thrust a millimetre, a larger one "
+        f"{100.0 * large:.1f} % (least squares over the flights, found or not). If every cut cost just that, and flights differed from the healthy mean as healthy flights do (one draw for an airframe, "
         "whose other propellers stayed), the single cuts would give:\n",
         "| single cuts | wanted | expected (95 % of draws) | measured |", "|---|---|---|---|",
     ]  # fmt: skip
