@@ -114,8 +114,8 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
     lines = [
         f"A single cut below {LARGE:g} mm costs {100.0 * light:.1f} % of thrust a millimetre, a larger one "
         f"{100.0 * large:.1f} % (least squares over the flights, found or not). If every cut cost just that, and "
-        "flights differed from the healthy mean as healthy flights do (one draw for an airframe, whose other propellers "
-        "stayed), the single cuts would give:\n",
+        "flights differed from the healthy mean as healthy flights do (one draw for an airframe, whose other "
+        "propellers stayed), the single cuts would give:\n",
         "| single cuts | wanted | expected (95 % of draws) | measured |", "|---|---|---|---|",
     ]  # fmt: skip
     for what, wanted, chosen, right, column in ROWS:

@@ -101,8 +101,8 @@ def right(case: Case, effects: list[tuple[str, int]]) -> bool:
     return names == {"cg_offset"} if case.shift != (0.0, 0.0) else not names
 
 
-def _judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, float]:
-    """Whether it is called changed, whether rightly answered, and the errors of the losses of thrust and of torque."""
+def judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, float]:
+    """Whether case `k` is called changed and rightly answered, and the errors of its losses of thrust and drag torque."""
     vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
     profile = ("hover", "gentle", "excited")[k % 3]
 
@@ -128,7 +128,7 @@ def table(each: int = 12) -> str:
     for k, case in enumerate(cases(each)):
         for name, simulate in SIMULATORS.items():
             rows = done.setdefault(case.group, {}).setdefault(name, [])
-            rows.append(_judged(case, k, simulate))
+            rows.append(judged(case, k, simulate))
     heads = [f"{name}: {what}" for name in SIMULATORS for what in ("changed", "right", "error of loss, of drag loss")]
     lines = ["| hidden | of | " + " | ".join(heads) + " |", "|---" * (2 + len(heads)) + "|"]
     for group, by in done.items():
