@@ -102,7 +102,7 @@ def right(case: Case, effects: list[tuple[str, int]]) -> bool:
 
 
 def judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, float]:
-    """Whether case `k` is called changed and rightly answered, and the errors of its losses of thrust and drag torque."""
+    """Whether case `k` is called changed and rightly answered, and the errors of its losses of thrust and drag."""
     vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
     profile = ("hover", "gentle", "excited")[k % 3]
 
