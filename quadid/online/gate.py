@@ -30,10 +30,9 @@ class GateSettings(BaseModel):
         yaw_width: the same of d, J_zz, J_r where the data claim to know them.
         step: largest change of a parameter from the set in force, relative.
         creep: largest change from the last set that a person approved, or the first of this flight.
-        agility: largest change of torque over inertia from the set in force, relative: what a controller's gain margin
-            has to bear.
         reference: largest change of torque over inertia from that set, from the vehicle file before the first, and
-            between windows, that is published without a person: rotor speeds wrong by a factor change it.
+            between windows, that is published without a person: rotor speeds wrong by a factor change it, and a
+            controller's gain margin has to bear it.
         inertia_slack: how far the triangle inequality of the inertias may be broken.
         gain: deviance per held-out window that counts as a real gain over the set in force.
         sharper: a set is also published when the interval of a parameter has shrunk to this share,
@@ -49,7 +48,6 @@ class GateSettings(BaseModel):
     yaw_width: float = Field(default=0.3, gt=0.0, le=3.0)
     step: float = Field(default=0.25, gt=0.0, le=2.0)
     creep: float = Field(default=0.4, gt=0.0, le=4.0)
-    agility: float = Field(default=0.4, gt=0.0, le=4.0)
     reference: float = Field(default=0.04, gt=0.0, le=4.0)
     inertia_slack: float = Field(default=1.5, ge=1.0, le=3.0)
     gain: float = Field(default=6.0, gt=0.0)
@@ -130,7 +128,7 @@ def decide(case: Case, settings: GateSettings) -> Decision:
 
 def _doubled(settings: GateSettings) -> GateSettings:
     """Limits up to which a person may approve a step."""
-    wide = {name: 2.0 * getattr(settings, name) for name in ("step", "creep", "agility")}
+    wide = {name: 2.0 * getattr(settings, name) for name in ("step", "creep")}
     return settings.model_copy(update=wide)
 
 
@@ -241,22 +239,11 @@ def _step(case: Case, settings: GateSettings) -> str | None:
             room = limit + (2.0 * old.sigma / old.value if known and old.value > 0.0 else math.inf)
             if abs(math.log1p(change)) > math.log1p(room):
                 return f"{p.name} would change by {change:+.0%} from {what}, allowed {limit:.0%}"
-    return _agility(case, settings)
-
-
-def _agility(case: Case, settings: GateSettings) -> str | None:
-    if case.in_force is None:
-        return None
-    old = case.in_force.parameters
-    for name in ("J_xx", "J_yy"):
-        ratio = (case.parameters["b"].value / case.parameters[name].value) / (old["b"].value / old[name].value)
-        if abs(math.log(ratio)) > math.log1p(settings.agility):
-            return f"torque over inertia ({name}) would change by {ratio - 1.0:+.0%}, a controller may not bear that"
     return None
 
 
 def _reference(case: Case, settings: GateSettings) -> str | None:
-    """Torque over inertia against what was trusted first; mass and accelerometer leave it as it is."""
+    """Torque over inertia against what was trusted first: a controller's gain, which mass leaves as it is."""
     known, what = case.stated, "the vehicle file"
     if case.baseline is not None:
         known = {p.name: (p.value, p.sigma) for p in case.baseline.parameters if p.status not in UNKNOWN}
