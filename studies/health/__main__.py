@@ -22,7 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--each", type=int, default=12, help="simulated cases of every kind")
+    parser.add_argument("--each", type=int, default=6, help="simulated cases of every kind")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
     chosen = parser.parse_args()
     page = chosen.out / "health.md"

@@ -122,7 +122,7 @@ def judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, 
     return changed, right(case, named) if changed else not hidden, errors[0], errors[1]
 
 
-def table(each: int = 12) -> str:
+def table(each: int = 6) -> str:
     """The campaign as Markdown."""
     done: dict[str, dict[str, list[tuple[bool, bool, float, float]]]] = {}
     for k, case in enumerate(cases(each)):
