@@ -42,7 +42,7 @@ _BLOCK = 84
 """Candidates whose slopes are taken at once: each of their runs evaluates all of them."""
 FOLDS = 3
 """Parts of the data, each predicted once by what the others taught."""
-_SHORTEST = 4.0
+_SHORTEST = 2.5
 """Shortest piece of a flight that is such a part [s]."""
 STEPS = 2
 """Steps that a larger model takes from one selection."""

@@ -26,6 +26,7 @@ RATE = 100.0
 """Grid of the scores [Hz]."""
 SOON = 0.1
 """Time [s] after which the rate of `crazyflie rpm` is wanted below 0.35 of no change."""
+NOTES = Path(__file__).with_name("notes.md")
 _KEPT = ("parameters", "verdict", "validation", "findings")
 
 
@@ -46,7 +47,7 @@ def main() -> None:
         rows = json.loads(kept.read_text()) if kept.exists() else {}
         rows[name] = dataclasses.asdict(row)
         kept.write_text(json.dumps(rows, indent=1) + "\n")
-        (given.out / "foreign.md").write_text(page({n: Row(**rows[n]) for n in SETS if n in rows}))
+        (given.out / "foreign.md").write_text(page({n: Row(**rows[n]) for n in SETS if n in rows}, NOTES.read_text()))
 
 
 def measured(one: FlightSet, data: Path) -> Row:
@@ -85,7 +86,8 @@ def learners(seen: Sequence[Window], new: Sequence[Window]) -> dict[str, list[fl
         return {}
     learn, test = runs_of(seen), runs_of(new)
     guesses = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES), "network": network(learn)}
-    return {name: shares(guess, test).tolist() for name, guess in guesses.items()}
+    alone = shares(ridge(learn.state, FEATURES), test.state).tolist()
+    return {name: shares(guess, test).tolist() for name, guess in guesses.items()} | {"state alone": alone}
 
 
 def _share(windows: Sequence[Window], vehicle: Vehicle, seconds: float) -> list[float]:

@@ -20,6 +20,8 @@ FloatArray = NDArray[np.float64]
 
 BINS = 10
 """Parts of the half second over which rotor speeds are averaged."""
+STATE = 9
+"""Inputs that are the state: velocity, rate, direction of gravity."""
 FEATURES = 400
 WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1)
 """Ridge weights; the best on a held-out fifth of the training flights is taken."""
@@ -35,6 +37,11 @@ class Runs:
 
     x: FloatArray
     y: FloatArray
+
+    @property
+    def state(self) -> Runs:
+        """The same runs with the state alone, without any rotor speed."""
+        return Runs(self.x[:, :STATE], self.y)
 
 
 def runs_of(windows: Sequence[Window], seconds: float = 0.5) -> Runs:

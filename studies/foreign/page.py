@@ -47,7 +47,7 @@ class Row:
 def page(rows: Mapping[str, Row], notes: str = "") -> str:
     """Markdown of all sets measured so far; `notes` stand before the sets."""
     parts = ["# Vehicles of others", _ahead(rows), _kept(rows), notes]
-    return "\n\n".join([p for p in parts if p] + [section(n, SETS[n], row) for n, row in rows.items()]) + "\n"
+    return "\n\n".join([p.strip() for p in parts if p] + [section(n, SETS[n], row) for n, row in rows.items()]) + "\n"
 
 
 def _ahead(rows: Mapping[str, Row]) -> str:

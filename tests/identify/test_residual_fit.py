@@ -70,7 +70,7 @@ def test_runs_of_a_vehicle_whose_rotors_follow_the_battery_know_its_voltage(damp
 
 
 def test_from_a_flight_too_short_to_judge_by_nothing_is_learnt(damped: tuple[Flight, Flight]) -> None:
-    assert fit_residual([damped[0].window.slice(0, 300)], PELICAN).terms == ()
+    assert fit_residual([damped[0].window.slice(0, 240)], PELICAN).terms == ()
 
 
 def test_flights_without_one_run_of_half_a_second_are_refused(damped: tuple[Flight, Flight]) -> None:
