@@ -54,7 +54,7 @@ def _ahead(rows: Mapping[str, Row]) -> str:
     """Half-second errors of all sets beside each other."""
     lines = [
         f"Errors {AHEAD:g} s ahead on unseen flights as shares of no change, {' / '.join(QUANTITIES)}; in bold what is "
-        "below ridge and random features.", "",
+        "below ridge and random features.  Without a prediction file the physical one stands in its column.", "",
         "| data | physical file | prediction file | ridge | random features | logged velocity alone: position, scale | "
         "noise variances, validation |",
         "|---|---|---|---|---|---|---|",
