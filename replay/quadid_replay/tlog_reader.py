@@ -15,6 +15,7 @@ from quadid_replay.boot_clock import BootClock, Placed
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.esc_messages import extend_dialect
+from quadid_replay.mavlink_decode import Decoder
 from quadid_replay.mavlink_frames import FrameCount, iterate_frames
 from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count
 from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES, Reading, boot_stamp, unix_seconds
@@ -118,16 +119,18 @@ def read_tlog(path: Path) -> Recording:
     count = FrameCount()
     vehicles: dict[tuple[int, int], _VehicleLog] = {}
     bad = 0
-    decoder = _DIALECT.MAVLink(None)
+    decoder = Decoder(_DIALECT, _WANTED)
     for frame in iterate_frames(path, count):
         if frame.message not in _WANTED:
             continue
-        try:
-            message = decoder.decode(bytearray(frame.data))
-        except _DIALECT.MAVError:
+        message = decoder.decode(frame.message, frame.data)
+        if message is None:
             bad += 1
             continue
-        vehicles.setdefault((frame.system, frame.component), _VehicleLog()).take(message, frame.received)
+        sender = frame.system, frame.component
+        if sender not in vehicles:
+            vehicles[sender] = _VehicleLog()
+        vehicles[sender].take(message, frame.received)
     if not any(v.signals for v in vehicles.values()):
         raise LogError(
             f"{path.name}: {count.frames} MAVLink frames but no measurements of a vehicle",
