@@ -54,6 +54,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder that keeps flights once flown")
     parser.add_argument("--kinds", default="campaign,cases,recorded")
     parser.add_argument("--classes", default="", help="name:count of campaign classes, by commas")
+    parser.add_argument("--flights", default="", help="flights whose name is one of these, by commas")
     parser.add_argument("--only", default="", help="variants whose name holds one of these words, by commas")
     parser.add_argument("--out", type=Path, help="folder of the page")
     parser.add_argument("--start", type=int, default=START, help="number of the first case of each class")
@@ -64,6 +65,8 @@ def main() -> None:
     given = [part.split(":") for part in options.classes.split(",") if part]
     classes = {name: int(count) for name, count in given} or CLASSES
     todo = flights(options.kinds.split(","), classes, options.start)
+    named = [n for n in options.flights.split(",") if n]
+    todo = [f for f in todo if not named or f.name in named]
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
     rows: list[str] = []
@@ -81,7 +84,8 @@ def main() -> None:
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
     """The result page."""
     command = f"python -m studies.ablation --records FILE --kinds {options.kinds}"
-    command += f" --classes {options.classes}" if options.classes else ""
+    for name in ("classes", "flights", "only"):
+        command += f" --{name} '{getattr(options, name)}'" if getattr(options, name) else ""
     return (
         f"""# Diagnosis: without each rule, with half and twice each number
 

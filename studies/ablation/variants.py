@@ -11,8 +11,11 @@ from types import ModuleType
 from typing import Any
 
 import quadid.diagnose
+from quadid.diagnose.model import Model, fit_model
+from quadid.identify.shooting import Shooting
+from studies.ablation.house import measured
 
-WHOLE = ("FEWEST_BLOCKS", "FEWEST_SEGMENTS", "MOST_REFITS", "SMOOTH", "WAVES", "NOISE_ROUNDS", "FAR_SEGMENTS")
+WHOLE = ("FEWEST_BLOCKS", "FEWEST_SEGMENTS", "FAR_ITERATIONS", "MOST_ROUNDS", "SMOOTH", "WAVES")
 """Numbers that count something and stay whole."""
 
 
@@ -52,17 +55,9 @@ def modules() -> list[ModuleType]:
     return [importlib.import_module(m.name) for m in found]
 
 
-def numbers() -> dict[str, float]:
-    """Named numbers of the diagnosis, each where it is defined, by name."""
-    out = {}
-    for module in modules():
-        source = module.__file__ or ""
-        with open(source, encoding="utf-8") as file:
-            defined = {line.split(" = ")[0] for line in file if " = " in line and line[0].isupper()}
-        for name, value in vars(module).items():
-            if name in defined and isinstance(value, int | float) and name.isupper():
-                out[name] = value
-    return out
+def numbers() -> dict[str, Any]:
+    """Named numbers of the diagnosis, or tuples of such, by name."""
+    return {name: getattr(m, name) for m in modules() for name in measured().numbers if hasattr(m, name)}
 
 
 def variants() -> list[Variant]:
@@ -70,8 +65,9 @@ def variants() -> list[Variant]:
     out = [Variant("base", {}), *(Variant(f"without {name}", values) for name, values in RULES.items())]
     for name, value in numbers().items():
         for factor in (0.5, 2.0):
-            other = max(round(value * factor), 1) if name in WHOLE else value * factor
-            out.append(Variant(f"{name} {value:g} -> {other:g}", {name: other}))
+            other = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+            other = max(round(other), 1) if name in WHOLE else other
+            out.append(Variant(f"{name} {value} -> {other}", {name: other}))
     return out
 
 
@@ -95,6 +91,22 @@ def _always(*_: object) -> bool:
     return True
 
 
+def _same_noise(windows: object, short: Any, model: object) -> Any:
+    return short.noise
+
+
+def _own_states(shooting: object, model: Any) -> Any:
+    return model.states
+
+
+def _nominal(shooting: Shooting, *_: object) -> Model:
+    return fit_model(shooting, shooting.layout.initial(shooting.vehicle), ())
+
+
+def _no_trial(*_: object) -> None:
+    return None
+
+
 RULES: dict[str, dict[str, Callable[..., Any]]] = {
     "swaps": {"_swaps": _none},
     "calibration (Godambe)": {"calibration": _one},
@@ -102,5 +114,9 @@ RULES: dict[str, dict[str, Callable[..., Any]]] = {
     "impossible numbers": {"impossible_causes": _nothing},
     "constancy of a bias": {"inconstant_causes": _nothing},
     "a last pruning": {"pruned": _unpruned},
+    "a possible cause for an impossible one": {"_possible": _no_trial},
+    "noise around the causes": {"_noise_around": _same_noise},
+    "a start from everything": {"from_everything": _nominal},
+    "initial states settled first": {"settled_states": _own_states},
 }
 """Rules that are functions, and what stands in their place."""
