@@ -235,8 +235,8 @@ def _scaling(r: Result) -> list[str]:
     return [
         *rows, "",
         f"Processor time grows with the {e['fit_processor']:.2f}th power of the length, memory with the "
-        f"{e['peak_mb']:.2f}th: the swarm, the first polish and the noise use a bounded number of segments, the last "
-        "polish all, whose residuals and weights are held whole, so that memory grows with the log.", "",
+        f"{e['peak_mb']:.2f}th: of more than an hour a fit takes stretches spread evenly (`identify/long_logs.py`); "
+        "what grows beyond that are the windows themselves, 0.1 kB a sample.", "",
         "![](speed-scaling.png)",
     ]  # fmt: skip
 
