@@ -17,7 +17,7 @@ from typing import Any
 
 from quadid_node.mavlink_wire import dialect
 
-from studies.chaos.running import Running, stop_quietly
+from studies.chaos.running import Running, low_bits, stop_quietly
 from studies.chaos.vehicle import Sender, Vehicle
 
 
@@ -87,7 +87,7 @@ def killed_at_commit(scene: Scene) -> str:
         time.sleep(0.0005)
     told, number = len(scene.vehicle.told), scene.service.newest_number()
     scene.service.end(signal.SIGKILL)
-    heard = any(name == "QI_SEQ" and round(value) == number for _, name, value in scene.vehicle.told[told:])
+    heard = any(name == "QI_SEQ" and round(value) == low_bits(number) for _, name, value in scene.vehicle.told[told:])
     scene.service.start()
     return f"kill -9 after the commit of set {number}, which was {'' if heard else 'not '}heard on the wire"
 

@@ -115,6 +115,11 @@ class Running:
                 self.crashes.append(f"a traceback was said, after: {self.lines[-2:-1]}")
 
 
+def low_bits(number: int) -> int:
+    """What QI_SEQ says of a set's number: a float on the wire holds 24 bits, QI_SEQ_HI the others."""
+    return number % (1 << 24)
+
+
 def stop_quietly(process: subprocess.Popen[Any]) -> None:
     """Ends a process of ours."""
     if process.poll() is None:

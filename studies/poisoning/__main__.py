@@ -19,6 +19,7 @@ from quadid.flight import Flight, fly
 from quadid.online import Session, SessionSettings
 from quadid.online.records import OnlineSet
 from quadid.vehicle import Vehicle
+from studies.judged import judged
 from studies.poisoning.flying import MUST, Poison, fly_online
 from studies.poisoning.page import page
 
@@ -97,7 +98,8 @@ def main() -> None:
         print(done[-1], flush=True)
         kept.write_text("[\n" + ",\n".join(json.dumps(d) for d in done) + "\n]\n")
     healthy = [(s.stop, study.error(s)) for s in study.healthy]
-    (given.out / "poisoning.md").write_text(page(cells(), done, healthy, SEED))
+    where = given.out / "poisoning.md"
+    where.write_text(page(cells(), done, healthy, SEED) + judged(where))
 
 
 if __name__ == "__main__":
