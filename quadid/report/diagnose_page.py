@@ -10,7 +10,7 @@ from quadid.effects import EFFECTS
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.report.figures import MODELS, MOST_LOGS, channel_figures, error_figure, gain_figure
-from quadid.report.identify_page import noise_rows
+from quadid.report.identify_page import noise_rows, parameter_row
 from quadid.report.page import number
 from quadid.report.residual_maps import ResidualMap, map_figure
 from quadid.report.verdict import Level, Verdict, percent
@@ -222,6 +222,7 @@ def diagnose_page(
         "title": f"Diagnosis of {vehicle}",
         "subtitle": f"{fitted} log{'s' * (fitted != 1)} diagnosed, {held or 'none'} held out for validation",
         "verdict": part["verdict"],
+        "parameters": [parameter_row(p) for p in result.get("parameters", ())],
         "diagnoses": [{**part, "verdict": None}],
         "warnings": list(warnings),
         "quality": quality,

@@ -40,7 +40,7 @@ def fleet_page(
         "verdict": asdict(fleet_verdict(summary, health)),
         "sections": [s for s in (
             _health(health), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
-            _common(summary), _unusable(summary),
+            _common(summary), _unusable(summary), _logs(logs),
         ) if s is not None],
         "provenance": provenance,
     }  # fmt: skip
@@ -234,3 +234,21 @@ def _unusable(summary: JsonDict) -> Any:
         for r in summary["reasons"]
     ]
     return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)
+
+
+def _logs(logs: Sequence[JsonDict]) -> Any:
+    """Every log with its error and where its date comes from, the worst error first."""
+    worst = sorted(logs, key=lambda log: -(log["mse_fitted"] if log["mse_fitted"] is not None else math.inf))
+    rows = [
+        (
+            log["name"], log["unit"], f"{_date(log['started'])} ({_DATED.get(log['dated_by'], log['dated_by'])})",
+            log["status"], number(log["mse_initial"], 3), number(log["mse_fitted"], 3),
+        )
+        for log in worst
+    ]  # fmt: skip
+    head = ("Log", "Vehicle", "Date (and whose)", "Outcome", "Error before", "Error after")
+    intro = "Error over one second of simulation, in noise variances: 1 is the noise floor."
+    return _section("logs", "Every log", head, rows, intro)
+
+
+_DATED = {"log": "clock in the log", "file": "date of the file"}

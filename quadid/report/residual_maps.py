@@ -18,11 +18,12 @@ from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, NEVER
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, settle_states
+from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
 from quadid.report.figures import trace
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
 FloatArray = NDArray[np.float64]
@@ -33,6 +34,7 @@ SLOPE_SECONDS = 0.1
 """Span over which a residual's rate of change is taken [s]."""
 MOST_SECONDS = 300.0
 """Flight that a map is made of, at most [s]."""
+_VELOCITY = slice(7, 10)
 _CHANNELS = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z")
 
 
@@ -64,7 +66,7 @@ class ResidualMap:
         x: middle of the bins, shape (bins,).
         before, after: mean residual without and with the cause, shape (bins,).
         before_error, after_error: 95 % half-widths from the spread between stretches of 1 s.
-        seen: chi-square by which the bins differ from zero without the cause, less that with it.
+        seen: mean square of the bins without the cause less that with it, in variances of a sample with it.
     """
 
     channel: str
@@ -100,9 +102,10 @@ def residual_map(
     if not shooting.rollouts or effect not in PAIRS:
         return None
     shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
-    after = _residuals(shooting, theta)
-    signals = _signals(shooting, after)
-    before = _residuals(shooting, switched_off(shooting.layout, theta, effect, names))
+    settled = settle_states(shooting, theta)
+    after = _residuals(settled)
+    signals = _signals(shooting, after, settled)
+    before = _residuals(settle_states(shooting, switched_off(shooting.layout, theta, effect, names)))
     drawn = [
         _binned(shooting, before, after, mode, channel, quantity, signals[quantity])
         for mode, channel, quantity in PAIRS[effect]
@@ -133,21 +136,22 @@ def _first(windows: Sequence[Window]) -> list[Window]:
     return out
 
 
-def _residuals(shooting: Shooting, theta: FloatArray) -> FloatArray:
+def _residuals(lin: Linearised) -> FloatArray:
     """Measured less simulated, (segments, length, channels); NaN where not measured."""
-    lin = settle_states(shooting, theta)
     return np.where(lin.weights > 0.0, -lin.residuals, np.nan)
 
 
-def _signals(shooting: Shooting, residual: FloatArray) -> dict[str, FloatArray]:
+def _signals(shooting: Shooting, residual: FloatArray, settled: Linearised) -> dict[str, FloatArray]:
     """Quantities at the samples of all segments, (segments, length); rates are simulated ones, free of gyro noise."""
+    starts = settled.states.at(settled.n_pre, shooting.rollouts, shooting.segments).x0
     parts: list[dict[str, FloatArray]] = []
     place = 0
-    for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
+    for rollout, segments, x0 in zip(shooting.rollouts, shooting.segments, starts, strict=True):
         rows = segments.starts[:, None] + np.arange(segments.length)
         mine = residual[place : place + len(rows)]
         place += len(rows)
-        parts.append(_of_window(rollout.window, rows, rollout.measured[rows][..., :3] - mine[..., :3], shooting))
+        signals = _of_window(rollout.window, rows, rollout.measured[rows][..., :3] - mine[..., :3], shooting)
+        parts.append(signals | _in_the_air(rollout.window, rows, x0[:, _VELOCITY], settled.n_pre))
     shared = set.intersection(*(set(p) for p in parts))
     return {name: np.concatenate([p[name] for p in parts]) for name in shared}
 
@@ -168,25 +172,39 @@ def _of_window(window: Window, rows: NDArray[np.intp], rates: FloatArray, shooti
     for i, name in enumerate("pqr"):
         out[name] = rates[..., i]
         out[f"{name}_dot"] = np.gradient(rates[..., i], dt, axis=1)
-    if window.attitude is not None:
-        out |= _in_the_air(window, rows)
     if window.position is not None:
         out["height"] = -window.position[rows, 2]
     return out
 
 
-def _in_the_air(window: Window, rows: NDArray[np.intp]) -> dict[str, FloatArray]:
-    """Heading, and body velocity where velocity is measured."""
-    assert window.attitude is not None
+def _in_the_air(window: Window, rows: NDArray[np.intp], start: FloatArray, n_pre: int) -> dict[str, FloatArray]:
+    """Heading, and body velocity: measured, else from the velocity fitted at each start and the accelerometer.
+
+    Args:
+        window: the data.
+        rows: of the samples, (segments, length).
+        start: fitted velocity `n_pre` rows before each segment [m/s], (segments, 3).
+        n_pre: rows between the start and the segment.
+    """
+    if window.attitude is None:
+        return {}
     w, x, y, z = window.attitude[rows].transpose(2, 0, 1)
     out = {"heading": np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))}
-    if window.velocity is not None:
-        v = window.velocity[rows]
-        u = np.stack([x, y, z], axis=-1)
-        # World to body: the inverse rotation, v + 2 u x (u x v - w v).
-        body = v + 2.0 * np.cross(u, np.cross(u, v) - w[..., None] * v)
+    v = None if window.velocity is None else window.velocity[rows]
+    if v is None and window.accel is not None:
+        along = np.concatenate([rows[:, :1] + np.arange(1 - n_pre, 0), rows], axis=1)
+        pull = rotated(window.attitude[along], window.accel[along]) + [0.0, 0.0, GRAVITY]
+        v = (start[:, None] + window.dt * np.cumsum(pull, axis=1))[:, n_pre - 1 :]
+    if v is not None:
+        body = rotated(window.attitude[rows] * [1.0, -1.0, -1.0, -1.0], v)
         out |= {"v_x": body[..., 0], "v_y": body[..., 1], "v_z": body[..., 2]}
     return out
+
+
+def rotated(q: FloatArray, v: FloatArray) -> FloatArray:
+    """Vectors (..., 3) turned by unit quaternions (..., 4), scalar first."""
+    u = q[..., 1:]
+    return np.asarray(v + 2.0 * np.cross(u, np.cross(u, v) + q[..., :1] * v))
 
 
 def _binned(
@@ -213,7 +231,7 @@ def _binned(
     told = np.isfinite(error_b) & np.isfinite(error_a) & (error_b > 0.0) & (error_a > 0.0)
     if np.count_nonzero(told) < BINS // 2:
         return None
-    seen = float(np.sum((mean_b[told] / error_a[told]) ** 2 - (mean_a[told] / error_a[told]) ** 2))
+    seen = float(np.mean(mean_b[told] ** 2 - mean_a[told] ** 2) / max(float(np.var(both[1][good])), 1e-300))
     name, unit = CHANNEL_NAMES[channel], CHANNEL_UNITS[channel]
     if mode == "slope":
         name, unit = f"d{name}/dt", f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"

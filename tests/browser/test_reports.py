@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -264,3 +265,10 @@ def test_without_scripts_the_words_are_complete(chromium: Browser, demo_page: Pa
     assert "Figures need JavaScript" in page.inner_text("body")
     assert "Known to" in page.inner_text("main")
     context.close()
+
+
+def test_a_printed_report_is_short_and_light(chromium: Browser, demo_page: Path, shots: Path) -> None:
+    with opened(chromium, demo_page, scheme="dark") as one:
+        paper = one.page.pdf(path=shots / "demo.pdf", format="A4")
+        assert 2 <= len(re.findall(rb"/Type\s*/Page[^s]", paper)) <= 8
+        assert one.complaints == []

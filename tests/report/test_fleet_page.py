@@ -21,6 +21,7 @@ def rows(values: dict[str, np.ndarray], sigma: float = 0.01) -> tuple[list[dict[
             name = f"{unit}/{i}.csv"
             logs.append({
                 "name": name, "unit": unit, "status": "done", "reason": "", "started": 1.6e9 + i * DAY, "verdict": None,
+                "dated_by": "log", "mse_initial": 20.0, "mse_fitted": 1.0 + 0.01 * i,
             })  # fmt: skip
             half = 1.96 * sigma * 2e-5
             parameters.append({
@@ -77,7 +78,7 @@ def test_common_findings_count_flights_not_numbers() -> None:
 def test_the_page_is_safe_and_says_what_to_do() -> None:
     logs, parameters = rows({EVIL: np.ones(6)})
     bad = {"name": f"{EVIL}/x.bin", "unit": EVIL, "status": "unreadable", "reason": EVIL, "started": 0.0}
-    logs.append({**bad, "verdict": None})
+    logs.append({**bad, "verdict": None, "dated_by": EVIL, "mse_initial": None, "mse_fitted": None})
     summary = summarise(logs, parameters, [])
     verdict = fleet_verdict(summary)
     assert verdict.headline == "6 of 7 logs gave parameters."
@@ -87,3 +88,24 @@ def test_the_page_is_safe_and_says_what_to_do() -> None:
     assert len(html) < 6_000_000
     for part in ("Parameters over time", "Vehicles", "Logs without an answer"):
         assert part in html
+
+
+def test_every_log_is_named_with_its_error_and_whose_date_it_has() -> None:
+    logs, parameters = rows({"a": np.ones(3)})
+    broken = {
+        **logs[1],
+        "status": "unreadable",
+        "reason": "empty",
+        "dated_by": "file",
+        "mse_initial": None,
+        "mse_fitted": None,
+    }
+    logs[1] = broken
+    page = fleet_page(summarise(logs, parameters, []), logs, parameters, [], "Fleet")
+    (section,) = [s for s in page["sections"] if s["id"] == "logs"]
+    table = {row[0]: row for row in section["tables"][0]["rows"]}
+    assert list(table) == ["a/1.csv", "a/2.csv", "a/0.csv"]
+    assert table["a/2.csv"][3:] == ["done", "20", "1.02"]
+    assert "clock in the log" in table["a/0.csv"][2]
+    assert "date of the file" in table["a/1.csv"][2]
+    assert table["a/1.csv"][3] == "unreadable"

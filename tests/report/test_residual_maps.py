@@ -24,9 +24,12 @@ def pelican() -> Vehicle:
     return vehicle.model_copy(update={"parameters": parameters})
 
 
-def drawn(vehicle: Vehicle, effect: str, values: dict[str, float], names: tuple[str, ...]) -> ResidualMap:
+def drawn(
+    vehicle: Vehicle, effect: str, values: dict[str, float], names: tuple[str, ...],
+    extras: tuple[str, ...] = ("velocity", "position"),
+) -> ResidualMap:  # fmt: skip
     """The map of an effect that a vehicle flew with, at its true values."""
-    flight = fly(vehicle, seconds=40.0, seed=8, effects={effect: values}, extras=("velocity", "position"))
+    flight = fly(vehicle, seconds=40.0, seed=8, effects={effect: values}, extras=extras)
     layout = Layout(vehicle)
     theta = layout.initial(vehicle)
     for name in names:
@@ -56,8 +59,9 @@ def test_a_lag_is_an_error_in_step_with_angular_acceleration(pelican: Vehicle) -
     assert flat(found)
 
 
-def test_drag_is_a_force_in_step_with_speed(pelican: Vehicle) -> None:
-    found = drawn(pelican, "rotor_drag", {"k_x": 0.3, "k_y": 0.3}, ("rotor_drag.k_x", "rotor_drag.k_y"))
+@pytest.mark.parametrize("extras", [("velocity", "position"), ()])
+def test_drag_is_a_force_in_step_with_speed(pelican: Vehicle, extras: tuple[str, ...]) -> None:
+    found = drawn(pelican, "rotor_drag", {"k_x": 0.3, "k_y": 0.3}, ("rotor_drag.k_x", "rotor_drag.k_y"), extras)
     assert (found.channel, found.unit, found.against_unit) in {("a_x", "m/s^2", "m/s"), ("a_y", "m/s^2", "m/s")}
     assert slope(found) == pytest.approx(-0.3, rel=0.15)
     assert flat(found)

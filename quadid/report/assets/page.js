@@ -77,7 +77,8 @@
     const figure = figures[box.dataset.figure], number = chosen.get(figure.id) || 0;
     const view = figure.views[number] = unpacked(figure.views[number]);
     box.dataset.drawn = "yes";
-    return Plotly.react(box, view.data.map((trace) => painted(trace, view)), layoutOf(view), { responsive: true, displaylogo: false, displayModeBar: false });
+    const size = { width: box.clientWidth, height: box.clientHeight };
+    return Plotly.react(box, view.data.map((trace) => painted(trace, view)), { ...layoutOf(view), ...size }, { responsive: true, displaylogo: false, displayModeBar: false });
   }
 
   const boxes = () => document.querySelectorAll(".plot");
@@ -126,14 +127,25 @@
   system.addEventListener("change", dress);
   dress();
 
-  // Paper: light colours, every part open and every figure drawn.
-  let was = [];
+  // Paper: light colours, the parts that are open, every figure of theirs drawn, as wide as a page and less high.
+  const PAGE = 690, FLAT = 0.7;
   window.addEventListener("beforeprint", () => {
-    was = Array.from(document.querySelectorAll("details")).filter((d) => !d.open);
-    was.forEach((d) => { d.open = true; });
     root.classList.remove("dark");
     colours.clear();
-    boxes().forEach(draw);
+    boxes().forEach((box) => {
+      if (box.closest("details:not([open])")) return;
+      box.dataset.height = box.style.height;
+      box.style.height = FLAT * parseFloat(box.style.height) + "px";
+      box.style.width = PAGE + "px";
+      draw(box);
+    });
   });
-  window.addEventListener("afterprint", () => { was.forEach((d) => { d.open = false; }); dress(); });
+  window.addEventListener("afterprint", () => {
+    boxes().forEach((box) => {
+      if (box.dataset.height) box.style.height = box.dataset.height;
+      box.style.width = "";
+      delete box.dataset.height;
+    });
+    dress();
+  });
 })();
