@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import JsonTarget, OutFolder, Preset, Rate, ReportFile, Seed, Unchecked, VehicleName
+from quadid_cli.options import Columns, JsonTarget, OutFolder, Preset, Rate, ReportFile, Seed, Unchecked, VehicleName
 
 
 def excite(
@@ -22,6 +23,7 @@ def excite(
     seed: Seed = 1,
     rate: Rate = None,
     preset: Preset = "auto",
+    columns: Columns = None,
     unchecked: Unchecked = False,
     report: ReportFile = None,
     json: JsonTarget = None,
@@ -29,7 +31,7 @@ def excite(
 ) -> None:
     """Propose the manoeuvre that shrinks the intervals most, within tilt and rate limits; write it to a file."""
     from quadid.workflow.excite import check_limits, propose
-    from quadid.workflow.loading import load_logs, load_vehicle
+    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid_cli import output, terminal
 
     check_limits(seconds, tilt, rate_limit)
@@ -37,7 +39,8 @@ def excite(
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
     folder = output.out_folder(out)
-    opened = load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked)
+    named = parse_columns(columns or [])
+    opened = load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked, named)
     with terminal.progress() as advance:
         done = propose(
             opened, vehicle=described, seconds=seconds, tilt=tilt, rate_limit=rate_limit, seed=seed, advance=advance
@@ -70,8 +73,9 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
     moves = Table(title="Manoeuvre")
     for name in ("movement", "amplitude (rms)"):
         moves.add_column(name)
-    for m in result["movements"]:
-        moves.add_row(m["name"], ", ".join(amplitude(a, v) for a, v in m["amplitudes"].items()))
+    moves.add_column("times", justify="right")
+    for name, amplitudes, times in grouped(result["movements"]):
+        moves.add_row(name, amplitudes, str(times))
     console.print(moves)
     peak = result["peak"]
     console.print(f"In simulation it reaches {peak['tilt_deg']:.0f} degrees and {peak['rate_deg_s']:.0f} deg/s.")
@@ -79,6 +83,12 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
     console.print(f"Manoeuvre: {result['manoeuvre_file']}", soft_wrap=True)
     if "report" in result:
         console.print(f"Report: {result['report']}", soft_wrap=True)
+
+
+def grouped(movements: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int]]:
+    """Movements that follow each other alike as one: name, amplitudes, how many times."""
+    each = [(m["name"], ", ".join(amplitude(a, v) for a, v in m["amplitudes"].items())) for m in movements]
+    return [(*move, len(list(same))) for move, same in groupby(each)]
 
 
 def percent(half: float) -> str:

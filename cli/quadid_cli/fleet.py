@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import JsonTarget, OutFolder, Seed
+from quadid_cli.options import Columns, JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
     from quadid.workflow.fleet import Job
@@ -47,17 +47,24 @@ def fleet(
     ] = False,
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = GRID,
     seed: Seed = 1,
+    columns: Columns = None,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
     """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
-    from quadid.workflow.loading import load_vehicle
+    from quadid.workflow.loading import load_vehicle, parse_columns
     from quadid_cli import fleet_folder, output, terminal
     from quadid_cli.fleet_store import open_store
 
     output.check_file(json, "--json")
     target = output.out_folder(out)
-    default = None if vehicle is None else load_vehicle(vehicle).to_yaml()
+    named = parse_columns(columns or [])
+    if named and vehicle is None:
+        raise typer.BadParameter(
+            "vehicles in the folder name their own: give it with --vehicle", param_hint="--columns"
+        )
+    known = None if vehicle is None else load_vehicle(vehicle)
+    default = None if known is None else known.model_copy(update={"columns": known.columns | named}).to_yaml()
     found = fleet_folder.find_jobs(folder.resolve(), default, rate, seed, diagnose, target)
     begin = time.perf_counter()
     with open_store(target / "fleet.sqlite") as store:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import QuadidError
-from quadid_cli.options import JsonTarget, Preset, Seed, VehicleName
+from quadid_cli.options import Columns, JsonTarget, Preset, Seed, VehicleName
 
 if TYPE_CHECKING:
     from quadid_node.publication import Output
@@ -61,6 +61,7 @@ def replay(
     ] = False,
     seed: Seed = 0,
     preset: Preset = "auto",
+    columns: Columns = None,
     json: JsonTarget = None,
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
@@ -70,7 +71,7 @@ def replay(
     from quadid_node.worker import InlineWorker
     from quadid_replay import open_log
 
-    from quadid.workflow.loading import load_vehicle
+    from quadid.workflow.loading import load_vehicle, parse_columns
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -79,7 +80,7 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
-    recording = open_log(log, preset, described.columns)
+    recording = open_log(log, preset, described.columns | parse_columns(columns or []))
     if as_recorded:
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle
