@@ -170,6 +170,8 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     if not fit.straight:
         message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         fix = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
+            fix = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
         return Check("gyro_attitude", Verdict.ERROR, message, fix, numbers)
     for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
         if 0.75 < fit.scale / scale < 1.33:

@@ -164,6 +164,12 @@ def load(
     described = as_vehicle(vehicle)
     cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
     recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
+    if "gyro" not in recording.channels:
+        unused = next((f"; {note}" for note in recording.warnings if note.startswith("columns not used")), "")
+        raise LogError(
+            f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
+            "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
+        )  # fmt: skip
     doubts = () if unchecked else check_conventions(recording, described)
     windows, report = _gridded(recording, described, rate, cut)
     return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)

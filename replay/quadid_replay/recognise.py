@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from quadid.errors import LogError
+from quadid.sanitise import plain
 
 Format = Literal["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "blackbox", "csv"]
 HEAD_BYTES = 65536
@@ -31,6 +32,8 @@ _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"FMT, 128,", "a DataFlash text log", "give the binary .bin log"),
     (b"\xbc\x01\x00", "a Crazyflie µSD log of version 1", "record it with newer firmware"),
 )
+_FEW_COLUMNS = 3
+"""Text with more commas than these in its first line is a table."""
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 
 
@@ -59,6 +62,12 @@ def recognise(head: bytes, name: str, time: str = "t") -> Format:
         return "tlog"
     if _is_csv(head, time):
         return "csv"
+    cells = _cells(head)
+    if len(cells) > _FEW_COLUMNS and all(cell.isprintable() for cell in cells):
+        raise LogError(
+            f"{name}: a CSV without the column '{time}' (its first are {plain(', '.join(cells[:3]))})",
+            "the time [s] in a column t", f"name it: --columns {plain(cells[0])}=t",
+        )  # fmt: skip
     shown = head[:8].hex(" ")
     raise LogError(f"{name}: unknown format (begins with {shown})", ALLOWED, "see docs/logs.md for what each needs")
 
@@ -98,11 +107,13 @@ def _frame_length(head: bytes, at: int) -> int | None:
 
 def _is_csv(head: bytes, time: str) -> bool:
     """Text whose first line that is not a comment holds the column of time."""
-    line = header_line(head)
-    if line is None:
-        return False
-    cells = line.replace(";", ",").replace("\t", ",").split(",")
-    return time in [cell.strip().strip('"') for cell in cells]
+    return time in _cells(head)
+
+
+def _cells(head: bytes) -> list[str]:
+    """Cells of the header of a CSV; none where it is not text."""
+    line = (header_line(head) or "").replace(";", ",").replace("\t", ",")
+    return [cell.strip().strip('"') for cell in line.split(",")]
 
 
 def header_line(head: bytes) -> str | None:

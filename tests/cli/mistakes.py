@@ -157,21 +157,16 @@ MISTAKES = (
         "world axes east, north, up",
         fit(lambda p: p.moved("x y z vx vy vz qw qx qy qz", "y x -z vy vx -vz qw qy qx -qz")),
         "ENU",
-        vague=True,
     ),
     Mistake("quaternion with its scalar last", fit(lambda p: p.moved("qw qx qy qz", "qx qy qz qw")), "qw|scalar|order"),
     Mistake(
         "normalised commands as rad/s",
         fit(lambda p: p.scaled("w1 w2 w3 w4", 1e-3)),
         "normali[sz]ed|command",
-        3,
-        vague=True,
     ),
     Mistake("decimal commas", fit(lambda p: p.commas()), "comma"),
-    Mistake(
-        "other column names", fit(lambda p: p.named(p="gyro_x", q="gyro_y", r="gyro_z")), "gyro_x|columns", vague=True
-    ),
-    Mistake("time column called time", fit(lambda p: p.named(t="time")), "column t|unknown format|time", vague=True),
+    Mistake("other column names", fit(lambda p: p.named(p="gyro_x", q="gyro_y", r="gyro_z")), "gyro_x"),
+    Mistake("time column called time", fit(lambda p: p.named(t="time")), "time=t"),
     Mistake("one column of three missing", fit(lambda p: p.without("r")), "lacks column r"),
     Mistake("no rotor signal", fit(lambda p: p.without("w1 w2 w3 w4")), "no rotor speeds"),
     Mistake("no gyro", fit(lambda p: p.without("p q r")), "no gyro"),
