@@ -11,6 +11,7 @@ import numpy as np
 from scipy import stats
 
 from quadid.chi_square import Z95
+from quadid.report.verdict import ROUGH
 
 JsonDict = Mapping[str, Any]
 
@@ -33,13 +34,14 @@ def summarise(logs: Sequence[JsonDict], parameters: Sequence[JsonDict], findings
         findings: rows with log, effect, confident, parameter, value.
 
     Returns:
-        ``counts`` by status, ``units`` (each with its parameters: median, spread, flights), ``drifts``, ``outliers``,
+        ``counts`` by status, ``rough`` (logs that the simulation misses much of), ``units`` (each with its parameters: median, spread, flights), ``drifts``, ``outliers``,
         ``common`` (findings by number of flights), ``reasons`` (failures by reason).
     """
     by_name = {log["name"]: log for log in logs}
     series = _series(by_name, parameters)
     return {
         "counts": dict(Counter(log["status"] for log in logs)),
+        "rough": sum(log["mse_fitted"] is not None and not log["mse_fitted"] <= ROUGH for log in logs),
         "units": _units(logs, series),
         "drifts": _drifts(series),
         "outliers": _outliers(series),
