@@ -14,7 +14,7 @@ from quadid.report.figures import trace
 from quadid.report.health_page import change_words
 from quadid.report.page import number
 from quadid.report.page import unit as unit_text
-from quadid.report.verdict import Level, Verdict, percent
+from quadid.report.verdict import ROUGH, Level, Verdict, percent
 
 JsonDict = Mapping[str, Any]
 
@@ -52,7 +52,9 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
     total, done = sum(counts.values()), counts.get("done", 0)
     last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
     changed = [row for row in last.values() if row["verdict"] != "unchanged"]
-    level: Level = "good" if done == total and not changed else "fair" if done >= 0.5 * total else "poor"
+    rough = summary["rough"]
+    fit = done - rough
+    level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
     headline = f"{done} of {total} logs gave parameters."
     words = (
         ("refused", "cannot support an answer"),
@@ -61,12 +63,14 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
     )
     details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
     details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+    if rough:
+        details.append(f"{rough} miss much of their flight (error above {ROUGH:g} noise variances): not to be used.")
     details += [
         f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
         f"in {d['days']:.3g} days."
         for d in summary["drifts"][:3]
     ]
-    steps = []
+    steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
     if changed:
         steps.append(f"How sure that is: `quadid health {changed[0]['log']}` against its first flights.")
     if summary["drifts"]:

@@ -34,8 +34,9 @@ def summarise(logs: Sequence[JsonDict], parameters: Sequence[JsonDict], findings
         findings: rows with log, effect, confident, parameter, value.
 
     Returns:
-        ``counts`` by status, ``rough`` (logs that the simulation misses much of), ``units`` (each with its parameters: median, spread, flights), ``drifts``, ``outliers``,
-        ``common`` (findings by number of flights), ``reasons`` (failures by reason).
+        ``counts`` by status, ``rough`` (logs that the simulation misses much of), ``units`` (each with its parameters:
+        median, spread, flights), ``drifts``, ``outliers``, ``common`` (findings by number of flights), ``reasons``
+        (failures by reason).
     """
     by_name = {log["name"]: log for log in logs}
     series = _series(by_name, parameters)

@@ -109,3 +109,13 @@ def test_every_log_is_named_with_its_error_and_whose_date_it_has() -> None:
     assert "clock in the log" in table["a/0.csv"][2]
     assert "date of the file" in table["a/1.csv"][2]
     assert table["a/1.csv"][3] == "unreadable"
+
+
+def test_a_fleet_of_bad_fits_is_not_green() -> None:
+    logs, parameters = rows({"a": np.ones(3)})
+    assert fleet_verdict(summarise(logs, parameters, [])).level == "good"
+    for log in logs:
+        log["mse_fitted"] = 50.0
+    verdict = fleet_verdict(summarise(logs, parameters, []))
+    assert verdict.level == "poor"
+    assert "3 miss much of their flight" in verdict.details[0]
