@@ -76,7 +76,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: peers health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: autopilot peers health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -88,6 +88,9 @@ foreign: venv ## vehicles and logs of others: truth, answers, predictions beside
 
 peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.tools' recipe, Kalman filters; hours)
 	$(STUDY) studies.peers --out docs/results
+autopilot: venv ## ArduCopter's and others' flights through the online session, replayed and live in real time (half an hour)
+	$(STUDY) studies.autopilot --out docs/results
+	$(STUDY) studies.autopilot --live --out docs/results
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results

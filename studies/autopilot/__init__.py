@@ -1,0 +1,1 @@
+"""Recorded flights of autopilots through the online session: estimates, alarms and waits."""
