@@ -1,8 +1,7 @@
 """The diagnosis of a flight while it lasts: now and then `quadid.diagnose` on the last minute, beside the fits.
 
-It takes seconds of a processor, so the session does not wait for it: what it found is used once a fixed time of data
-has passed, later only when it took longer than that.  Where the model misses the flight, the first `SOON` seconds are
-diagnosed at once, because nothing can be published until the cause is known.
+It takes seconds of a processor, so the session does not wait for it: what it found is told once a fixed time of data
+has passed, later only when it took longer than that.
 """
 
 from __future__ import annotations
@@ -24,10 +23,6 @@ DIAGNOSED_SECONDS = 60.0
 """Flight that a diagnosis looks at [s]."""
 ANSWER_AFTER = 30.0
 """Time of the data between question and published answer [s]."""
-SOON = 20.0
-"""The same, and the least flight to look at, where the model misses the flight [s]."""
-EXPLAINED = 0.8
-"""What is found must account for this share of what the model missed on unseen blocks, else the model stays."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +59,10 @@ class DiagnosisReply(JobReply):
     Attributes:
         findings: most important first.
         verdict: of `quadid.diagnose`.
-        extended: the vehicle with its effects, whether confident or not; None where they do not account for
-            `EXPLAINED` of what was missed.
     """
 
     findings: tuple[OnlineFinding, ...] = ()
     verdict: str = ""
-    extended: Vehicle | None = None
 
 
 def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
@@ -89,10 +81,7 @@ def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
             {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
             tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
         ))  # fmt: skip
-    left, before = result.validation.extended - 1.0, result.validation.nominal - 1.0
-    explained = bool(findings) and left <= (1.0 - EXPLAINED) * before
-    extended = Vehicle.from_yaml(result.vehicle_yaml) if explained else None
-    return DiagnosisReply(request.number, "", tuple(findings), result.verdict.value, extended)
+    return DiagnosisReply(request.number, "", tuple(findings), result.verdict.value)
 
 
 class BackgroundDiagnosis:
@@ -105,26 +94,23 @@ class BackgroundDiagnosis:
         self._reply: DiagnosisReply | None = None
         self._last = -math.inf
         self._told: DiagnosisReply | None = None
-        self._wait = ANSWER_AFTER
-        self.outcome = ""
 
-    def ask(self, number: int, tick: float, since: float, missed: bool) -> DiagnosisRequest | None:
+    def ask(self, number: int, tick: float, since: float) -> DiagnosisRequest | None:
         """The next question, if it is time for one.
 
         Args:
             number: of the job.
             tick: now [s].
             since: data before this belong to another vehicle [s].
-            missed: the model misses the flight, and nothing is known of the cause.
         """
-        every, least = (SOON, SOON) if missed else (self._every, DIAGNOSED_SECONDS)
         start = max(tick - DIAGNOSED_SECONDS, since)
-        if not self._every or self._asked is not None or tick - self._last < every or tick - start < least:
+        early = tick - self._last < self._every or tick - start < DIAGNOSED_SECONDS
+        if not self._every or self._asked is not None or early:
             return None
         cut = self._store.cut(start, tick)
         if cut.reason or cut.seconds < COMPLETE * (tick - start):
             return None
-        self._last, self._wait = tick, SOON if missed else ANSWER_AFTER
+        self._last = tick
         self._asked = DiagnosisRequest(number, self._vehicle, cut.windows, start, tick, self._seed)
         return self._asked
 
@@ -141,12 +127,11 @@ class BackgroundDiagnosis:
             since: an answer about data from before this is no longer true [s].
         """
         asked, reply = self._asked, self._reply
-        if asked is None or reply is None or tick < asked.stop + self._wait:
+        if asked is None or reply is None or tick < asked.stop + ANSWER_AFTER:
             return None
         self._asked = self._reply = None
         if asked.start < since:
             return None
-        self.outcome = reply.problem or f"the diagnosis says {reply.verdict}, and does not account for it"
         return asked, reply
 
     def news(self, asked: DiagnosisRequest, reply: DiagnosisReply, stamp: Callable[[float], float]) -> Diagnosed | None:
@@ -162,14 +147,6 @@ class BackgroundDiagnosis:
         self._told = reply
         findings = tuple(_stamped(f, stamp) for f in reply.findings)
         return Diagnosed(stamp(asked.stop), stamp(asked.start), stamp(asked.stop), findings, reply.verdict)
-
-    def waits(self, tick: float, since: float) -> str:
-        """Why the cause of a misfit is not known yet."""
-        if self._asked is not None:
-            return f"the diagnosis of {self._asked.stop - self._asked.start:.0f} s of flight is running"
-        if self.outcome:
-            return self.outcome
-        return f"waits for a diagnosis: {max(tick - since, 0.0):.0f} of {SOON:.0f} s of flight"
 
 
 def _stamped(finding: OnlineFinding, stamp: Callable[[float], float]) -> OnlineFinding:

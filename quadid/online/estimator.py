@@ -12,13 +12,13 @@ from quadid.chi_square import exceeded
 from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
-from quadid.model.layout import Layout
+from quadid.model.layout import B, Layout
 from quadid.online.fusion import DRIFT, Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case
-from quadid.online.model_vehicle import ThrustModel, secant_share
+from quadid.online.model_vehicle import ThrustModel
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
-from quadid.online.window_fit import FitReply, FitRequest, LackOfFit, prior_of
+from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -47,9 +47,9 @@ class Estimator:
 
     Attributes:
         vehicle: of the vehicle file.
-        model: the same with what a diagnosis found; windows are fitted with it.
+        model: the same, its bare guesses moved by the first fit with effects; windows are fitted with it.
+        flexible: every effect that moves the vehicle is fitted along, as the vehicle file's model misses the flight.
         fusion: the fused windows.
-        lack: what effects outside the model would explain, of all windows that were looked at.
         misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
         theta: full parameter vector, the best at hand.
         learned: whether `theta` rests on data.
@@ -59,18 +59,17 @@ class Estimator:
         input_hash: SHA-256 over seed and windows learned from.
     """
 
-    def __init__(self, vehicle: Vehicle, memory: float, seed: int, looks: bool = True) -> None:
-        """Starts from the vehicle file; `looks`: what the model lacks is looked for, and held against it till found."""
-        self._looks = looks
+    def __init__(self, vehicle: Vehicle, memory: float, seed: int) -> None:
+        """Starts from the vehicle file."""
         self.vehicle, self._memory, self._seed = vehicle, memory, seed
         self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
         self._asked: tuple[Window, ...] = ()
-        self.take_model(vehicle)
+        self.take_model(vehicle, flexible=False)
 
-    def take_model(self, model: Vehicle) -> None:
+    def take_model(self, model: Vehicle, flexible: bool) -> None:
         """Fits later windows with `model`, whose parameters are first guesses; nothing else is kept."""
-        self.model = model
+        self.model, self.flexible = model, flexible
         self._layout = Layout(model)
         self._initial = self._layout.initial(model)
         self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
@@ -80,18 +79,8 @@ class Estimator:
         self._noise: NoiseModel | None = None
         self._pool = 0
         self.theta = self._initial
-        self.misfit, self.lack = np.full(6, np.nan), LackOfFit()
+        self.misfit = np.full(6, np.nan)
         self.forget()
-
-    @property
-    def extended(self) -> bool:
-        """Whether the model is more than the vehicle file."""
-        return self.model is not self.vehicle
-
-    @property
-    def misses(self) -> bool:
-        """Whether the model misses what effects of the catalogue would explain."""
-        return self._looks and self.lack.significant
 
     @property
     def _scatter(self) -> float:
@@ -100,7 +89,7 @@ class Estimator:
 
     @property
     def _yaw_missed(self) -> bool:
-        return self.misses or bool(self.misfit.max() > YAW_MISFIT)
+        return bool(self.misfit.max() > YAW_MISFIT)
 
     @property
     def thrust(self) -> ThrustModel:
@@ -153,7 +142,8 @@ class Estimator:
         self._asked = windows
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
-            number, self.model, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure
+            number, self.model, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure,
+            self.flexible,
         )  # fmt: skip
 
     def take(self, reply: FitReply, trusted: bool) -> None:
@@ -164,7 +154,7 @@ class Estimator:
             return
         self._pool_noise(reply)
         if reply.misfit is not None:
-            self.misfit, self.lack = reply.misfit, self.lack + (reply.lack or LackOfFit())
+            self.misfit = reply.misfit
             self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
         for window in self._asked:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
@@ -177,7 +167,15 @@ class Estimator:
         self._search = False
         fused = self.fusion.estimate()
         assert fused is not None
-        self.theta, self.learned = self._free.placed(self._initial, fused.z), True
+        best = reply.theta if reply.excited or not self.learned else self.theta
+        self.theta, self.learned = self._free.placed(best, fused.z), True
+        self.theta[B] = self._tangent(self.theta)
+
+    def _tangent(self, theta: FloatArray) -> float:
+        """The b of the thrust curve in `theta`, whose b is that at hover unless the vehicle file knows the curve."""
+        if "thrust_curve" in self.vehicle.effects:
+            return float(theta[B])
+        return ThrustModel(self._layout, theta).tangent(float(theta[B]), self.vehicle.mass * GRAVITY)
 
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
@@ -201,7 +199,6 @@ class Estimator:
         if fused is None:
             return None
         theta = self._free.placed(self._initial, fused.z)
-        theta[0] *= secant_share(self.vehicle, self.model, self._layout, theta)
         covariance = fused.covariance
         if self._yaw_missed:
             theta, covariance = self._without_yaw(theta, covariance)
@@ -231,8 +228,6 @@ class Estimator:
             if p.name in NOMINAL_NAMES:
                 place = self._layout.entry(p.name).index
                 theta[place] = self.theta[place] if p.status is Status.PRIOR_DOMINATED else p.value
-        if known is not None:
-            theta[0] /= secant_share(self.vehicle, self.model, self._layout, self.theta)
         return self._free.scaled(theta[self._free.index])
 
     def case(

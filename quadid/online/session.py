@@ -15,7 +15,6 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -83,7 +82,7 @@ class Session:
         self._change_supervisor = ChangeSupervisor(vehicle, self._store)
         self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
         self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
-        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed, self.settings.diagnose > 0.0)
+        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
         self._supervisor = Supervisor(
             self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency
         )
@@ -91,7 +90,6 @@ class Session:
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
         self._land: Callable[[Any], Iterator[None]] = iter
-        self._refits = deque[float]()
         self._outdated = 0
         self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
         self._work: Iterator[None] | None = None
@@ -129,7 +127,6 @@ class Session:
         answer = self.active_set.roll_back(self._outbox.stamp(self._now), by)
         if answer.done:
             self._outdated, self._work = self._number, None
-            self._refits.clear()
             self._change_supervisor.restart()
             self._supervisor.relearn(self._now, f"rolled back by {by}")
             self._outbox.act(*answer.actions)
@@ -157,7 +154,7 @@ class Session:
         """Whether there is a piece of work that waits for nothing."""
         if self._work is None and self._waiting is not None:
             return self._reply is not None
-        return self._work is not None or bool(self._refits) or self._tick_due or self.resampler.busy
+        return self._work is not None or self._tick_due or self.resampler.busy
 
     def poll(self, most: int | None = None) -> list[Action]:
         """Works through what has arrived and returns what to do, in order.
@@ -211,8 +208,6 @@ class Session:
         if self._work is None:
             if self._waiting is not None:
                 self._work = self._apply()
-            elif self._refits:
-                self._work = self._fit(self._refits.popleft())
             elif self._tick_due:
                 tick, self._tick_at = self._tick_at, self._tick_at + self._tick
                 self._work = self._at(tick)
@@ -227,7 +222,6 @@ class Session:
         if rows.fresh:
             first = float(rows.t[0])
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
-            self._refits.clear()
             self._supervisor.interrupted(first)
             self._consistency.restart()
             self._change_supervisor.restart()
@@ -248,36 +242,26 @@ class Session:
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
             self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
         self._health.look(tick)
-        if self._study(tick):
-            return
+        self._study(tick)
         yield
         if self._change_supervisor.seen is not None:
             self._explain(tick)
         elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
             yield from self._fit(tick)
 
-    def _study(self, tick: float) -> bool:
-        """Uses what a diagnosis brought, and asks for the next one when the vehicle is known and moves.
-
-        Returns:
-            The model was extended, and what was flown since is fitted again.
-        """
+    def _study(self, tick: float) -> None:
+        """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
         estimator, supervisor = self._estimator, self._supervisor
         answered = self._diagnosis.answer(tick, supervisor.learn_from)
-        first = estimator.start
-        if answered is not None and supervisor.diagnosed(tick, *answered, self._diagnosis):
-            count = math.floor((tick - first + _EPS) / self.settings.window)
-            self._refits.extend(tick - k * self.settings.window for k in reversed(range(max(count, 1))))
-            return True
-        supervisor.waits = self._diagnosis.waits(tick, first)
+        if answered is not None:
+            supervisor.diagnosed(*answered, self._diagnosis)
         moving = estimator.learned and is_excited(estimator.excitation)
         if moving and self._change_supervisor.seen is None and supervisor.quality == Quality():
-            since = max(supervisor.learn_from, first)
-            request = self._diagnosis.ask(self._number + 1, tick, since, bool(supervisor.unexplained))
+            since = max(supervisor.learn_from, estimator.start)
+            request = self._diagnosis.ask(self._number + 1, tick, since)
             if request is not None:
                 self._number = request.number
                 self._outbox.act(request)
-        return False
 
     def _explain(self, tick: float) -> None:
         assert self._change_supervisor.seen is not None
@@ -311,7 +295,7 @@ class Session:
         self._last_fit = tick
         start = max(start, tick - self.settings.window)
         request = self._estimator.request(self._number + 1, self._cut.windows, start, tick)
-        self._await(request, partial(self._supervisor.fitted, request, last=not self._refits))
+        self._await(request, partial(self._supervisor.fitted, request))
         self._outbox.act(request)
 
     def _incomplete(self, tick: float, start: float) -> None:
@@ -329,7 +313,6 @@ class Session:
         yield from self._land(reply)
 
     def _changed(self, request: ChangeRequest, reply: ChangeReply) -> Iterator[None]:
-        self._refits.clear()
         self._change_supervisor.restart()
         self._supervisor.changed(request, reply)
         yield

@@ -11,7 +11,6 @@ from quadid.online.consistency import ALLOWED, Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
-from quadid.online.model_vehicle import extended
 from quadid.online.outbox import Outbox
 from quadid.online.quality import Quality
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
@@ -28,7 +27,6 @@ class Supervisor:
         learn_from: nothing before this time is learned from [s].
         quality: of the newest window.
         fits, rejected: fits done, and those the gate refused.
-        waits: why the cause of a misfit is not known yet.
     """
 
     def __init__(
@@ -40,7 +38,6 @@ class Supervisor:
         self.learn_from = -math.inf
         self.quality = Quality()
         self.fits = self.rejected = 0
-        self.waits = ""
         self._odd_since: float | None = None
         self._scale = ""
 
@@ -79,39 +76,18 @@ class Supervisor:
 
     @property
     def unexplained(self) -> str:
-        """What speaks against the model: a sensor's scale, or what it misses for a cause not known; empty: nothing."""
-        if self._scale:
-            return f"the diagnosis stands: {self._scale}"
-        if self._estimator.extended or not self._estimator.misses:
-            return ""
-        share = self._estimator.lack.share
-        return f"effects that the model lacks explain {share:.0%} of its residuals: {self.waits}"
+        """What speaks against the model: a sensor's scale that a diagnosis found; empty: nothing."""
+        return f"the diagnosis stands: {self._scale}" if self._scale else ""
 
-    def diagnosed(
-        self, tick: float, asked: DiagnosisRequest, reply: DiagnosisReply, diagnosis: BackgroundDiagnosis
-    ) -> bool:
-        """Publishes a diagnosis; extends the model by it where the present one misses the flight.
-
-        Returns:
-            The model was extended: what was flown since has to be fitted again.
-        """
+    def diagnosed(self, asked: DiagnosisRequest, reply: DiagnosisReply, diagnosis: BackgroundDiagnosis) -> None:
+        """Publishes what is new in a diagnosis; a sensor's wrong scale stops publishing."""
         self._scale = next((f.evidence for f in reply.findings if f.confident and _wrong_scale(f)), "")
         told = diagnosis.news(asked, reply, self._outbox.stamp)
         if told is not None:
             self._outbox.act(told)
-        if not self._estimator.misses or reply.extended is None:
-            return False
-        model = extended(self._estimator.vehicle, reply.extended)
-        self._estimator.take_model(model)
-        self._odd_since = None
-        names = ", ".join(n for n in model.effects if n not in self._estimator.vehicle.effects)
-        self._outbox.say(
-            tick, "info", "model", f"the model takes in {names}; the flight so far is fitted again with it"
-        )
-        return True
 
-    def fitted(self, request: FitRequest, reply: FitReply, last: bool = True) -> Iterator[None]:
-        """Takes in the fit of a window, piece by piece; the gate is asked after the `last` one only."""
+    def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
+        """Takes in the fit of a window, piece by piece."""
         if reply.problem:
             self._outbox.note(request.stop, Phase.FAILED, reply.problem)
             return
@@ -125,23 +101,28 @@ class Supervisor:
             # Information adds up: one such window would spoil every estimate after it.
             self._outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
+        if reply.flexible and reply.vehicle is not None and not self._estimator.flexible:
+            self._join(request, reply)
         if not self._estimator.fusion.judge(reply.estimate).agrees:
             self._odd(request, reply)
             return
         self._odd_since = None
         self._estimator.take(reply, trusted=True)
         yield
-        if last and not self._taken_back(reply):
+        if not self._taken_back(reply):
             self._judge(request, reply)
 
-    def _odd(self, request: FitRequest, reply: FitReply) -> None:
-        """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed.
+    def _join(self, request: FitRequest, reply: FitReply) -> None:
+        """From now on effects are fitted along; what was learned without them is forgotten."""
+        assert reply.vehicle is not None
+        self._estimator.take_model(reply.vehicle, flexible=True)
+        self._odd_since = None
+        share = f"{reply.lack.share:.0%} of what" if reply.lack is not None else "what"
+        text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"
+        self._outbox.say(request.stop, "info", "model", text)
 
-        Windows of a model that misses the flight disagree without any change.
-        """
-        if self.unexplained:
-            self._outbox.note(request.stop, Phase.CANDIDATE, self.unexplained)
-            return
+    def _odd(self, request: FitRequest, reply: FitReply) -> None:
+        """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed."""
         if self._odd_since is None:
             self._odd_since = request.stop
         self._outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")

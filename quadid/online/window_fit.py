@@ -8,19 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from quadid.effects import effect_of
+from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import Polished, Prior, polish, robust_weights
 from quadid.identify.global_search import swarm_search
-from quadid.identify.noise_estimation import flexible_names, residual_noise, reweighted_fit
+from quadid.identify.noise_estimation import residual_noise, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
+from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
+from quadid.online.model_vehicle import moved
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -50,8 +52,6 @@ LACKING = 6.0
 """... and the standard deviations by which it must exceed what noise gives."""
 FEWEST_SEGMENTS = 5
 """Fewer segments do not give the noise well enough to say what is more than noise."""
-EFFECT_WIDTH = 3.0
-"""Prior width of an effect in the score test, in its typical size."""
 INERTIAL = (0, 1, 2, 6, 7, 8)
 """Residual channels of gyro and accelerometer: their noise is the sensor's own, no estimator's."""
 
@@ -69,6 +69,7 @@ class FitRequest(Job):
         search: run the swarm first: nothing is known yet, or the vehicle has changed.
         seed: of the swarm.
         measure: measure the sensor noise in this window too.
+        flexible: fit every effect that moves the vehicle along.
     """
 
     vehicle: Vehicle
@@ -80,6 +81,7 @@ class FitRequest(Job):
     search: bool
     seed: int
     measure: bool = False
+    flexible: bool = False
 
     def run(self) -> FitReply:
         """Fits the window."""
@@ -92,7 +94,7 @@ class FitRequest(Job):
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """What the effects of the catalogue would take from the residuals, all freed at once; windows add up.
+    """What the effects of the catalogue would take from the residuals, all freed at once.
 
     Attributes:
         drop: of the deviance, in units of the residuals' own level.
@@ -103,10 +105,6 @@ class LackOfFit:
     drop: float = 0.0
     freedom: int = 0
     rows: float = 0.0
-
-    def __add__(self, other: LackOfFit) -> LackOfFit:
-        """That of both windows."""
-        return LackOfFit(self.drop + other.drop, self.freedom + other.freedom, self.rows + other.rows)
 
     @property
     def share(self) -> float:
@@ -134,7 +132,9 @@ class FitReply(JobReply):
         measured: noise measured in this window, when that was asked for.
         misfit: variance of gyro (x, y, z) and accelerometer residuals over that of the sensors' own noise, shape (6,):
             1 where the model misses nothing; with `measured`, or where noise was found anew.
-        lack: what effects of the catalogue would explain; with `misfit`.
+        lack: what effects of the catalogue would explain; with `misfit`, where they were not fitted along.
+        flexible: every effect that moves the vehicle was fitted along.
+        vehicle: what it was fitted with: that of the request, its bare guesses moved where effects joined.
     """
 
     excitation: FloatArray | None = None
@@ -145,6 +145,8 @@ class FitReply(JobReply):
     measured: NoiseModel | None = None
     misfit: FloatArray | None = None
     lack: LackOfFit | None = None
+    flexible: bool = False
+    vehicle: Vehicle | None = None
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
@@ -177,6 +179,8 @@ def _fit(request: FitRequest) -> FitReply:
     drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)
     if not is_excited(bounds) and not drowned:
         return FitReply(request.number, excitation=bounds)
+    if request.flexible:
+        return _flexible(request, theta, None if drowned else noise)
     sensor = None
     if request.search or noise is None or drowned:
         theta, sensor = _search(replace(request, noise=None) if drowned else request, layout)
@@ -200,24 +204,46 @@ def _fit(request: FitRequest) -> FitReply:
     reply = FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured)
     if sensor is None:
         return reply
-    misfit = ((measured or noise).variance / sensor.variance)[list(INERTIAL)]
-    return replace(reply, misfit=misfit, lack=_lack_of_fit(shooting, result, layout))
+    lack = _lack_of_fit(shooting, result)
+    if lack.significant:
+        joined = replace(request, vehicle=moved(request.vehicle, result.theta))
+        return replace(_flexible(joined, result.theta, None), lack=lack)
+    return replace(reply, misfit=_share_of(measured or noise, sensor), lack=lack)
 
 
-def _moves(name: str) -> bool:
-    effect = effect_of(name)
-    return effect is None or effect.acts != "sensor" or effect.name == "imu_lag"
+def _share_of(noise: NoiseModel, sensor: NoiseModel) -> FloatArray:
+    return np.asarray((noise.variance / sensor.variance)[list(INERTIAL)])
 
 
-def _lack_of_fit(problem: Shooting, result: Polished, layout: Layout) -> LackOfFit:
-    """Score test of everything that moves the vehicle, and of the IMU filter, freed at once.
+def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) -> FitReply:
+    """The fit with every effect that moves the vehicle; `noise` None lets it find the noise."""
+    vehicle, layout, nominal = request.vehicle, Layout(request.vehicle), prior_of(request.vehicle)
+    shooting, free, prior, result = flexible_fit(request.windows, vehicle, nominal, theta, noise)
+    if not np.isfinite(result.cost):
+        return request.failed("the simulation diverges at every point tried")
+    estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
+    bounds = bounds_of(estimate.information)
+    reply = FitReply(
+        request.number, "", bounds, is_excited(bounds), estimate, result.theta, shooting.noise, flexible=True,
+        vehicle=vehicle,
+    )  # fmt: skip
+    if not request.measure:
+        return reply
+    measured = residual_noise(shooting, result)
+    short, *_, brief = flexible_fit(request.windows, vehicle, nominal, result.theta, measured, SWARM_SECONDS)
+    return replace(reply, measured=measured, misfit=_share_of(measured, residual_noise(short, brief)))
+
+
+def _lack_of_fit(problem: Shooting, result: Polished) -> LackOfFit:
+    """Score test of the flexible part of everything that moves the vehicle, and of the IMU filter, freed at once.
 
     Errors of sensors are left out: with them a slow error of the AHRS would look like a lack.
     """
     if problem.count < FEWEST_SEGMENTS:
         return LackOfFit()
-    moving = [n for n in flexible_names(layout, problem) if _moves(n)]
-    free = problem.free(moving)
+    rigid = {n for e in EFFECTS.values() for n in (*e.entries, *e.refinements) if n not in e.flexible_entries}
+    rigid |= {n for e in EFFECTS.values() if e.flexible == "never" for n in e.entries}
+    free = problem.free([n for n in moving_names(problem) if n not in rigid])
     lin = problem.linearise(result.theta, free)
     gram, score = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
     weight = np.where(free.is_log, 0.0, 1.0 / EFFECT_WIDTH**2) + 1e-9

@@ -1,0 +1,134 @@
+"""The fit of a window that the vehicle file's model misses: every effect that moves the vehicle is fitted along.
+
+Nothing is selected.  Each effect is held near the vehicle file's value by a few of its typical sizes, and has a value
+of its own in each window: what cannot be told from the parameters widens their intervals instead of bending them.
+Segments are short, because what no effect describes grows with their length.
+
+What is left of a window is a quadratic model in the nominal six, the effects eliminated (Schur complement).  Its b is
+that of thrust b w^2 at hover, which all windows share, unlike the steepness of a curve (`ThrustModel.secant`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.effects import EFFECTS
+from quadid.identify.covariance import score_products
+from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, robust_weights
+from quadid.identify.noise_estimation import residual_noise
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.shooting import Free, Shooting
+from quadid.model.layout import B, Layout
+from quadid.online.fusion import WindowEstimate
+from quadid.online.model_vehicle import ThrustModel
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Window
+
+FloatArray = NDArray[np.float64]
+
+SEGMENT = 0.5
+"""Length of the shooting segments [s]."""
+EFFECT_WIDTH = 3.0
+"""Prior width of an effect, in its typical size."""
+ROUNDS = 4
+"""Fits after which the noise that the fit leaves has settled, where none is known."""
+STEP = 1e-5
+"""Of differences, in scaled parameters."""
+MOVING = ("command", "rotor", "air", "body")
+"""Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
+
+
+def moving_names(problem: Shooting) -> list[str]:
+    """The nominal six and every effect that moves the vehicle and that these data could show."""
+    windows = [r.window for r in problem.rollouts]
+    known = {"readings" if problem.vehicle.command.kind == "rotor_speed" else "commands"}
+    known |= {n for n in ("velocity", "battery") if all(getattr(w, n) is not None for w in windows)}
+    out = list(NOMINAL_NAMES)
+    for effect in EFFECTS.values():
+        moves = (effect.acts in MOVING and not effect.per_log) or effect.name == "imu_lag"
+        seen = known.issuperset(effect.needs) and (effect.flexible != "with_velocity" or problem.has_velocity)
+        if moves and seen and effect.name != "weak_rotor":
+            out += (*effect.entries, *effect.refinements)
+    losses = [n for n in problem.layout.entries if n.startswith("weak_rotor.loss_")]
+    return out + losses[1:]
+
+
+def flexible_prior(nominal: Prior, free: Free, vehicle: Vehicle, layout: Layout) -> Prior:
+    """Prior of everything that is free: `nominal` of the nominal six, effects about the vehicle file's values."""
+    effects = free.index[len(NOMINAL_NAMES) :]
+    mean = np.concatenate([nominal.mean, layout.initial(vehicle)[effects]])
+    return Prior(mean, np.concatenate([nominal.sigma, np.full(len(effects), EFFECT_WIDTH)]))
+
+
+def flexible_fit(
+    windows: Sequence[Window], vehicle: Vehicle, nominal: Prior, theta: FloatArray, noise: NoiseModel | None,
+    seconds: float = SEGMENT,
+) -> tuple[Shooting, Free, Prior, Polished]:  # fmt: skip
+    """Fits everything; the problem with its noise, what is free, its prior, and the optimum.
+
+    Args:
+        windows: data.
+        vehicle: the vehicle.
+        nominal: prior of the nominal six.
+        theta: start, full vector.
+        noise: None lets the fit find it, all structure that remains counted as noise.
+        seconds: length of the segments.
+    """
+    layout = Layout(vehicle)
+    problem = Shooting.cut(windows, vehicle, seconds, noise, layout)
+    free = problem.free(moving_names(problem))
+    prior = flexible_prior(nominal, free, vehicle, layout)
+    result = polish(problem, theta, free, prior, iterations=12)
+    for _ in range(0 if noise is not None else ROUNDS - 1):
+        problem = problem.with_noise(residual_noise(problem, result))
+        result = polish(problem, result.theta, free, prior, iterations=12)
+    if not np.isfinite(result.cost):
+        return problem, free, prior, result
+    robust = problem.with_robust(robust_weights(problem, result.lin))
+    return problem, free, prior, polish(robust, result.theta, free, prior, result.states, iterations=4)
+
+
+def reduced(
+    start: float, stop: float, layout: Layout, vehicle: Vehicle, free: Free, prior: Prior, result: Polished
+) -> WindowEstimate:
+    """What a window says of the nominal six, whatever the effects are; b is that at hover.
+
+    Information counts for less where the scores of segments scatter more than the noise explains (`score_products`).
+    """
+    lin, six = result.lin, len(NOMINAL_NAMES)
+    precision, pull, _ = prior_terms(free, prior, result.theta)
+    gram, score, scores = lin.gram.sum(axis=0), lin.grad.sum(axis=0), lin.grad
+    gram[six:, six:] += np.diag(precision[six:])
+    score[six:] += pull[six:]
+    z = free.scaled(result.theta[free.index])[:six]
+    if "thrust_curve" not in vehicle.effects:
+        z[B], slopes = _at_hover(layout, vehicle.mass * GRAVITY, free, result.theta)
+        back = np.eye(len(score))
+        back[B] = -slopes / slopes[B]
+        back[B, B] = 1.0 / slopes[B]
+        gram, score, scores = back.T @ gram @ back, back.T @ score, scores @ back
+    gain = np.linalg.solve(gram[six:, six:], gram[six:, :six]).T
+    information = gram[:six, :six] - gain @ gram[six:, :six]
+    step = np.linalg.solve(information, score[:six] - gain @ score[six:])
+    covariance = np.linalg.inv(information)
+    meat, _ = score_products(replace(lin, grad=scores[:, :six] - scores[:, six:] @ gain.T))
+    excess = np.sqrt(np.maximum(np.diag(covariance @ meat @ covariance) / np.diag(covariance), 1.0))
+    information = 0.5 * (information + information.T) / np.outer(excess, excess)
+    return WindowEstimate(
+        start, stop, z, information, information @ step, float(lin.cost.sum()), float(lin.rows.sum())
+    )  # fmt: skip
+
+
+def _at_hover(layout: Layout, weight: float, free: Free, theta: FloatArray) -> tuple[float, FloatArray]:
+    """Logarithm of the b at hover, and its derivatives to all scaled parameters."""
+
+    def value(at: FloatArray) -> float:
+        return float(np.log(at[B] * ThrustModel(layout, at).secant(weight)))
+
+    here, steps = value(theta), STEP * np.eye(len(free.entries))
+    return here, np.array([(value(free.move(theta, step)) - here) / STEP for step in steps])
