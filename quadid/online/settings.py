@@ -15,8 +15,7 @@ class SessionSettings(BaseModel):
         window: flight time that one fit looks at [s].
         refit: time between fits [s].
         memory: time constant of forgetting [s] of excited flight; hover does not make a session forget.
-        diagnose: time between two diagnoses of the last minute [s]; 0: never, and what the model lacks is then not held
-            against its estimates. Sudden changes are looked for anyway.
+        diagnose: time between two diagnoses of the last minute [s]; 0: never. Sudden changes are looked for anyway.
         seed: decides every random number.
         gate: what an estimate must pass.
     """
