@@ -11,14 +11,13 @@ from quadid.workflow.identify import origin_remark, out_of_reach, proven
 from quadid.workflow.logs import Given, settled
 from quadid.workflow.outcome import Outcome
 from quadid.workflow.progress import Advance, silent
-from quadid.workflow.searching import OPTIMIZERS, check_length, search
+from quadid.workflow.searching import check_length
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from quadid.diagnose import Diagnosis
     from quadid.diagnose.pipeline import Workings
-    from quadid.identify.fit import Fit
     from quadid.identify.noise_model import NoiseModel
     from quadid.identify.result import ScoredSet
     from quadid.report.residual_maps import ResidualMap
@@ -166,32 +165,23 @@ def diagnose(
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
     check_length(windows)
     found, workings = diagnose_windows(windows, described, unseen, seed, advance)
-    unreachable = out_of_reach(train)
-    found = _within_reach(found, unreachable)
+    found = _within_reach(found, out_of_reach(train))
     result = found.to_dict()
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
-    # The error without the findings is the one that `quadid identify` states for these flights.
-    nominal = search(
-        OPTIMIZERS[0], windows, described, seed, lambda _, share: advance("nominal fit", share), unreachable
-    )
     sets = [
-        scored(log, role, nominal, workings) for role, part in (("train", train), ("validate", held)) for log in part
+        scored(log, role, described, workings) for role, part in (("train", train), ("validate", held)) for log in part
     ]
-    judged = [s for s in sets if s.role == "validate"] or sets
-    result["validation"] |= {
-        "mse_nominal": max(s.initial.mse for s in judged), "mse_extended": max(s.fitted.mse for s in judged)
-    }  # fmt: skip
     return Diagnosed(result, found, sets, workings.decisive.noise, [*train, *held], described, workings)
 
 
-def scored(log: Log, role: str, nominal: Fit, workings: Workings) -> ScoredSet:
-    """Scores the model without findings, and the one with them, on one log."""
+def scored(log: Log, role: str, vehicle: Vehicle, workings: Workings) -> ScoredSet:
+    """Scores the model without and with the findings on one log."""
     from quadid.identify.result import ScoredSet
     from quadid.identify.score import mse_score
 
-    before = mse_score(log.windows, nominal.vehicle, nominal.theta, nominal.noise)
-    after = mse_score(log.windows, nominal.vehicle, workings.search.model.theta, workings.decisive.noise)
+    models = workings.search.nominal.theta, workings.search.model.theta
+    before, after = (mse_score(log.windows, vehicle, theta, workings.decisive.noise) for theta in models)
     return ScoredSet(log.recording.name, role, before, after)
 
 

@@ -98,9 +98,3 @@ def test_a_file_is_not_proven_on_its_own_flight(flown: tuple[Path, Path, Path]) 
     scored = quadid.score(quadid.load(one, vehicle=fitted))
     assert any("no proof" in warning for warning in scored.warnings)
     assert not quadid.score(quadid.load(other, vehicle=fitted)).warnings
-
-
-def test_identify_and_diagnose_state_one_error(logs: tuple[Path, Path]) -> None:
-    train, unseen = (quadid.load(path, vehicle="pelican") for path in logs)
-    fit, found = quadid.identify(train, validate=unseen, seed=2), quadid.diagnose(train, validate=unseen, seed=2)
-    assert found.result["validation"]["mse_nominal"] == fit.result["sets"][1]["mse"]["fitted"]
