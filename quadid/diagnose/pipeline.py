@@ -30,7 +30,7 @@ from quadid.identify.residual_prediction import POOR, Prediction, learn_predicti
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.model.supply import with_reference_voltage
-from quadid.parameters import NOMINAL_NAMES, Parameter
+from quadid.parameters import NOMINAL_NAMES, Parameter, Status
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -112,7 +112,7 @@ def diagnose(
         report("prediction", 0.0)
         prediction = _prediction(windows, text, validation, warnings)
     result = Diagnosis(
-        verdict, findings, outcome, left, _nominal_parameters(vehicle, search.model), text,
+        verdict, findings, outcome, left, _nominal_parameters(vehicle, search.model, verdict), text,
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)
@@ -132,11 +132,17 @@ def _prediction(
     return out
 
 
-def _nominal_parameters(vehicle: Vehicle, model: Model) -> tuple[Parameter, ...]:
-    """The nominal six beside the findings, as an identification gives them."""
+def _nominal_parameters(vehicle: Vehicle, model: Model, verdict: Verdict) -> tuple[Parameter, ...]:
+    """The nominal six beside the findings, as an identification gives them.
+
+    Where the cause of the error is unknown, so is what it does to them: none is identified.
+    """
     initial = Layout(vehicle).initial(vehicle)
     everything = parameter_set(model.free, model.theta, initial, model.uncertainty)
-    return tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    nominal = (p for p in everything if p.name in NOMINAL_NAMES)
+    if verdict is not Verdict.UNKNOWN:
+        return tuple(nominal)
+    return tuple(replace(p, status=Status.UNRELIABLE) if p.status is Status.IDENTIFIED else p for p in nominal)
 
 
 @dataclass(frozen=True)
