@@ -45,10 +45,14 @@ FAR_ITERATIONS = 10
 """Linearisations of the flexible fit where the nominal one is far off."""
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
-SHARE_TO_NAME = 0.9
-"""Named causes must account for this share of all structure, else the answer is `unknown`."""
+SHARE_TO_NAME = 0.8
+"""Named causes must account for this share of all structure, else the answer is `unknown` …"""
+SHARE_ALONE = 0.9
+"""… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
 LEAST_STRUCTURE = 0.01
-"""Structure below this share of the noise is not worth a word."""
+"""Structure below this share of the noise is not worth a word …"""
+LEAST_OF_EXPLAINED = 1e-3
+"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
 
 
 @dataclass(frozen=True)
@@ -247,11 +251,11 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
         unnamed: deviance that causes which are not what their names say take away; it counts as left.
     """
     explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
-    structure = left.deviance + unnamed
-    structure = structure if structure > LEAST_STRUCTURE * model.rows else 0.0
+    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
+    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:
         return Verdict.EXPLAINED
-    known = explained >= SHARE_TO_NAME * (explained + structure)
-    return Verdict.PARTLY_EXPLAINED if known else Verdict.UNKNOWN
+    share = SHARE_TO_NAME if len(model.effects) > 1 else SHARE_ALONE
+    return Verdict.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Verdict.UNKNOWN
