@@ -10,7 +10,7 @@ import numpy as np
 from quadid.errors import WindowError
 from quadid.identify.answer import final_answer
 from quadid.identify.composite_likelihood import with_second_cut
-from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
+from quadid.identify.covariance import PRIOR_SHARE, Uncertainty, parameter_set, reaches_bound, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, default_prior, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
@@ -225,10 +225,15 @@ def _finish(
 
 def _warnings(free: Free, theta: FloatArray, unc: Uncertainty) -> tuple[str, ...]:
     out = []
-    for e in free.entries:
+    told = unc.from_noise <= PRIOR_SHARE * unc.prior_sigma
+    for e, log, sigma, by_data in zip(free.entries, free.is_log, unc.sigma, told, strict=True):
         value = float(theta[e.index])
         if at_bound(value, e.lower, e.upper):
             out.append(f"{e.name} = {value:.4g} {e.unit} rests on its bound [{e.lower:.4g}, {e.upper:.4g}]")
+        elif log and by_data and reaches_bound(value, float(sigma), e.lower, e.upper):
+            out.append(
+                f"the interval of {e.name} reaches its bound [{e.lower:.4g}, {e.upper:.4g}]: check what is assumed"
+            )
     grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
     if grown:
         out.append(

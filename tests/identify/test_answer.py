@@ -93,3 +93,18 @@ def test_a_value_on_a_bound_is_unreliable() -> None:
     priors = {**guessed(truth).parameters, "b": ParameterPrior(initial=0.6 * b, bounds=(0.5 * b, 0.7 * b))}
     vehicle = PELICAN.model_copy(update={"parameters": priors})
     assert fit([flown(3).window], vehicle, FitOptions(iterations=0)).parameters["b"].status is Status.UNRELIABLE
+
+
+def test_a_value_whose_interval_reaches_its_bound_is_unreliable() -> None:
+    """A bound one standard deviation above the estimate has a say in it."""
+    window = flown(3).window.slice(0, 500)
+    vehicle = PELICAN.model_copy(update={"parameters": guessed(flown(3).truth.parameters).parameters})
+    free = fit([window], vehicle, FitOptions(iterations=0)).parameters["J_xx"]
+    assert free.status is Status.IDENTIFIED
+    high = free.value + free.sigma
+    priors = {**vehicle.parameters, "J_xx": ParameterPrior(initial=0.9 * high, bounds=(0.3 * high, high))}
+    near = fit([window], vehicle.model_copy(update={"parameters": priors}), FitOptions(iterations=0))
+    found = near.parameters["J_xx"]
+    assert not at_bound(found.value, 0.3 * high, high), "the estimate itself lies inside"
+    assert found.status is Status.UNRELIABLE
+    assert any("the interval of J_xx reaches its bound" in text for text in near.warnings)
