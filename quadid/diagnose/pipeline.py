@@ -19,6 +19,7 @@ from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.errors import NotIdentifiableError
+from quadid.identify.answer import possible_moments
 from quadid.identify.covariance import parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
@@ -110,13 +111,15 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
     ]
-    text = extended_vehicle(vehicle, decisive.layout, search.model)
+    parameters, moved = possible_moments(_nominal_parameters(vehicle, search.model, verdict))
+    warnings += [] if moved is None else [moved]
+    text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
     prediction = None
     if search.model.reduced_chi_square > POOR:
         report("prediction", 0.0)
         prediction = _prediction(windows, text, validation, warnings)
     result = Diagnosis(
-        verdict, findings, outcome, left, _nominal_parameters(vehicle, search.model, verdict), text,
+        verdict, findings, outcome, left, parameters, text,
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)

@@ -20,6 +20,8 @@ NEAR = 0.4
 """Additions predicted to gain this share of what the best one did are refitted too …"""
 ALIKE = 0.8
 """… and so are causes that should regain this share of what is lost when another one leaves."""
+MOST_REFITS = 7
+"""Causes refitted on one model in a round: where the model misses much, predictions promise without end."""
 MOST_ROUNDS = 24
 """Moves after which the search ends: where the catalogue lacks the cause, stand-ins take turns for long."""
 
@@ -224,7 +226,8 @@ def _refits(
         lost: deviance that `model` lost when another cause left it, to be gained again.
     """
     gained = 0.0
-    for score, start in sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d[0].drop):
+    drafts = sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d[0].drop)
+    for score, start in drafts[:MOST_REFITS]:
         if lost + score.drop < max(least, near * gained):
             break
         trial = _tried(shooting, model, score, start)

@@ -11,7 +11,7 @@ import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, UNKNOWN, ParameterSet, Status, impossible_inertia
+from quadid.parameters import INERTIAS, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -60,15 +60,29 @@ def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
 
 
 def possible_inertia(fit: Fit) -> Fit:
-    """The fit with guessed moments of inertia moved to where a rigid body can have them beside those identified.
+    """The fit with moments of inertia that a rigid body can have; see `possible_moments`."""
+    parameters, said = possible_moments(tuple(fit.parameters))
+    if said is None:
+        return fit
+    theta, layout = fit.theta.copy(), Layout(fit.vehicle)
+    for p in parameters:
+        theta[layout.entry(p.name).index] = p.value
+    return replace(
+        fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
+        warnings=(*fit.warnings, said),
+    )  # fmt: skip
+
+
+def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter, ...], str | None]:
+    """Parameters with guessed moments of inertia moved to where a rigid body can have them beside those identified.
 
     Each principal moment lies between the difference and the sum of the other two; what breaks that by more than a
-    vehicle file may is moved there.  Where identified ones alone are impossible, the largest is not to be used, and is
-    moved as a guess is.
+    vehicle file may is moved there, and a sentence says so.  Where identified ones alone are impossible, the largest is
+    not to be used, and is moved as a guess is.
     """
-    values = {p.name: p for p in fit.parameters if p.name in INERTIAS}
+    values = {p.name: p for p in parameters if p.name in INERTIAS}
     if len(values) < len(INERTIAS) or impossible_inertia([values[n].value for n in INERTIAS]) is None:
-        return fit
+        return parameters, None
     movable = [n for n in INERTIAS if values[n].status in UNKNOWN]
     if not movable:
         movable = [max(INERTIAS, key=lambda n: values[n].value)]
@@ -78,14 +92,8 @@ def possible_inertia(fit: Fit) -> Fit:
     value = min(max(old.value, abs(one - two)), one + two)
     status = old.status if old.status in UNKNOWN else Status.UNRELIABLE
     moved = replace(old, value=value, status=status, relative_to=None)
-    theta = fit.theta.copy()
-    theta[Layout(fit.vehicle).entry(name).index] = value
     said = (
         f"{name}: moved from {old.value:.4g} to {value:.4g} {old.unit}, because no rigid body has the former beside "
         "the other two moments of inertia"
     )
-    parameters = tuple(moved if p.name == name else p for p in fit.parameters)
-    return replace(
-        fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
-        warnings=(*fit.warnings, said),
-    )  # fmt: skip
+    return tuple(moved if p.name == name else p for p in parameters), said

@@ -8,9 +8,15 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from quadid.diagnose.extended_vehicle import extended_vehicle
 from quadid.diagnose.model import Model, extend
+from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
+from quadid.diagnose.result import Verdict
+from quadid.identify.answer import possible_moments
+from quadid.parameters import Status
+from quadid.vehicle import Vehicle
 from tests.diagnose.hidden import answer, of_class
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
@@ -104,3 +110,20 @@ def test_a_bias_that_changes_is_doubted(follows: str) -> None:
 
 def test_other_findings_are_not_asked_for_constancy() -> None:
     assert doubts_about(clean(), "rate_damping") == {}
+
+
+def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> None:
+    """Where the catalogue lacks the cause, J_zz may run away; the file is still one that every command takes."""
+    problem = clean()
+    theta = problem.nominal.theta.copy()
+    layout, vehicle = problem.shooting.layout, problem.shooting.vehicle
+    theta[layout.entry("J_zz").index] *= 8.0
+    far = replace(problem.nominal, theta=theta)
+    parameters, said = possible_moments(_nominal_parameters(vehicle, far, Verdict.UNKNOWN))
+    assert said is not None
+    assert "J_zz: moved" in said
+    written = Vehicle.from_yaml(extended_vehicle(vehicle, layout, far, parameters))
+    moved = {p.name: p for p in parameters}["J_zz"]
+    assert written.parameters["J_zz"].initial == moved.value
+    assert written.parameters["J_zz"].sigma is None
+    assert moved.status is Status.UNRELIABLE
