@@ -43,7 +43,7 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
         found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []
         headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
-    where = "the diagnosed flight itself" if v.get("on") == HELD_OUT else "unseen flights"
+    where = "held-out blocks of the same flight" if v.get("on") == HELD_OUT else "unseen flights"
     before, after = _short(v["mse_nominal"]), _short(v["mse_extended"])
     change = f"falls from {before} to {after}" if result["findings"] else f"is {before}"
     details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
