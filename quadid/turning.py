@@ -1,4 +1,4 @@
-"""Turns of a body: between two attitudes, and what a gyro adds up to."""
+"""Turns of a body: between two attitudes, of vectors, and what a gyro adds up to."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def integrated(rate: FloatArray, step: float) -> FloatArray:
     level[:, 0] = 1.0
     q = level
     for mean in 0.5 * (rate[1:] + rate[:-1]):
-        q = _product(q, _exp(mean * step))
+        q = product(q, _exp(mean * step))
     return turn(level, q)
 
 
@@ -40,11 +40,24 @@ def down(q: FloatArray) -> FloatArray:
     return np.column_stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
 
 
+def rotated(q: FloatArray, v: FloatArray) -> FloatArray:
+    """Vectors (..., 3) turned by unit quaternions (..., 4), scalar first: body to world, or back with `conjugate`."""
+    u = q[..., 1:]
+    turned = np.cross(u, v)
+    return np.asarray(v + 2.0 * (q[..., :1] * turned + np.cross(u, turned)))
+
+
+def conjugate(q: FloatArray) -> FloatArray:
+    """The turns back, of unit quaternions (..., 4)."""
+    return np.asarray(q * [1.0, -1.0, -1.0, -1.0])
+
+
+def product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Quaternions (n, 4) of the turns `b` seen from the bodies that `a` has turned."""
+    w = a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1)
+    return np.column_stack([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])])
+
+
 def _exp(vector: FloatArray) -> FloatArray:
     half = 0.5 * np.linalg.norm(vector, axis=1)
     return np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector])
-
-
-def _product(a: FloatArray, b: FloatArray) -> FloatArray:
-    w = a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1)
-    return np.column_stack([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])])

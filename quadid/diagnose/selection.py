@@ -213,7 +213,7 @@ def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
 def _refits(
     shooting: Shooting, model: Model, scores: Sequence[Score], least: float, near: float, lost: float = 0.0
 ) -> Iterator[Trial]:
-    """Refits with one cause each, by what it is predicted to gain, until none comes `near` what one did gain.
+    """Refits with one cause each, at most `MOST_REFITS`, until none is predicted to come `near` what one did gain.
 
     A prediction is linear and the effects are not, so what a refit brought counts, not what another one promised.
 

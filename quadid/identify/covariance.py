@@ -115,7 +115,7 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
             if log
             else (value - half * e.typical, value + half * e.typical)
         )
-        status, partner = _status(j, free, unc, value)
+        status, partner = _status(j, free, unc, value, ci)
         out.append(
             Parameter(
                 e.name, e.unit, value, float(sigma[j]) * (value if log else e.typical), float(initial[e.index]),
@@ -127,25 +127,15 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
 
 
-def reaches_bound(value: float, sigma: float, low: float, high: float) -> bool:
-    """Returns whether the 95 % interval of a positive number reaches a bound, which then has a say in the number.
-
-    Args:
-        value: estimate within [low, high], low > 0.
-        sigma: standard deviation of its logarithm.
-        low: lower bound.
-        high: upper bound.
-    """
-    return min(math.log(value / low), math.log(high / value)) < Z95 * sigma
-
-
-def _status(j: int, free: Free, unc: Uncertainty, value: float) -> tuple[Status, str | None]:
+def _status(
+    j: int, free: Free, unc: Uncertainty, value: float, ci: tuple[float, float]
+) -> tuple[Status, str | None]:  # fmt: skip
     sigma, entry = unc.sigma, free.entries[j]
     if at_bound(value, entry.lower, entry.upper):
         return Status.UNRELIABLE, None
     if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j]:
         return Status.PRIOR_DOMINATED, None
-    if free.is_log[j] and reaches_bound(value, sigma[j], entry.lower, entry.upper):
+    if free.is_log[j] and not (entry.lower <= ci[0] and ci[1] <= entry.upper):  # then the bound has a say in the value
         return Status.UNRELIABLE, None
     limit = SPREAD_LIMIT if free.is_log[j] else SPREAD_LIMIT * max(1.0, abs(value) / entry.typical)
     if unc.spread is not None and unc.spread[j] > limit:

@@ -10,7 +10,7 @@ import numpy as np
 from quadid.errors import WindowError
 from quadid.identify.answer import final_answer
 from quadid.identify.composite_likelihood import with_second_cut
-from quadid.identify.covariance import PRIOR_SHARE, Uncertainty, parameter_set, reaches_bound, uncertainty
+from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, default_prior, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
@@ -24,9 +24,8 @@ from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
-from quadid.model.channels import CHANNEL_NAMES
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, Status, at_bound
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -219,21 +218,18 @@ def _finish(
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(
         shooting.vehicle, theta, parameters, shooting.noise, unc, outcome, evaluations,
-        (*doubts, *_warnings(free, theta, unc)),
+        (*doubts, *_warnings(free, parameters, unc)),
     )  # fmt: skip
 
 
-def _warnings(free: Free, theta: FloatArray, unc: Uncertainty) -> tuple[str, ...]:
+def _warnings(free: Free, parameters: ParameterSet, unc: Uncertainty) -> tuple[str, ...]:
     out = []
-    told = unc.from_noise <= PRIOR_SHARE * unc.prior_sigma
-    for e, log, sigma, by_data in zip(free.entries, free.is_log, unc.sigma, told, strict=True):
-        value = float(theta[e.index])
-        if at_bound(value, e.lower, e.upper):
-            out.append(f"{e.name} = {value:.4g} {e.unit} rests on its bound [{e.lower:.4g}, {e.upper:.4g}]")
-        elif log and by_data and reaches_bound(value, float(sigma), e.lower, e.upper):
-            out.append(
-                f"the interval of {e.name} reaches its bound [{e.lower:.4g}, {e.upper:.4g}]: check what is assumed"
-            )
+    for p, log in zip(parameters, free.is_log, strict=True):
+        low, high = p.bounds
+        if at_bound(p.value, low, high):
+            out.append(f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]")
+        elif log and p.status is Status.UNRELIABLE and not (low <= p.ci95[0] and p.ci95[1] <= high):
+            out.append(f"the interval of {p.name} reaches its bound [{low:.4g}, {high:.4g}]: check what is assumed")
     grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
     if grown:
         out.append(
@@ -241,8 +237,3 @@ def _warnings(free: Free, theta: FloatArray, unc: Uncertainty) -> tuple[str, ...
             + "; quadid diagnose names the cause"
         )  # fmt: skip
     return tuple(out)
-
-
-def channel_names(channels: int) -> tuple[str, ...]:
-    """Names of the residual channels in order."""
-    return CHANNEL_NAMES[:channels]

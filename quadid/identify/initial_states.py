@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.turning import rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window
@@ -136,9 +137,7 @@ def dead_reckoning(window: Window) -> FloatArray:
         return np.zeros((n, 3))
     q, f = window.attitude, window.accel
     good = np.isfinite(q).all(axis=1) & np.isfinite(f).all(axis=1)
-    w, v = q[:, :1], q[:, 1:]
-    cross = np.cross(v, f)
-    acceleration = f + 2.0 * (w * cross + np.cross(v, cross)) + np.array([0.0, 0.0, GRAVITY])
+    acceleration = rotated(q, f) + np.array([0.0, 0.0, GRAVITY])
     acceleration[~good] = 0.0
     keep = float(np.exp(-window.dt / LEAK_SECONDS))
     out = window.dt * acceleration

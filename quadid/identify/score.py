@@ -17,6 +17,7 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler
+from quadid.turning import product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -245,12 +246,7 @@ def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     v = np.clip(0.5 * error, -1.0, 1.0)
     w = np.sqrt(np.maximum(1.0 - np.sum(v * v, axis=1), 0.0))
-    simulated = np.column_stack(
-        [
-            q[:, 0] * w - np.sum(q[:, 1:] * v, axis=1),
-            q[:, :1] * v + w[:, None] * q[:, 1:] + np.cross(q[:, 1:], v),
-        ]
-    )
+    simulated = product(q, np.column_stack([w, v]))
     angles, other = euler(q), euler(simulated)
     angles[:, 2] = np.unwrap(angles[:, 2])
     difference = np.remainder(other - angles + np.pi, 2.0 * np.pi) - np.pi

@@ -12,7 +12,7 @@ from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import sample_period
 from quadid.resampling_plan import GAP
-from quadid.turning import turn
+from quadid.turning import conjugate, rotated, turn
 from quadid.vehicle import GRAVITY
 from quadid.window import Channel, Recording
 
@@ -215,7 +215,7 @@ def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
     """Ways in which four numbers may have been meant."""
     return [
         ("as given", q),
-        ("world to body", q * np.array([1.0, -1.0, -1.0, -1.0])),
+        ("world to body", conjugate(q)),
         ("x y z w (scalar last)", q[:, [3, 0, 1, 2]]),
     ]
 
@@ -231,9 +231,7 @@ def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tup
     """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
     q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    w, v = q[:, :1], q[:, 1:]
-    turned = np.cross(v, accel.values)
-    force = accel.values + 2.0 * (w * turned + np.cross(v, turned)) + np.array([0.0, 0.0, GRAVITY])
+    force = rotated(q, accel.values) + np.array([0.0, 0.0, GRAVITY])
     stride = max(1, round(0.2 / sample_period(velocity.t)))
     t, speed = velocity.t[::stride], velocity.values[::stride]
     keep = _usable_steps(t, accel.t) & _usable_steps(t, attitude.t)

@@ -72,7 +72,7 @@ class Case:
         baseline: the set from which creeping is measured.
         approval: auto or manual, now.
         age: time since the data that the set in force rests on [s].
-        unexplained: what the model misses and why it is not known yet, or empty.
+        unexplained: what speaks against the model: a sensor's scale that a diagnosis found, or empty.
         unproven: what is still to be known of the sensors, or empty.
         stated: value and standard deviation of the parameters that the vehicle file claims to know.
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard

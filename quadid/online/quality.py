@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from quadid.online.model_vehicle import ThrustModel
 from quadid.resample import median
 from quadid.saturation import at_limit
+from quadid.turning import turn
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -106,8 +107,7 @@ def _rate_ratio(window: Window) -> float | None:
     if window.attitude is None or window.gyro is None:
         return None
     q = window.attitude
-    step = np.abs(np.einsum("ij,ij->i", q[1:], q[:-1]))
-    rate = 2.0 * np.arccos(np.clip(step, 0.0, 1.0)) / window.dt
+    rate = np.linalg.norm(turn(q[:-1], q[1:]), axis=1) / window.dt
     size = np.linalg.norm(window.gyro[:-1], axis=1)
     good = np.isfinite(rate) & np.isfinite(size)
     if np.count_nonzero(good) < 50 or median(rate[good]) < 0.05:

@@ -16,6 +16,7 @@ from quadid.online.quality import Quality
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
 
 _EPS = 1e-6
 
@@ -101,8 +102,8 @@ class Supervisor:
             # Information adds up: one such window would spoil every estimate after it.
             self._outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
-        if reply.flexible and reply.vehicle is not None and not self._estimator.flexible:
-            self._join(request, reply)
+        if reply.vehicle is not None and not self._estimator.flexible:
+            self._join(request, reply, reply.vehicle)
         if not self._estimator.fusion.judge(reply.estimate).agrees:
             self._odd(request, reply)
             return
@@ -112,10 +113,9 @@ class Supervisor:
         if not self._taken_back(reply):
             self._judge(request, reply)
 
-    def _join(self, request: FitRequest, reply: FitReply) -> None:
+    def _join(self, request: FitRequest, reply: FitReply, model: Vehicle) -> None:
         """From now on effects are fitted along; what was learned without them is forgotten."""
-        assert reply.vehicle is not None
-        self._estimator.take_model(reply.vehicle, flexible=True)
+        self._estimator.take_model(model, flexible=True)
         self._odd_since = None
         share = f"{reply.lack.share:.0%} of what" if reply.lack is not None else "what"
         text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"

@@ -133,8 +133,8 @@ class FitReply(JobReply):
         misfit: variance of gyro (x, y, z) and accelerometer residuals over that of the sensors' own noise, shape (6,):
             1 where the model misses nothing; with `measured`, or where noise was found anew.
         lack: what effects of the catalogue would explain; with `misfit`, where they were not fitted along.
-        flexible: every effect that moves the vehicle was fitted along.
-        vehicle: what it was fitted with: that of the request, its bare guesses moved where effects joined.
+        vehicle: where every effect that moves the vehicle was fitted along, what it was fitted with: that of the
+            request, its bare guesses moved where effects joined.
     """
 
     excitation: FloatArray | None = None
@@ -145,7 +145,6 @@ class FitReply(JobReply):
     measured: NoiseModel | None = None
     misfit: FloatArray | None = None
     lack: LackOfFit | None = None
-    flexible: bool = False
     vehicle: Vehicle | None = None
 
 
@@ -224,7 +223,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
     bounds = bounds_of(estimate.information)
     reply = FitReply(
-        request.number, "", bounds, is_excited(bounds), estimate, result.theta, shooting.noise, flexible=True,
+        request.number, "", bounds, is_excited(bounds), estimate, result.theta, shooting.noise,
         vehicle=vehicle,
     )  # fmt: skip
     if not request.measure:

@@ -23,6 +23,7 @@ from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
 from quadid.report.figures import trace
+from quadid.turning import conjugate, rotated
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -196,15 +197,9 @@ def _in_the_air(window: Window, rows: NDArray[np.intp], start: FloatArray, n_pre
         pull = rotated(window.attitude[along], window.accel[along]) + [0.0, 0.0, GRAVITY]
         v = (start[:, None] + window.dt * np.cumsum(pull, axis=1))[:, n_pre - 1 :]
     if v is not None:
-        body = rotated(window.attitude[rows] * [1.0, -1.0, -1.0, -1.0], v)
+        body = rotated(conjugate(window.attitude[rows]), v)
         out |= {"v_x": body[..., 0], "v_y": body[..., 1], "v_z": body[..., 2]}
     return out
-
-
-def rotated(q: FloatArray, v: FloatArray) -> FloatArray:
-    """Vectors (..., 3) turned by unit quaternions (..., 4), scalar first."""
-    u = q[..., 1:]
-    return np.asarray(v + 2.0 * np.cross(u, np.cross(u, v) + q[..., :1] * v))
 
 
 def _binned(

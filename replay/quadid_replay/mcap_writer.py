@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError
+from quadid.turning import conjugate, rotated
 from quadid.window import Channel, Recording
 from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.topic_writer import TopicWriter
@@ -168,8 +169,7 @@ def _odometry(writer: TopicWriter, recording: Recording, epoch: int) -> list[_Se
         q = np.column_stack([np.interp(t, attitude.t, c) for c in attitude.values.T])
         q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
         rows[:, 3:7] = q[:, [1, 2, 3, 0]]
-        turned = np.cross(-q[:, 1:], world)
-        world = world + 2.0 * (q[:, :1] * turned + np.cross(-q[:, 1:], turned))
+        world = rotated(conjugate(q), world)
     rows[:, 43:46] = world
     child = "base_link" if attitude is not None else "map"
     return [
