@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -49,8 +50,9 @@ class Decoder:
         return build(unpacker.unpack_from(payload))
 
 
+@cache
 def _layout(kind: Any) -> tuple[bytes, struct.Struct, Callable[[tuple[Any, ...]], Any]]:
-    """Checksum seed, numbers in a payload, and what makes a message of them."""
+    """Checksum seed, numbers in a payload, and what makes a message of them; the same for every log."""
     fields = _tuple_of(kind.msgname, kind.fieldnames)
     message: Any = type(kind.msgname, (fields,), {"get_type": lambda self: kind.msgname})
     takes: list[tuple[int, int, bool]] = []
