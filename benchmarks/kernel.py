@@ -19,17 +19,15 @@ from pathlib import Path
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned, jit, lane_kernel
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SECONDS, RATE, LENGTH = 40, 50, 50
 PEAK_ROUNDS, PEAK_CHAINS, PEAK_DEPTH = 2000, 12, 16

@@ -17,13 +17,12 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, nearest
 from quadid.rotation import write_rotation
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 F = TypeVar("F", bound=Callable[..., object])
 
 

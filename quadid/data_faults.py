@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.saturation import at_limit
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Window
 
 LEAST_COPIES = 0.03
@@ -78,7 +77,7 @@ def _saturated(name: str, unit: str, values: FloatArray) -> list[DataFault]:
     return found
 
 
-def _copied(values: FloatArray) -> NDArray[np.bool_]:
+def _copied(values: FloatArray) -> BoolArray:
     """Which rows, from the second on, equal the row before exactly, shape (n - 1,)."""
     return np.asarray(np.all(values[1:] == values[:-1], axis=1))
 

@@ -11,20 +11,19 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
 from quadid.identify.excitation import excitation
 from quadid.identify.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 
 if TYPE_CHECKING:
     from quadid.identify.global_search import Progress as Advance
     from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 BLOCK = 6.0
 """Length of one movement [s]."""
 PAUSE = 0.5

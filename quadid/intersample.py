@@ -24,16 +24,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.attitude_controller import mixer_matrix
 from quadid.chi_square import exceeded
 from quadid.rotation import euler
-from quadid.types import FloatArray
+from quadid.types import ComplexArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-ComplexArray = NDArray[np.complex128]
 
 STRETCH_SECONDS = 10.0
 """Stretches compared by themselves [s], each half over the one before."""

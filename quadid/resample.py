@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 
 HALF_WIDTH = 4.0
 """Half-width of the low-pass kernel in steps of the new grid."""
@@ -35,7 +34,7 @@ def sample_period(t: FloatArray) -> float:
     return period_of(t[1:] - t[:-1])
 
 
-def measured_rows(t: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+def measured_rows(t: FloatArray, values: FloatArray) -> BoolArray:
     """Rows that were measured, shape (n,); the others were put on straight lines between them before they were logged.
 
     Measured numbers do not lie on a line with both neighbours in every column while they move; where more than
@@ -102,7 +101,7 @@ def split_stretches(t: FloatArray, longest_step: float, breaks: Sequence[float] 
     return [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
-def matching_rows(t: FloatArray, at: FloatArray, step: float) -> NDArray[np.intp] | None:
+def matching_rows(t: FloatArray, at: FloatArray, step: float) -> IndexArray | None:
     """Returns the index of the sample at each time of `at`, or None unless each has one within `COINCIDENT` steps."""
     if len(t) == 0:
         return None
@@ -228,7 +227,7 @@ def lowpass_span(t: FloatArray, step: float, held: bool) -> tuple[float, float]:
     return float(t[0]) + HALF_WIDTH * step, float(t[-1]) + tail - HALF_WIDTH * step
 
 
-def fresh_rows(values: FloatArray) -> NDArray[np.intp]:
+def fresh_rows(values: FloatArray) -> IndexArray:
     """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
 
     A slow estimate written at a fast rate is a staircase, half a step late when read as instants.  A reading counts as

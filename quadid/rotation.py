@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @nb.njit(cache=True, inline="always")

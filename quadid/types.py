@@ -1,4 +1,4 @@
-"""Types that every room shares."""
+"""Types that every room shares. Shape and unit stand where they are used."""
 
 from __future__ import annotations
 
@@ -8,4 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
-"""Numbers in double precision; shape and unit stand where it is used."""
+ComplexArray: TypeAlias = NDArray[np.complex128]
+BoolArray: TypeAlias = NDArray[np.bool_]
+IntArray: TypeAlias = NDArray[np.int64]
+"""Numbers kept as such, as in a log or a file."""
+IndexArray: TypeAlias = NDArray[np.intp]
+"""Places in another array."""

@@ -19,18 +19,17 @@ from typing import Any, NamedTuple
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
 from quadid.identify.fit import FitOptions, fit
 from quadid.intersample import find_feedback
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from studies.cases import windows
 from studies.page import put_section
 
-FloatArray = NDArray[np.float64]
 INSIDE = 1.96
 """Standard deviations to either side that hold the truth in 95 of 100 cases."""
 

@@ -16,13 +16,13 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight import TruthParameters, draw_truth, fly
 from quadid.flight.airframe import Oddity
 from quadid.flight.setup import Setup, prepare
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from studies.page import put_section
 from studies.tracking import (
@@ -39,7 +39,6 @@ from studies.tracking import (
 )
 from studies.truth import poor_guess
 
-FloatArray = NDArray[np.float64]
 CRAFT = Vehicle.shipped("pelican")
 SECONDS, SETTLE = 14.0, 2.0
 FLIGHT = 40.0

@@ -17,7 +17,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.online.driving import drive, samples
 from quadid.flight import fly
@@ -32,7 +31,6 @@ from studies.page import put_section
 from studies.tracking import CONTROL, EDGE, Known, reference
 from studies.truth import poor_guess
 
-FloatArray = NDArray[np.float64]
 FACTORS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 FAR = 1.0
 """A flight that is this far off its path on average [m] counts as lost."""

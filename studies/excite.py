@@ -18,7 +18,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.experiment import Limits, Proposal, Simulator, propose
@@ -27,13 +26,13 @@ from quadid.identify.fit import FitOptions, fit
 from quadid.identify.optimal_input import halfwidths
 from quadid.identify.result import fitted_vehicle
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from quadid.workflow.excite import knowledge
 from studies.page import put_section
 from studies.truth import poor_guess
 
-FloatArray = NDArray[np.float64]
 LIMITS = Limits(math.radians(25.0), math.radians(150.0))
 CRAFT = Vehicle.shipped("pelican")
 

@@ -22,7 +22,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.baselines.optimisers import NAMES, minimise
 from quadid.flight import draw_truth, fly
@@ -31,11 +30,10 @@ from quadid.model.layout import Layout
 from quadid.model.rollout import NUMBERS, Rollout
 from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 BUDGET = {"smooth": 1500, "non-smooth": 1000}
 """Simulations of the flight that a run may spend."""

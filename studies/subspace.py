@@ -17,7 +17,6 @@ from typing import NamedTuple
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from quadid.baselines.black_box import BlackBox, score_black_box
@@ -25,9 +24,9 @@ from quadid.baselines.quadrotor_io import FEEDTHROUGH, quadrotor_io
 from quadid.baselines.subspace import METHODS, Loop, fit_subspace
 from quadid.flight import fly
 from quadid.identify.noise_model import NoiseModel
+from quadid.types import ComplexArray, FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 LOOPS: tuple[Loop, Loop] = ("closed", "open")
 ALLOWED = 0.01
 ROWS = 4000
@@ -60,7 +59,7 @@ class System(NamedTuple):
             x = self.A @ x + self.B @ u[k] + self.K @ e[k]
         return u, y
 
-    def pole_error(self, poles: NDArray[np.complex128]) -> float:
+    def pole_error(self, poles: ComplexArray) -> float:
         """Largest distance of a pole from the true one, relative to its magnitude."""
         true = np.sort_complex(np.linalg.eigvals(self.A).astype(np.complex128))
         return float(np.max(np.abs(np.sort_complex(poles) - true) / np.abs(true)))

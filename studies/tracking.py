@@ -14,14 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_are
 
 from quadid.flight.airframe import STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.jit import kernel
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 
-FloatArray = NDArray[np.float64]
 DT, EVERY = 1e-3, 4
 """Step of the truth [s], and steps between two controls."""
 CONTROL = DT * EVERY

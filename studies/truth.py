@@ -18,7 +18,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.flight import draw_truth, fly
@@ -30,12 +29,12 @@ from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 from studies.page import put_section
 
-FloatArray = NDArray[np.float64]
 SEGMENT = 1.0
 NOISE_SCALES = (0.3, 1.0, 3.0)
 MEMORIES = (0.3, 0.66, 1.5, 3.0)

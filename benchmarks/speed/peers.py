@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.kernel import numpy_moments, numpy_step
 from benchmarks.speed.flights import flight
@@ -20,9 +19,8 @@ from quadid.identify.particle_swarm import Swarm, SwarmOptions
 from quadid.identify.shooting import Shooting
 from quadid.identify.shooting_objective import BoxProblem
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 PARTICLES, ITERATIONS = 64, 4
 WITHIN = 1.001

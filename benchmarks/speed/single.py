@@ -23,8 +23,7 @@ from benchmarks.kernel import every_effect
 from benchmarks.speed.peers import NumpyObjective
 from quadid.model.needs_kernel import needs_of
 from quadid.model.simd import LANES
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 SECONDS, TURNS = 100.0, 20
 PACKAGE = "quadid.model"

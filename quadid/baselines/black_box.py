@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.baselines.order import choose_order
 from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, quadrotor_io
@@ -17,10 +16,9 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, covering, expected_squares
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 ORDERS = tuple(range(4, 25, 2))
 """Numbers of states that are tried."""

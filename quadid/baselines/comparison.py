@@ -11,15 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from quadid.baselines.optimisers import NAMES as OPTIMISERS
 from quadid.baselines.optimisers import minimise
 from quadid.baselines.subspace import METHODS as SUBSPACE
 from quadid.errors import ParameterError, nearest
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 JsonDict = dict[str, Any]
 Clock = Callable[[], float]
 

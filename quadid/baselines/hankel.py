@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.errors import NotIdentifiableError, WindowError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quadid.types import FloatArray, IntArray
 
 CHUNK = 4096
 """Rows stacked at a time; bounds the memory."""

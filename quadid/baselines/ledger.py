@@ -10,11 +10,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Batch = Callable[[FloatArray], FloatArray]
 
 WORST = 1e30

@@ -14,13 +14,11 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError
 from quadid.identify.particle_swarm import checked_box, read_only
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quadid.types import FloatArray, IntArray
 
 SMALLEST_POPULATION = 4
 """N_min: current-to-pbest/1 needs this many."""

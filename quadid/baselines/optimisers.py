@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.baselines.ledger import WORST, Batch, BudgetSpentError, Ledger, NoGradientError
 from quadid.baselines.lshade import SMALLEST_POPULATION, LShade, LShadeOptions
@@ -21,8 +21,8 @@ from quadid.baselines.lshade import Stop as LShadeStop
 from quadid.errors import ParameterError, nearest
 from quadid.identify.particle_swarm import Stop as SwarmStop
 from quadid.identify.particle_swarm import Swarm, SwarmOptions, checked_box, read_only
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Polish = Callable[[Batch, FloatArray, FloatArray, FloatArray], FloatArray]
 """A local search: (residual (k, n) -> (k, m), start (n,), lower (n,), upper (n,)) -> better point (n,)."""
 

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.baselines.hankel import as_records
 from quadid.baselines.state_space import predict
 from quadid.baselines.subspace import Loop, fit_orders
 from quadid.errors import NotIdentifiableError
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 HELD_OUT = 0.3
 """Last part of each record that judges the orders fitted to the rest."""

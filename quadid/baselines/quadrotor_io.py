@@ -7,13 +7,11 @@ subspace method finds a linear relation about the mean of the data.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.rotation import euler
+from quadid.types import FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 OUTPUT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z")
 """Outputs in the order of the physical model's residual channels."""

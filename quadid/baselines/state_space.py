@@ -11,12 +11,10 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.errors import WindowError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quadid.types import ComplexArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class SubspaceModel:
         return len(self.A)
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> ComplexArray:
         """Eigenvalues of A, shape (n,), by falling magnitude; inside the unit circle where stable."""
         poles = np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
         return poles[np.lexsort((poles.imag, -np.abs(poles)))]

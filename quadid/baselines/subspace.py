@@ -19,14 +19,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quadid.baselines.hankel import Triangle, as_records, stack, triangular
 from quadid.baselines.state_space import SubspaceModel
 from quadid.errors import ParameterError, nearest
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from quadid.types import BoolArray, FloatArray, IntArray
 
 Loop = Literal["closed", "open"]
 METHODS = ("cva", "moesp")
@@ -100,7 +98,7 @@ def fit_orders(
     return models
 
 
-def _state_map(t: Triangle, method: str, loop: str, direct: NDArray[np.bool_]) -> FloatArray:
+def _state_map(t: Triangle, method: str, loop: str, direct: BoolArray) -> FloatArray:
     """Maps the past to states of unit variance, most telling first, shape (past * (p + m), states)."""
     z, y = t.z_past.ravel(), t.y_future.ravel()
     # A high-order ARX model: y[k] = sum_i theta_i (y, u)[k-i] + d u[k] + e[k].
@@ -140,7 +138,7 @@ def _corrected_future(t: Triangle, theta: FloatArray, d: FloatArray) -> FloatArr
 
 
 def _least_squares(
-    t: Triangle, known: FloatArray, u: IntArray, y: IntArray, direct: NDArray[np.bool_]
+    t: Triangle, known: FloatArray, u: IntArray, y: IntArray, direct: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Regresses y[k] on `known` columns and, where `direct`, on u[k]; returns (known, p) and (m, p)."""
     theta, d = np.zeros((known.shape[1], len(y))), np.zeros((len(u), len(y)))
@@ -153,7 +151,7 @@ def _least_squares(
     return theta, d
 
 
-def _order_scores(t: Triangle, to_state: FloatArray, direct: NDArray[np.bool_], largest: int) -> tuple[float, ...]:
+def _order_scores(t: Triangle, to_state: FloatArray, direct: BoolArray, largest: int) -> tuple[float, ...]:
     """Bayesian information criterion of the orders 1 ... `largest` from their one-step prediction errors."""
     p, m = t.y_future.shape[1], t.u_future.shape[1]
     scores = []
@@ -165,14 +163,14 @@ def _order_scores(t: Triangle, to_state: FloatArray, direct: NDArray[np.bool_], 
     return tuple(scores)
 
 
-def _innovations(t: Triangle, to_state: FloatArray, direct: NDArray[np.bool_]) -> tuple[FloatArray, ...]:
+def _innovations(t: Triangle, to_state: FloatArray, direct: BoolArray) -> tuple[FloatArray, ...]:
     """R columns of e[k], then [g; C'] of shape (1 + n, p) and D' of shape (m, p)."""
     known = np.concatenate([t.R[:, t.one], t.R[:, t.z_past.ravel()] @ to_state], axis=1)
     c, d = _least_squares(t, known, t.u_future[0], t.y_future[0], direct)
     return t.R[:, t.y_future[0]] - known @ c - t.R[:, t.u_future[0]] @ d, c, d
 
 
-def _regress(t: Triangle, to_state: FloatArray, direct: NDArray[np.bool_], scores: tuple[float, ...]) -> SubspaceModel:
+def _regress(t: Triangle, to_state: FloatArray, direct: BoolArray, scores: tuple[float, ...]) -> SubspaceModel:
     """Output equation, innovations, then the state equation with the innovations as known inputs."""
     n, m = to_state.shape[1], t.u_future.shape[1]
     error, c, d = _innovations(t, to_state, direct)

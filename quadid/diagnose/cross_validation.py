@@ -11,17 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from quadid.identify.shooting import Linearised
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
 BLOCK_SECONDS = 10.0
 FEWEST_BLOCKS = 10
 
 
-def block_labels(lin: Linearised) -> NDArray[np.intp]:
+def block_labels(lin: Linearised) -> IndexArray:
     """Block number of each segment, shape (segments,): stretches of 10 s, shorter if there would be fewer than ten."""
     step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
     total = step * len(lin.time)
@@ -36,7 +35,7 @@ def block_labels(lin: Linearised) -> NDArray[np.intp]:
     return labels
 
 
-def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
+def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> FloatArray:
     """Deviance of each block under parameters fitted to the other blocks, shape (blocks,)."""
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     if grad.shape[1] == 0:
@@ -47,7 +46,7 @@ def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: NDAr
     return np.asarray(cost + 2.0 * np.sum(grad * z, axis=1) + np.einsum("bp,bpq,bq->b", z, gram, z))
 
 
-def sum_by_block(values: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
+def sum_by_block(values: FloatArray, labels: IndexArray) -> FloatArray:
     """Sums of `values` (segments, ...) over the segments of each block, shape (blocks, ...)."""
     order = np.argsort(labels, kind="stable")
     first = np.flatnonzero(np.diff(labels[order], prepend=-1))

@@ -16,13 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.cross_validation import Gain, block_labels, held_out_deviance, paired_gain
 from quadid.diagnose.model import Model
 from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
 ERRORS = 2.5
 """Standard errors of a gain on unseen blocks above which a site counts as structured …"""
@@ -149,7 +148,7 @@ def _prepare(part: Columns, signal: FloatArray) -> _Prepared:
 
 
 def _judge(
-    site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model, labels: NDArray[np.intp]
+    site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model, labels: IndexArray
 ) -> tuple[Follows, list[Alone]]:
     pieces = [_products(site, p) for p in prepared]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))

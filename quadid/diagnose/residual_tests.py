@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
@@ -24,7 +23,7 @@ from quadid.identify.noise_spectrum import LOWEST, mode_power
 from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
 from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 
 SMOOTH = 3
 """Neighbouring modes averaged before they are judged."""
@@ -130,7 +129,7 @@ def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: 
 
 
 def _band(
-    found: FloatArray, null: FloatArray, usable: NDArray[np.bool_], segments: int, width: int
+    found: FloatArray, null: FloatArray, usable: BoolArray, segments: int, width: int
 ) -> tuple[FloatArray, FloatArray]:
     """Power over `width` modes relative to noise, and by how many standard errors it stands above it."""
     kernel = np.ones(width)

@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
 from quadid.diagnose.model import Model, settled_states, taken_out_causes
 from quadid.identify.gauss_newton import prior_terms
 from quadid.identify.shooting import Linearised, Shooting
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class _Own(NamedTuple):
 
     h: FloatArray
     g: FloatArray
-    place: NDArray[np.intp]
+    place: IndexArray
 
     @property
     def fall(self) -> float:
@@ -185,13 +184,13 @@ def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> 
     return own.fall - np.sum(g * z, axis=1), z
 
 
-def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: NDArray[np.intp]) -> Score:
+def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
     h, g = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
     drop, z = _reduced(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
     return Score(candidate, float(drop[0]), z[0])
 
 
-def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: NDArray[np.intp]) -> Score:
+def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
     """Scans the onset over segment boundaries: sums from the end turn the whole-log column into masked ones."""
     order = np.argsort(lin.time, kind="stable")
     from_end = slice(None, None, -1)

@@ -21,12 +21,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight.jit import kernel
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 
-FloatArray = NDArray[np.float64]
 STATES = 33
 RIGID_STATES = 21
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight.airframe import STATES
@@ -20,9 +19,9 @@ from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, prepare
 from quadid.flight.stabiliser import default_gains, mixer_matrix, pack_gains
 from quadid.flight.truth import TruthParameters
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 LEAD_IN = 5.0
 """Flown before the first log row [s], so that filters, delays and integrals have settled."""
 LOW_FLIGHT = 3.0

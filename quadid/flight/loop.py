@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight.airframe import Body, orthonormalise
 from quadid.flight.jit import kernel
 from quadid.flight.rotors import Drive, load_input, spin_up_kick
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 SUPPLY_FALL = 0.15
 """How much of its mean the supply voltage loses over a flight in which it matters."""
 NO_TIME = 1e300

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.jit import kernel
@@ -26,8 +25,8 @@ from quadid.flight.loop import (
 from quadid.flight.pilot import Pilot, fly_by_hand
 from quadid.flight.rotors import Drive, advance
 from quadid.flight.stabiliser import stabilise
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 FLEW, CRASHED = 0, 1
 
 

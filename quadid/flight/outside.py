@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError, nearest
 from quadid.flight import outside_flight, outside_log
@@ -18,8 +17,6 @@ from quadid.flight.draw import vehicle_scales
 from quadid.flight.outside_flight import Arrange, Scene
 from quadid.flight.outside_log import Distort, LogRows
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

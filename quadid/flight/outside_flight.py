@@ -6,13 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from quadid.flight.loop import Plan
 from quadid.flight.setup import Setup
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @dataclass

@@ -6,14 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from quadid.flight import sensors
 from quadid.flight.loop import OnBoard, Plan, Track
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

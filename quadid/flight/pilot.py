@@ -8,12 +8,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight.jit import kernel
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 
-FloatArray = NDArray[np.float64]
 PILOT_STEP = 0.02
 """Time between two looks of the pilot [s]."""
 

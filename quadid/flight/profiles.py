@@ -7,13 +7,12 @@ from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
 from quadid.errors import ParameterError, nearest
 from quadid.flight.pilot import PILOT_STEP
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 AXES = ("roll", "pitch", "yaw", "throttle")
 """Columns of a stick profile: roll, pitch [rad], yaw [rad], collective [fraction of hover thrust]."""
 KINDS = ("step", "pulse", "doublet", "3211", "sine", "chirp", "multisine", "noise")

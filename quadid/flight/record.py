@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
 from quadid.flight import sensors
@@ -16,10 +15,10 @@ from quadid.flight.outside_log import LogRows
 from quadid.flight.sensors import SensorNoise
 from quadid.flight.setup import Effects, Setup
 from quadid.flight.truth import TruthParameters
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Window
 
-FloatArray = NDArray[np.float64]
 FULL_BATTERY = 12.4
 """Voltage at the first sample [V]; thrust goes with its square."""
 EXTRAS = ("velocity", "position", "battery")

@@ -9,12 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight.airframe import RIGID_STATES, STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.jit import kernel
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 class Drive(NamedTuple):

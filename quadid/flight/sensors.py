@@ -8,12 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, cont2discrete, lfilter, lfiltic
 
 from quadid.flight.loop import OnBoard, Plan, Track
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)

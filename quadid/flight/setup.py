@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses, rotor_losses
 from quadid.errors import ParameterError, nearest
@@ -17,9 +16,9 @@ from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.loop import NO_TIME, Events, OnBoard
 from quadid.flight.rotors import Drive
 from quadid.flight.truth import TruthParameters
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
-FloatArray = NDArray[np.float64]
 Effects = Mapping[str, Mapping[str, float]]
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
 from quadid.chi_square import Z95
@@ -15,9 +14,8 @@ from quadid.health.comparison import Explained, compare, distance, p_healthy
 from quadid.health.hypotheses import hypotheses
 from quadid.health.spread import Healthy, healthy_spread
 from quadid.health.trims import AXES, FlightTrim
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 SIGNIFICANT = 0.01
 """A change is one that healthy flights make less often than this."""

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, log_ndtr, ndtri, stdtr
 
 from quadid.health.hypotheses import Hypothesis
 from quadid.health.spread import Healthy
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 class Explained(NamedTuple):

@@ -12,12 +12,10 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.health.trims import trim_directions
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 LOSS = 0.2
 """Prior standard deviation of a rotor's loss of thrust."""

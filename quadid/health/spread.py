@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.health.trims import AXES, FlightTrim
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 PRIOR_FLIGHTS = 4.0
 """Weight of the prior spread, in degrees of freedom."""

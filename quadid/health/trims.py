@@ -14,16 +14,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.inspection.airborne import flying_spans
 from quadid.resample import sample_period
 from quadid.rotor_signal import rotor_signal
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 AXES = ("roll", "pitch", "yaw", "effort")
 """What a trim consists of; effort is the logarithm of rotor thrust commanded per specific force."""
@@ -115,7 +113,7 @@ def wander(rest: FloatArray) -> FloatArray:
     return np.asarray(rest[: 3 * count].reshape(count, 3, -1).mean(axis=1).std(axis=0))
 
 
-def _block_means(t: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _block_means(t: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Means over the blocks that begin at `edges`, shape (blocks, columns), and which blocks hold enough samples."""
     first, end = np.searchsorted(t, edges), np.searchsorted(t, edges + BLOCK)
     sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
@@ -197,7 +195,7 @@ def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatAr
     return out, rest
 
 
-def _parts(edges: FloatArray) -> Sequence[NDArray[np.intp]]:
+def _parts(edges: FloatArray) -> Sequence[IndexArray]:
     """Blocks of each part of a flight: between landings, else thirds."""
     breaks = np.flatnonzero(np.diff(edges) > 2.0 * BLOCK) + 1
     parts = np.split(np.arange(len(edges)), breaks)

@@ -12,16 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from quadid.health.changes import Change, changes_of
 from quadid.health.comparison import distance, p_healthy
 from quadid.health.spread import Healthy, healthy_spread
 from quadid.health.trims import AXES, FlightTrim, trim_of_load, wander
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-
-FloatArray = NDArray[np.float64]
 
 RECENT = 3
 """Seconds that are compared, as many as `FlightTrim.wander` is of."""

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, scaled_difference
 from quadid.identify.shooting import Free, Shooting
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
-Places = list[NDArray[np.intp]]
+Places = list[IndexArray]
 
 FEWEST_SEGMENTS = 10
 """Segments of the second cut below which it is not made."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.simd import TILE_ROWS
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 
 VELOCITY = 6
 """Place of the velocity among the directions of an initial state."""
@@ -26,7 +25,7 @@ class Whitening:
         reach: first column of each tile of rows that counts, shape (C, tiles).
     """
 
-    def __init__(self, sigma: FloatArray, coloured: NDArray[np.bool_], whitener: FloatArray) -> None:
+    def __init__(self, sigma: FloatArray, coloured: BoolArray, whitener: FloatArray) -> None:
         """Prepares standard deviations (C,) and a whitener (C, length, length)."""
         channels, length, _ = whitener.shape
         tiles = -(-length // TILE_ROWS)

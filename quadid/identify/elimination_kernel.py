@@ -12,10 +12,9 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.elimination import VELOCITY, Reduced, StatePrior, Whitening
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 
 # isort: off
 from quadid.model.simd import (
@@ -27,7 +26,7 @@ from quadid.model.simd import (
 
 
 def reduce_segments(
-    out: FloatArray, lane: NDArray[np.intp], steps: FloatArray, weights: FloatArray, whitening: Whitening,
+    out: FloatArray, lane: IndexArray, steps: FloatArray, weights: FloatArray, whitening: Whitening,
     prior: StatePrior, into: Reduced,
 ) -> None:  # fmt: skip
     """Weights, whitens and squares the columns of every segment and eliminates its initial state.
@@ -93,7 +92,7 @@ def _squares(y: FloatArray, i: int, row: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def _factor(g: FloatArray, lane: NDArray[np.intp], s: int, prior: StatePrior, into: Reduced, l: FloatArray) -> None:
+def _factor(g: FloatArray, lane: IndexArray, s: int, prior: StatePrior, into: Reduced, l: FloatArray) -> None:
     """Cholesky factor L of the products of the eliminated columns with their prior; writes what it tells."""
     own, fitted, occam = len(l), 0.0, 0.0
     for i in range(own):
@@ -119,7 +118,7 @@ def _factor(g: FloatArray, lane: NDArray[np.intp], s: int, prior: StatePrior, in
 
 @nb.njit(**jit)
 def _eliminate(
-    g: FloatArray, lane: NDArray[np.intp], s: int, prior: StatePrior, into: Reduced, l: FloatArray, y: FloatArray,
+    g: FloatArray, lane: IndexArray, s: int, prior: StatePrior, into: Reduced, l: FloatArray, y: FloatArray,
     row: FloatArray,
 ) -> None:  # fmt: skip
     """Eliminates the initial state of segment s from products g of its columns, known on and above the diagonal.
@@ -176,8 +175,8 @@ def _largest(g: FloatArray) -> float:
 
 @nb.njit(**allocating)
 def _reduce(
-    out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: NDArray[np.bool_],
-    matrix: FloatArray, reach: NDArray[np.int64], lane: NDArray[np.intp], prior: StatePrior, into: Reduced,
+    out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: BoolArray,
+    matrix: FloatArray, reach: IntArray, lane: IndexArray, prior: StatePrior, into: Reduced,
 ) -> None:  # fmt: skip
     """The loop over segments of `reduce_segments`; `matrix` and `reach` as in `Whitening`."""
     count, length, channels = weights.shape

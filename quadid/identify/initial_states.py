@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.turning import rotated
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window
 
@@ -74,7 +74,7 @@ class InitialStates:
         moved = (retract(x, d) for x, d in zip(old.x0, _split(da, old.x0), strict=True))
         return self.replaced(n_pre, old._replace(x0=tuple(_frozen(x) for x in moved)))
 
-    def chosen(self, n_pre: int, better: NDArray[np.bool_], other: InitialStates) -> InitialStates:
+    def chosen(self, n_pre: int, better: BoolArray, other: InitialStates) -> InitialStates:
         """These states for segments where `better`, those of `other` elsewhere."""
         mine, its = self.starts[n_pre], other.starts[n_pre]
         parts = _split(better, mine.x0)
@@ -83,7 +83,7 @@ class InitialStates:
         )
         return self.replaced(n_pre, mine._replace(x0=x0))
 
-    def taking(self, places: Sequence[NDArray[np.intp]]) -> InitialStates:
+    def taking(self, places: Sequence[IndexArray]) -> InitialStates:
         """States of some segments of each window, as `Shooting.taking`; windows of which none is kept are left out."""
 
         def some(arrays: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
@@ -112,7 +112,7 @@ def first_states(rollout: Rollout, segments: Segments, n_pre: int) -> FloatArray
     return x0
 
 
-def _without_spikes(x0: FloatArray, gyro: FloatArray, rows: NDArray[np.int64]) -> None:
+def _without_spikes(x0: FloatArray, gyro: FloatArray, rows: IntArray) -> None:
     """Puts the median of five samples in place of an initial rate that is far from it, in place.
 
     Everything a segment simulates follows from its initial state; one spoilt sample there is worth a second of flight.

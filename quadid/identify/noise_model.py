@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import lower_mean
 from quadid.identify.elimination import Whitening
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle_parts import Noise
 
 _Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None]
@@ -83,7 +82,7 @@ class NoiseModel:
         return tuple(self.white), tuple(self.slow), self.slow_time, shape
 
     @property
-    def coloured(self) -> NDArray[np.bool_]:
+    def coloured(self) -> BoolArray:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)

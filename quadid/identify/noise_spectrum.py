@@ -11,12 +11,11 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 
 LOWEST = 3.0
 """Frequency [Hz] below which residual power is not counted as noise."""
@@ -29,7 +28,7 @@ LEAST_SEGMENTS = 20
 
 def mode_power(
     shooting: Shooting, theta: FloatArray, free: Free, rng: np.random.Generator, states: InitialStates
-) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Mean power of each mode (channels, length) of the residual, and of noise through the same elimination.
 
     Args:
@@ -42,7 +41,7 @@ def mode_power(
     Returns:
         Power found, power of unit white noise, and the number of segments, per channel; NaN where none is complete.
     """
-    parts: list[tuple[FloatArray, FloatArray, NDArray[np.bool_]]] = []
+    parts: list[tuple[FloatArray, FloatArray, BoolArray]] = []
     for c in shooting.columns(theta, free, states, parameters=False):
         powers = [_powers(c.residual, c.basis)]
         powers += [_powers(rng.standard_normal(c.residual.shape), c.basis) for _ in range(DRAWS)]

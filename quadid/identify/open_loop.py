@@ -11,18 +11,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.initial_states import retract
 from quadid.model import layout as ix
 from quadid.model.kernel import LANES, N_STATE
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-Mask = NDArray[np.bool_]
 
 QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}
 """What is predicted, with units."""
@@ -48,7 +45,7 @@ class OpenLoop:
         self._rollout = Rollout(_padded(window), vehicle)
         self.rows = np.flatnonzero(self._known["gyro"][: max(len(window) - longest, 0)])[::every]
 
-    def counted(self, rows: NDArray[np.intp], at: NDArray[np.intp]) -> Mask:
+    def counted(self, rows: IndexArray, at: IndexArray) -> BoolArray:
         """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
 
         A quantity counts where it was measured at the target and the start was known well enough: a velocity needs
@@ -65,7 +62,7 @@ class OpenLoop:
                 out[..., i] = valid[:, place][target] & started[:, None]
         return out
 
-    def parts(self, theta: FloatArray, at: NDArray[np.intp]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
+    def parts(self, theta: FloatArray, at: IndexArray) -> Iterator[tuple[IndexArray, FloatArray]]:
         """Yields rows of starts and what runs from them miss by, in turns.
 
         Args:
@@ -88,12 +85,12 @@ class OpenLoop:
             ran = np.nan_to_num(found, nan=np.inf, posinf=np.inf, neginf=np.inf)
             yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
 
-    def misses(self, theta: FloatArray, at: NDArray[np.intp]) -> FloatArray:
+    def misses(self, theta: FloatArray, at: IndexArray) -> FloatArray:
         """What all runs miss by, shape (vectors, starts, at, 4, 3); see `parts`."""
         none = np.full((len(theta), 0, len(at), 4, 3), np.nan)
         return np.concatenate([none, *(misses for _, misses in self.parts(theta, at))], axis=1)
 
-    def no_change(self, at: NDArray[np.intp]) -> FloatArray:
+    def no_change(self, at: IndexArray) -> FloatArray:
         """Errors of predicting that nothing changes, shape (starts, at, 4); NaN for what is not measured."""
         target = self.rows[:, None] + at
         out = np.full((*target.shape, 4), np.nan)
@@ -188,7 +185,7 @@ def _padded(window: Window) -> Window:
     )
 
 
-def _finite(window: Window) -> dict[str, Mask]:
+def _finite(window: Window) -> dict[str, BoolArray]:
     """Rows at which each channel was measured."""
     out = {}
     for name in ("gyro", "attitude", "velocity", "position"):
@@ -197,7 +194,7 @@ def _finite(window: Window) -> dict[str, Mask]:
     return out
 
 
-def initial_states(window: Window, theta: FloatArray, known: dict[str, Mask]) -> FloatArray:
+def initial_states(window: Window, theta: FloatArray, known: dict[str, BoolArray]) -> FloatArray:
     """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown.
 
     The model's gyro is undone, and an attitude that is late by the model is turned on by the rate.
@@ -217,7 +214,7 @@ def initial_states(window: Window, theta: FloatArray, known: dict[str, Mask]) ->
     return x
 
 
-def _rate_before(x: FloatArray, known: Mask, rows: Mask, samples: float) -> FloatArray:
+def _rate_before(x: FloatArray, known: BoolArray, rows: BoolArray, samples: float) -> FloatArray:
     """Rates `samples` before some rows, between two measured ones; where one of those is missing, the row's own."""
     at = np.maximum(np.flatnonzero(rows) - samples, 0.0)
     first = at.astype(int)

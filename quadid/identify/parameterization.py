@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.layout import Entry
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True)
@@ -31,12 +30,12 @@ class Free:
         return tuple(e.name for e in self.entries)
 
     @cached_property
-    def index(self) -> NDArray[np.intp]:
+    def index(self) -> IndexArray:
         """Places in the full vector."""
         return np.array([e.index for e in self.entries], dtype=np.intp)
 
     @cached_property
-    def is_log(self) -> NDArray[np.bool_]:
+    def is_log(self) -> BoolArray:
         """True for parameters on the log scale."""
         return np.array([e.name in NOMINAL_NAMES for e in self.entries], dtype=bool)
 

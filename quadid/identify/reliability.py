@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
 from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, uncertainty
@@ -20,7 +19,7 @@ from quadid.identify.gauss_newton import Polished, Prior, bounded_step, default_
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.shooting import Free, Shooting
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
 BLOCKS = 6
 """Blocks of time that are compared; enough that their spread is known to a third."""
@@ -200,7 +199,7 @@ def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Fr
     return [(name, names) for _, _, name, names in (*promises[:1], *rest[: MOST_CAUSES - 1])]
 
 
-def _groups(everything: Free, first: int) -> Mapping[str, NDArray[np.intp]]:
+def _groups(everything: Free, first: int) -> Mapping[str, IndexArray]:
     """Places of each cause's entries; rotors are causes by themselves."""
     out: dict[str, list[int]] = {}
     for i, name in enumerate(everything.names[first:], first):

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -85,7 +84,7 @@ class RunErrors:
         return np.concatenate(slopes, axis=1), np.concatenate(errors)
 
 
-def _scales(loops: Sequence[OpenLoop], at: NDArray[np.intp]) -> list[FloatArray]:
+def _scales(loops: Sequence[OpenLoop], at: IndexArray) -> list[FloatArray]:
     """What no change misses by in the flight of each loop, shape (at, 4)."""
     flights = [(loop.window.name, loop.window.log_span) for loop in loops]
     still = [loop.no_change(at) for loop in loops]

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.initial_states import InitialStates
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 
 _LONGEST_STEP = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)
 """Longest step of an initial state: rad, rad/s, m/s, m."""
@@ -41,7 +40,7 @@ class Linearised:
     residuals: FloatArray
     weights: FloatArray
     back: tuple[FloatArray, FloatArray]
-    window: NDArray[np.intp]
+    window: IndexArray
     time: FloatArray
     states: InitialStates
     n_pre: int

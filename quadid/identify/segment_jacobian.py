@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IntArray
 from quadid.window import Window
 
 
@@ -31,15 +30,15 @@ class Columns:
     """
 
     window: Window
-    rows: NDArray[np.int64]
+    rows: IntArray
     basis: FloatArray
     residual: FloatArray
-    complete: NDArray[np.bool_]
+    complete: BoolArray
     parameters: FloatArray
     base: FloatArray
     weights: FloatArray
     sigma: FloatArray
-    coloured: NDArray[np.bool_]
+    coloured: BoolArray
     whitener: FloatArray
 
     @property

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
 from quadid.identify.elimination import Reduced, StatePrior
@@ -30,7 +29,7 @@ from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout, shared_rollout
 from quadid.model.segments import Segments
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -132,11 +131,11 @@ class Shooting:
         """The same problem on other data."""
         return Shooting.cut(windows, self.vehicle, self.seconds, self.noise, self.layout)
 
-    def places(self, every: int) -> list[NDArray[np.intp]]:
+    def places(self, every: int) -> list[IndexArray]:
         """Every n-th segment of each window, the first included."""
         return [np.arange(0, len(s.starts), every) for s in self.segments]
 
-    def taking(self, kept: Sequence[NDArray[np.intp]]) -> Shooting:
+    def taking(self, kept: Sequence[IndexArray]) -> Shooting:
         """The same problem on some segments of each window, by their places.
 
         Windows of which none is kept are left out.

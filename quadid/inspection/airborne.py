@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.resample import moving_mean, sample_period
 from quadid.rotor_signal import rotor_channel
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
 
-FloatArray = NDArray[np.float64]
 Spans = tuple[tuple[float, float], ...]
 
 _LEAST = 0.5
@@ -71,14 +70,14 @@ def _felt(accel: Channel) -> FloatArray:
     return np.asarray(moving_mean(share, width) > 0.3, dtype=np.float64)
 
 
-def _vibrates(accel: Channel) -> NDArray[np.bool_]:
+def _vibrates(accel: Channel) -> BoolArray:
     """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
     length = np.linalg.norm(accel.values, axis=1)
     mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
 
 
-def _spans(t: FloatArray, on: NDArray[np.bool_]) -> Spans:
+def _spans(t: FloatArray, on: BoolArray) -> Spans:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
     spans: list[tuple[float, float]] = []
     for first, end in zip(edges[::2], edges[1::2], strict=True):

@@ -6,17 +6,15 @@ from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import sample_period
 from quadid.resampling_plan import GAP
 from quadid.turning import conjugate, rotated, turn
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 DEGREES = 57.29577951308232
 """Degrees in a radian."""
@@ -207,7 +205,7 @@ def velocity_check(recording: Recording) -> Check:
     return Check("velocity_attitude", Verdict.OK, message, numbers=numbers)
 
 
-def _inside(t: FloatArray, spans: Spans) -> NDArray[np.bool_]:
+def _inside(t: FloatArray, spans: Spans) -> BoolArray:
     return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0))
 
 
@@ -240,7 +238,7 @@ def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tup
     return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
 
 
-def _usable_steps(t: FloatArray, other: FloatArray) -> NDArray[np.bool_]:
+def _usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
     """Tells which steps of `t` have no gap, neither in `t` nor in the other channel's times."""
     steps = np.diff(t)
     longest = GAP * sample_period(other)

@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.inspection.motor_checks import Lagged
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Recording
-
-FloatArray = NDArray[np.float64]
 
 _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""

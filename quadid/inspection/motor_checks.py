@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.grid import to_windows
@@ -13,10 +12,9 @@ from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import moving_mean
 from quadid.rotor_signal import rotor_signal
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Recording, Window
-
-FloatArray = NDArray[np.float64]
 
 _RPM = 2.0 * np.pi / 60.0
 _RATE = 50.0

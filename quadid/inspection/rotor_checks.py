@@ -8,16 +8,14 @@ time before the angular acceleration that it causes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 _BIN = 0.5
 """Means over this long [s] are compared: fast motion has passed by then."""
@@ -33,7 +31,7 @@ One of four that reads half its speed makes 0.75; one that lost 45 % of its thru
 _THRUST_RANGE = 1.8
 """Thrust felt per speed squared: 90 % over 10 % quantile.  A payload of half the weight makes 1.5."""
 
-Bins = tuple[FloatArray, NDArray[np.bool_]]
+Bins = tuple[FloatArray, BoolArray]
 """Means (m, columns) and which bins hold samples (m,)."""
 
 
@@ -61,7 +59,7 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     return Check(name, Verdict.OK, "the rotors agree with each other and with the thrust felt")
 
 
-def _flying(t: FloatArray, spans: Spans) -> NDArray[np.bool_]:
+def _flying(t: FloatArray, spans: Spans) -> BoolArray:
     return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0)) if spans else np.zeros(len(t), np.bool_)
 
 
@@ -93,7 +91,7 @@ def _dead(speeds: FloatArray) -> Problem | None:
     )
 
 
-def _stuck(signal: RotorSignal, recording: Recording, inside: NDArray[np.bool_]) -> Problem | None:
+def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Problem | None:
     """A value held while the vehicle moves, unless it is a limit that all rotors share."""
     gyro = recording.channels.get("gyro")
     t, values = signal.t[inside], signal.values[inside]
@@ -110,7 +108,7 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: NDArray[np.bool_])
     return None
 
 
-def _longest(t: FloatArray, same: NDArray[np.bool_]) -> tuple[float, float]:
+def _longest(t: FloatArray, same: BoolArray) -> tuple[float, float]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     if not len(edges):
         return 0.0, 0.0
@@ -154,7 +152,7 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
 
 
 def _against_thrust(
-    recording: Recording, squares: FloatArray, known: NDArray[np.bool_], edges: FloatArray, spans: Spans
+    recording: Recording, squares: FloatArray, known: BoolArray, edges: FloatArray, spans: Spans
 ) -> Problem | None:
     accel = recording.channels.get("accel")
     if accel is None:

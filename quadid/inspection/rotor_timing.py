@@ -9,17 +9,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import moving_mean, sample_period
 from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 _STEP = 0.01
 """Lags are compared at multiples of this [s]; the peak is found between them."""

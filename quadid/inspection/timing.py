@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
 from quadid.resample import measured_period
 from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
+from quadid.types import BoolArray, FloatArray
 from quadid.window import CHANNELS, Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 _GRID = 0.02
 """Step of the grid [s] for which gaps are told, that of the fit."""
@@ -55,7 +53,7 @@ def _facts(channel: Channel) -> ChannelFacts:
     )
 
 
-def _longest_rest(t: FloatArray, same: NDArray[np.bool_]) -> float:
+def _longest_rest(t: FloatArray, same: BoolArray) -> float:
     """Returns the longest time [s] during which no column changed."""
     if not same.any():
         return 0.0

@@ -10,10 +10,9 @@ import math
 from typing import Any
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
@@ -27,8 +26,6 @@ from quadid.model.rows import (
 
 # isort: on
 from quadid.model.simd import LANES, inlined, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 
 @nb.njit(**inlined)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Window
 
 CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
@@ -13,7 +12,7 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
 
-def measurements(window: Window, channels: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
     """What a window measured, as the kernel reads it.
 
     Args:

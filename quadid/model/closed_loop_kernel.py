@@ -10,7 +10,6 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.body_kernel import step_full
 from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core
@@ -18,6 +17,7 @@ from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
 from quadid.model.rotor_kernel import input_constants, turn_rotor
+from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
@@ -30,8 +30,6 @@ from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_
 from quadid.attitude_controller import rotation_of, steer
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
 from quadid.rotation import write_rotation
-
-FloatArray = NDArray[np.float64]
 
 OUTPUTS = 10
 """Rates 3, quaternion 4, mean specific force 3, as the sensors would read them."""
@@ -84,7 +82,7 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
 def _fly(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
     flight: Flight, theta: FloatArray, need: Needs, out: FloatArray, s: FloatArray, rot: FloatArray,
-    terms: NDArray[np.int64], coefficients: FloatArray, signals: FloatArray,
+    terms: IntArray, coefficients: FloatArray, signals: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over rows and steps of `fly_closed_loop`, with its work space."""
     rotors, dt = len(geometry), flight.dt / substeps
@@ -146,7 +144,7 @@ def _fly(
 @nb.njit(**allocating)
 def _fly_closed_loop(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-    terms: NDArray[np.int64], flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
+    terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Flies one block of lanes through a window.
 

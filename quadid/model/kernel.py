@@ -15,11 +15,10 @@ import math
 from typing import NamedTuple
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
@@ -36,7 +35,6 @@ from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
 
 __all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared"]
 
-FloatArray = NDArray[np.float64]
 
 GRAVITY = 9.80665
 SLOWEST_HOVER = 0.1

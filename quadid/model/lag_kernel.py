@@ -12,11 +12,10 @@ import math
 from typing import Any
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
@@ -27,8 +26,6 @@ from quadid.model.rows import (
 
 # isort: on
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 THIRD = 1.0 / 3.0
 A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE

@@ -11,16 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, parameter_of, rotor_drag_losses, rotor_losses
 from quadid.effects.kinds import Scale
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.residual import MOST_FACTORS, SIGNALS, TARGETS
+from quadid.types import FloatArray, IndexArray, IntArray
 from quadid.vehicle import GRAVITY, Vehicle
-
-FloatArray = NDArray[np.float64]
 
 B, D, JXX, JYY, JZZ, JR = range(6)
 _ENTRIES: tuple[tuple[str, Effect, EffectParameter], ...] = tuple(
@@ -115,7 +113,7 @@ class Layout:
             raise ParameterError(f"unknown parameter '{name}'", fix=nearest(name, self.entries))
         return self.entries[name]
 
-    def indices(self, names: list[str] | tuple[str, ...]) -> NDArray[np.intp]:
+    def indices(self, names: list[str] | tuple[str, ...]) -> IndexArray:
         """Returns the vector indices of `names`."""
         return np.array([self.entry(n).index for n in names], dtype=np.intp)
 
@@ -182,7 +180,7 @@ class Layout:
         return out | ({"drag_loss": float(losses[rotor] + extra[rotor])} if extra[rotor] else {})
 
 
-def residual_terms(vehicle: Vehicle) -> NDArray[np.int64]:
+def residual_terms(vehicle: Vehicle) -> IntArray:
     """Terms beyond the catalogue as numbers for the kernel, shape (terms, 4): target, three signals, 0 for none."""
     signals, targets = ["", *SIGNALS], list(TARGETS)
     rows = [

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
 from quadid.model.simd import SOURCES, cached, jit
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 
 class Needs(NamedTuple):

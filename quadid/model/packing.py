@@ -7,14 +7,11 @@ from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.needs_kernel import FACTOR_ENTRIES, HUB_ENTRIES, RARE_ENTRIES, ROTOR_ENTRIES, SOLID_ENTRIES
 from quadid.model.simd import LANES
-from quadid.types import FloatArray
-
-BoolArray = NDArray[np.bool_]
+from quadid.types import BoolArray, FloatArray, IndexArray
 
 _AIR, _HUB, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(9)
 _PLAIN, _AIR_COST, _HUB_COST, _SOLID_COST, _RARE_COST = 10.0, 7.0, 6.0, 10.0, 7.0
@@ -22,7 +19,7 @@ _ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7
 """Nanoseconds a particle and step, beside the plain ones; `python -m benchmarks.speed --parts pieces` measures them."""
 
 
-def packing(thetas: FloatArray, rotors: int, channels: int) -> NDArray[np.intp]:
+def packing(thetas: FloatArray, rotors: int, channels: int) -> IndexArray:
     """Lane of each of these parameter vectors (m, size), the first one in lane 0, shape (m,).
 
     Of a few orders by what a vector needs beyond the first one, the one that should take least time.  Lanes beyond the
@@ -42,7 +39,7 @@ def packing(thetas: FloatArray, rotors: int, channels: int) -> NDArray[np.intp]:
     return _cheapest(features.tobytes(), len(thetas))
 
 
-def packed(vectors: FloatArray, lane: NDArray[np.intp]) -> FloatArray:
+def packed(vectors: FloatArray, lane: IndexArray) -> FloatArray:
     """Vectors (m, n) in whole blocks of lanes, spare ones repeating the first."""
     out = np.repeat(vectors[:1], -(-len(vectors) // LANES) * LANES, axis=0)
     out[lane] = vectors
@@ -50,7 +47,7 @@ def packed(vectors: FloatArray, lane: NDArray[np.intp]) -> FloatArray:
 
 
 @lru_cache(maxsize=512)
-def _cheapest(features: bytes, m: int) -> NDArray[np.intp]:
+def _cheapest(features: bytes, m: int) -> IndexArray:
     needs = np.frombuffer(features, dtype=bool).reshape(m, -1)
     best = min(_orders(needs), key=lambda order: _cost(needs, order))
     place = np.empty(m, dtype=np.intp)
@@ -60,7 +57,7 @@ def _cheapest(features: bytes, m: int) -> NDArray[np.intp]:
     return place
 
 
-def _orders(needs: BoolArray) -> Iterator[NDArray[np.intp]]:
+def _orders(needs: BoolArray) -> Iterator[IndexArray]:
     """Vectors by lane, -1 for those that repeat the first: sorted by groups of needs, spare lanes early or late."""
     m = len(needs)
     spare = np.full(-(-m // LANES) * LANES - m, -1)
@@ -72,7 +69,7 @@ def _orders(needs: BoolArray) -> Iterator[NDArray[np.intp]]:
         yield np.concatenate([[0], spare, order])
 
 
-def _cost(needs: BoolArray, order: NDArray[np.intp]) -> float:
+def _cost(needs: BoolArray, order: IndexArray) -> float:
     """Time of all blocks, nanoseconds a lane and step."""
     total = 0.0
     for first in range(0, len(order), LANES):

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
+from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
@@ -22,8 +21,6 @@ from quadid.model.rows import (
 
 # isort: on
 from quadid.model.simd import LANES, exact, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 N_SIGNALS = 15
 
@@ -61,9 +58,7 @@ def residual_signals(s: FloatArray, signals: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def residual_forces(
-    terms: NDArray[np.int64], coefficients: FloatArray, signals: FloatArray, first: bool, s: FloatArray
-) -> None:
+def residual_forces(terms: IntArray, coefficients: FloatArray, signals: FloatArray, first: bool, s: FloatArray) -> None:
     """Sums all terms into rows of specific force [m/s^2] and moment [N m], their means over the coming step.
 
     The mean is extrapolated from the starts of this step and the last (Adams and Bashforth, second order).

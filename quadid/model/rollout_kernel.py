@@ -9,8 +9,6 @@ import math
 from typing import Any
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.body_kernel import (
     step_air,
@@ -26,6 +24,7 @@ from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
 from quadid.model.rotor_kernel import Drive, input_constants, rotors_start, rotors_step, spread_hub, spread_moments
+from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
@@ -39,8 +38,6 @@ from quadid.model.sensor_kernel import (
 
 # isort: on
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 N_TANGENT = MAX_TANGENTS
 
@@ -146,10 +143,10 @@ def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 @nb.njit(**jit)
 def _march(
     drive: Drive, flight: Flight, theta: FloatArray, table: FloatArray,
-    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
+    measured: FloatArray, scale: FloatArray, memory: int, starts: IntArray, n_pre: int, x0: FloatArray,
     dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray, out: FloatArray,
     ends: FloatArray, cost: FloatArray, s: FloatArray, rot: FloatArray, ahead: FloatArray, past: FloatArray,
-    total: FloatArray, inside: FloatArray, terms: NDArray[np.int64], coefficients: FloatArray, signals: FloatArray,
+    total: FloatArray, inside: FloatArray, terms: IntArray, coefficients: FloatArray, signals: FloatArray,
 ) -> None:  # fmt: skip
     """The loop over segments and steps of `roll_segments`, with its work space."""
     dt = flight.dt
@@ -242,8 +239,8 @@ def _march(
 
 @nb.njit(**allocating)
 def _roll_segments(
-    drive: Drive, terms: NDArray[np.int64], flight: Flight, table: FloatArray,
-    measured: FloatArray, scale: FloatArray, memory: int, starts: NDArray[np.int64], n_pre: int, x0: FloatArray,
+    drive: Drive, terms: IntArray, flight: Flight, table: FloatArray,
+    measured: FloatArray, scale: FloatArray, memory: int, starts: IntArray, n_pre: int, x0: FloatArray,
     theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray,
     out: FloatArray, ends: FloatArray, cost: FloatArray,
 ) -> None:  # fmt: skip

@@ -9,8 +9,6 @@ import math
 from typing import Any, NamedTuple
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.lag_kernel import (
     mean_delayed,
@@ -28,6 +26,7 @@ from quadid.model.lag_kernel import (
 )  # fmt: skip
 from quadid.model.layout import places
 from quadid.model.needs_kernel import Needs
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
@@ -38,8 +37,6 @@ from quadid.model.rows import (
 
 # isort: on
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""

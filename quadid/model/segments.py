@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
+from quadid.types import IndexArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Segments:
 
     length: int
     lead: int
-    starts: NDArray[np.int64]
+    starts: IntArray
 
     @classmethod
     def cut(cls, rows: int, length: int, lead: int = 1) -> Segments:
@@ -40,7 +40,7 @@ class Segments:
         """Returns every n-th segment, the first included."""
         return self.at(np.arange(0, len(self.starts), n))
 
-    def at(self, places: NDArray[np.intp]) -> Segments:
+    def at(self, places: IndexArray) -> Segments:
         """Returns the segments at `places`."""
         return Segments(self.length, self.lead, self.starts[places])
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
+from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
@@ -23,8 +22,6 @@ from quadid.model.rows import (
 
 # isort: on
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
-
-FloatArray = NDArray[np.float64]
 
 Y1, Y2 = LANES, 2 * LANES
 """Offsets of the second and third component of a vector."""

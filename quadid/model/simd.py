@@ -12,11 +12,9 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LANES = 16
 """Parameter vectors rolled out together; two AVX-512 or four AVX2 registers of float64."""

@@ -12,13 +12,11 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.online.resampler import Rows
 from quadid.resample import median
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
-
-FloatArray = NDArray[np.float64]
 
 CHUNK = 0.5
 """Time that gives one set of numbers [s]."""
@@ -94,8 +92,8 @@ class ChangeDetector:
         if len(rows.t) < 4 or abs(step * len(rows.t) - CHUNK) > 1.5 * step:
             return None
         force = -accel[:, 2]
-        good: NDArray[np.bool_] = np.isfinite(force) & np.isfinite(square).all(axis=1)
-        rate: NDArray[np.bool_] = np.asarray(np.isfinite(gyro).all(axis=1))
+        good: BoolArray = np.isfinite(force) & np.isfinite(square).all(axis=1)
+        rate: BoolArray = np.asarray(np.isfinite(gyro).all(axis=1))
         if np.count_nonzero(good) < 0.7 * len(good) or np.count_nonzero(rate) < 0.7 * len(rate):
             return None
         lift, total = float(force[good].mean()), float(square[good].sum(axis=1).mean())

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.rotation import continuous_sign
+from quadid.types import FloatArray
 from quadid.window import Channel
-
-FloatArray = NDArray[np.float64]
 
 
 class ChannelBuffer:

@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one of its channel means a reboot or a clock step; one that is only behind

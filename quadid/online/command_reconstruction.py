@@ -18,7 +18,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
 from quadid.errors import LogError
@@ -26,9 +25,8 @@ from quadid.online.channel_buffer import ChannelBuffer
 from quadid.resampling_plan import GAP
 from quadid.rotation import continuous_sign
 from quadid.rotor_signal import RotorSignal
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-
-FloatArray = NDArray[np.float64]
 
 NEEDED = ("attitude_reference", "attitude", "gyro")
 SOURCE = "references through the stabiliser"

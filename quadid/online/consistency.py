@@ -15,13 +15,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.online.resampler import Rows
 from quadid.turning import down, integrated, turn
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
-
-FloatArray = NDArray[np.float64]
 
 ALLOWED = 0.03
 """Calibrated sensors differ by less than this share."""

@@ -6,7 +6,6 @@ import hashlib
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
 from quadid.identify.covariance import Uncertainty, parameter_set
@@ -20,10 +19,9 @@ from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 AGREEMENT_PROBABILITY = 1e-3
 """A window disagrees with the fused estimate when a distance like its own is less probable than this."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
@@ -20,10 +19,9 @@ from quadid.online.change_detection import Change
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
 from quadid.identify.covariance import score_products
@@ -26,10 +25,9 @@ from quadid.model.layout import B, Layout
 from quadid.online.fusion import WindowEstimate
 from quadid.online.model_vehicle import ThrustModel
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""

@@ -12,11 +12,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import exceeded
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 DRIFT = 0.02
 """Parameters may honestly differ this much (log scale) from window to window: what no simulation of this kind has."""

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.online.resampler import Rows
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 SHORTEST = 2.0
 """A stretch without gaps shorter than this [s] is left out of a window."""
@@ -125,7 +123,7 @@ class GridBuffer:
         columns = {name: _stack(piece, name) for name in names}
         if "gyro" not in columns:
             return []
-        good: NDArray[np.bool_] = np.isfinite(columns["rotor_speed"]).all(axis=1) & (t >= start) & (t < stop)
+        good: BoolArray = np.isfinite(columns["rotor_speed"]).all(axis=1) & (t >= start) & (t < stop)
         good &= _bridged(np.asarray(np.isfinite(columns["gyro"]).all(axis=1)))
         out = []
         for a, b in _runs(good):
@@ -148,7 +146,7 @@ def _stack(blocks: list[Rows], name: str) -> FloatArray:
     return np.concatenate(parts)
 
 
-def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _bridged(good: BoolArray) -> BoolArray:
     """Short holes count as good: the model simply has no measurement there."""
     out = good.copy()
     for a, b in _runs(~good):
@@ -157,7 +155,7 @@ def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def _runs(good: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(good: BoolArray) -> list[tuple[int, int]]:
     """Start and end (exclusive) of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -6,12 +6,10 @@ from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.resample import split_stretches
 from quadid.resampling_plan import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 LOST = 2.05
 """Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.health.trims import FlightTrim
 from quadid.health.watch import HealthReport, HealthWatch
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.outbox import Outbox
 from quadid.online.records import HealthyFlight
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-
-FloatArray = NDArray[np.float64]
 
 MOST_FLIGHTS = 40
 """Newest healthy flights that are compared with."""

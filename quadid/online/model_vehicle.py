@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.layout import LOSS, Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
-
-FloatArray = NDArray[np.float64]
 
 
 def moved(vehicle: Vehicle, theta: FloatArray) -> Vehicle:

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.online.model_vehicle import ThrustModel
 from quadid.resample import median
 from quadid.saturation import at_limit
 from quadid.turning import turn
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 STUCK_SECONDS = 1.0
 """A sensor that repeats itself to the bit for longer than this [s] is stuck."""

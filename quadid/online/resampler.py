@@ -14,7 +14,6 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import QuadidError
 from quadid.mounting import in_body_axes
@@ -25,10 +24,9 @@ from quadid.online.grid_columns import columns_on_grid
 from quadid.resample import HALF_WIDTH, lowpass
 from quadid.resampling_plan import make_plan
 from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
-
-FloatArray = NDArray[np.float64]
 
 SETTLE = 0.5
 """Rows leave this long [s] after their time, so that slower and delayed channels are there."""
@@ -287,7 +285,7 @@ class Resampler:
         return self._reconstruction.signal(until)
 
 
-def _first(true: NDArray[np.bool_]) -> int:
+def _first(true: BoolArray) -> int:
     """Where the first True stands, shape (n,), n > 0; n for none."""
     at = int(true.argmax())
     return at if true[at] else len(true)

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
@@ -24,10 +23,9 @@ from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
 from quadid.online.model_vehicle import moved
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 FIT_SECONDS = 1.66
 """Length of the shooting segments [s]: six of them fill a window, one a short stretch.

@@ -10,13 +10,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import SetScore
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.types import FloatArray, IndexArray
 
-FloatArray = NDArray[np.float64]
 JsonDict = dict[str, Any]
 
 GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -91,7 +90,7 @@ def channel_figures(
 
 
 def _stack(
-    scored: ScoredSet, rows: NDArray[np.intp], channels: Sequence[int], labels: tuple[str, str], residual: bool = False
+    scored: ScoredSet, rows: IndexArray, channels: Sequence[int], labels: tuple[str, str], residual: bool = False
 ) -> JsonDict:
     """Channels above each other with one time axis; with `residual`: measured less simulated."""
     after, before = scored.fitted.series, scored.initial.series
@@ -136,7 +135,7 @@ def _focus(measured: FloatArray) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def thinned(values: FloatArray, points: int) -> NDArray[np.intp]:
+def thinned(values: FloatArray, points: int) -> IndexArray:
     """Rows that keep the peaks: of each bin the rows where the liveliest channel is smallest and largest."""
     n = len(values)
     if n <= points:
@@ -154,7 +153,7 @@ def _loudest(values: FloatArray) -> int:
     return int(np.argmax(np.nan_to_num(values[:, :3]).std(axis=0)))
 
 
-def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) -> NDArray[np.intp]:
+def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) -> IndexArray:
     """Rows of the `DETAIL_SECONDS`, or as many as `points` last, with the most rotation."""
     n = len(t)
     step = float(np.median(np.diff(t))) if n > 1 else 1.0

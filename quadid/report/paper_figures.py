@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
 from quadid.report.figures import LABELS, liveliest, trace
+from quadid.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 JsonDict = dict[str, Any]
 
 GROUPS: dict[str, tuple[str, slice]] = {

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, NEVER
@@ -24,10 +23,10 @@ from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
 from quadid.report.figures import trace
 from quadid.turning import conjugate, rotated
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 Mode = Literal["value", "slope"]
 
 BINS = 24
@@ -157,7 +156,7 @@ def _signals(shooting: Shooting, residual: FloatArray, settled: Linearised) -> d
     return {name: np.concatenate([p[name] for p in parts]) for name in shared}
 
 
-def _of_window(window: Window, rows: NDArray[np.intp], rates: FloatArray, shooting: Shooting) -> dict[str, FloatArray]:
+def _of_window(window: Window, rows: IndexArray, rates: FloatArray, shooting: Shooting) -> dict[str, FloatArray]:
     dt, speed = window.dt, window.rotor_speed
     square = np.mean(speed**2, axis=1)
     spins = np.array([rotor.spin for rotor in shooting.vehicle.rotors], dtype=np.float64)
@@ -178,7 +177,7 @@ def _of_window(window: Window, rows: NDArray[np.intp], rates: FloatArray, shooti
     return out
 
 
-def _in_the_air(window: Window, rows: NDArray[np.intp], start: FloatArray, n_pre: int) -> dict[str, FloatArray]:
+def _in_the_air(window: Window, rows: IndexArray, start: FloatArray, n_pre: int) -> dict[str, FloatArray]:
     """Heading, and body velocity: measured, else from the velocity fitted at each start and the accelerometer.
 
     Args:
@@ -235,7 +234,7 @@ def _binned(
     )
 
 
-def _means(values: FloatArray, label: NDArray[np.intp], good: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _means(values: FloatArray, label: IndexArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Mean of each bin, and its 95 % half-width from the means of the stretches, which are nearly independent."""
     segment = np.broadcast_to(np.arange(len(values))[:, None], values.shape)
     key = (segment * BINS + label)[good]

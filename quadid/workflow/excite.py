@@ -17,10 +17,9 @@ from quadid.workflow.progress import Advance, silent
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from quadid.experiment import Proposal
     from quadid.identify.noise_model import NoiseModel
+    from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
     from quadid.window import Window
 
@@ -54,7 +53,7 @@ def check_limits(seconds: float, tilt: float, rate_limit: float) -> None:
 
 def knowledge(
     vehicle: Vehicle, windows: Sequence[Window], seed: int, advance: Advance
-) -> tuple[Vehicle, NDArray[np.float64], NoiseModel | None]:
+) -> tuple[Vehicle, FloatArray, NoiseModel | None]:
     """What is known so far: vehicle with believed values, information (6, 6) of the log parameters, sensor noise.
 
     Without logs that is the vehicle file: its sigma, else half of its bounds on the log scale.

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from quadid.errors import LogError
 from quadid.proof import MOST_FLIGHTS, FittedFlight
 from quadid.sanitise import LONGEST_NAME
+from quadid.types import FloatArray, IntArray
 from quadid.vehicle import Vehicle
 from quadid.workflow.loading import Log, first_imu_time
 
-FloatArray = NDArray[np.float64]
 Marks = NDArray[np.uint64]
 
 RUN = 8
@@ -145,7 +145,7 @@ def _runs(rates: FloatArray) -> Marks:
     """Hashes of the `RUN` rows that begin at each row, but for those in which a sensor does not move."""
     if len(rates) < RUN:
         return np.zeros(0, dtype=np.uint64)
-    rounded: NDArray[np.int64] = np.rint(rates * 10.0**ROUNDED).astype(np.int64)
+    rounded: IntArray = np.rint(rates * 10.0**ROUNDED).astype(np.int64)
     changes = np.cumsum(np.vstack([np.zeros((1, 3), dtype=np.int64), np.diff(rounded, axis=0) != 0]), axis=0)
     moving = np.all(changes[RUN - 1 :] > changes[: len(changes) - RUN + 1], axis=1)
     axes: Marks = rounded.view(np.uint64)

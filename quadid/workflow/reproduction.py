@@ -12,17 +12,16 @@ import numpy as np
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from quadid.diagnose import Diagnosis
     from quadid.identify.fit import Fit
     from quadid.identify.noise_model import NoiseModel
     from quadid.identify.paper_objective import PaperProblem, PaperScore
+    from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
     from quadid.window import Window
     from quadid.workflow.progress import Advance
 
-    FloatArray = NDArray[np.float64]
+    FloatArray = FloatArray
 
 VEHICLE = "pelican"
 EFFECTS = {

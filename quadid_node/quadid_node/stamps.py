@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from quadid.types import FloatArray, IntArray
 
 
 def seconds(ns: int) -> float:
@@ -13,7 +14,7 @@ def seconds(ns: int) -> float:
     return ns * 1e-9
 
 
-def many_seconds(ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def many_seconds(ns: IntArray) -> FloatArray:
     """As `seconds`, for many stamps, the same numbers to the bit."""
     return np.asarray(ns * 1e-9)
 

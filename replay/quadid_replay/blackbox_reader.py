@@ -10,18 +10,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid.types import FloatArray
 from quadid.window import Recording
 from quadid_replay.blackbox_frames import Decoded, FrameDefinition, decode_frames, known_encodings, number
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble
 from quadid_replay.frames import GRAVITY, flip_body
 from quadid_replay.motors import RPM
-
-FloatArray = NDArray[np.float64]
 
 MAGIC = b"H Product:Blackbox"
 _DEGREE = np.pi / 180.0

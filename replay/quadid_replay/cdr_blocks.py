@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray, IntArray
+
 Blocks = list[Sequence[float]]
 _LITTLE_ENDIAN = b"\x00\x01"
 _STAMP = struct.Struct("<iI")
@@ -34,8 +34,8 @@ class Read(NamedTuple):
 class ReadMany(NamedTuple):
     """Messages: stamps (n,) as seconds and nanoseconds, runs of numbers (n, size), and what else was noted of all."""
 
-    seconds: NDArray[np.int64]
-    nanoseconds: NDArray[np.int64]
+    seconds: IntArray
+    nanoseconds: IntArray
     blocks: list[FloatArray]
     extra: Any
 

@@ -6,9 +6,8 @@ A log has one `LogClock`; stamps are fed in file order and come back as recordin
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from quadid.types import BoolArray, FloatArray
 
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one means a reboot or a clock step."""
@@ -89,7 +88,7 @@ class LogClock:
             return raw + self._offset
         return self._suspect(raw)
 
-    def times(self, raw: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def times(self, raw: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Maps many stamps in file order; returns recording times (NaN where refused) and which were accepted."""
         if len(raw) and self._newest is None and bool(np.isfinite(raw).all()):
             newest = np.maximum.accumulate(raw)

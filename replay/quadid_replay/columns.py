@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.resample import sample_period
 from quadid.rotation import continuous_sign
+from quadid.types import FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.frames import unit_quaternions
-
-FloatArray = NDArray[np.float64]
 
 _ABSURD = 1e9
 """No channel holds a number of this size in SI units; damage does."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
 
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray, IntArray
 
 _HEAD = b"\xa3\x95"
 _FMT_TYPE, _FMT_LENGTH = 0x80, 89
@@ -56,7 +56,7 @@ class DataflashIndex:
         """Tells whether there are records called `name` with all these columns."""
         return self.count(name) > 0 and all(c in self.formats[name].columns for c in columns)
 
-    def rows(self, name: str) -> NDArray[np.int64]:
+    def rows(self, name: str) -> IntArray:
         """Returns the byte offsets of the records, shape (n,): their order in the file."""
         return np.array(self.offsets.get(name, ()), dtype=np.int64)
 

@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
-
-FloatArray = NDArray[np.float64]
 
 _ATTITUDE = ("Roll", "Pitch", "Yaw")
 _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
@@ -40,7 +38,7 @@ class _Source(NamedTuple):
 
     name: str
     t: FloatArray
-    rows: NDArray[np.bool_]
+    rows: BoolArray
     refused: int
 
 

@@ -7,11 +7,9 @@ not finite and are dropped further on.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.rotation import euler
-
-FloatArray = NDArray[np.float64]
+from quadid.types import BoolArray, FloatArray
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2], the unit of accelerometers that count in g."""
@@ -72,7 +70,7 @@ def to_euler(q: FloatArray) -> FloatArray:
         return euler(q)
 
 
-def unit_quaternions(q: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def unit_quaternions(q: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Returns the quaternions with those off unit length by more than 1e-3 normalised, and which rows are attitudes.
 
     Rows of length below 0.5 or above 2 (zeros, garbage) are no attitudes.

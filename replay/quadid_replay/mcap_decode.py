@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 from quadid_replay.bag_topics import Topic
 from quadid_replay.cdr_blocks import BlockReader, Read
 from quadid_replay.clocks import LogClock
@@ -20,7 +20,6 @@ from quadid_replay.columns import Columns
 from quadid_replay.mcap_messages import MessageType
 from quadid_replay.signal_columns import UNDECODABLE, SignalColumns
 
-FloatArray = NDArray[np.float64]
 Message = tuple[int, int, bytes]
 """Channel id, log time [ns], payload."""
 ColumnsOf = dict[tuple[int, str], Columns]
@@ -84,7 +83,7 @@ class Stamps:
             self._offsets[group] = offset
         return self.clock.time(stamped + offset)
 
-    def times(self, groups: Sequence[str], stamps: NDArray[np.int64], logged: Sequence[int]) -> FloatArray:
+    def times(self, groups: Sequence[str], stamps: IntArray, logged: Sequence[int]) -> FloatArray:
         """As `time` for many stamps (n, 2), seconds and nanoseconds, in file order; NaN for those refused."""
         plain = self._plain_times(groups, stamps)
         if plain is not None:
@@ -93,7 +92,7 @@ class Stamps:
         each = [self.time(g, s, ns, log) for g, (s, ns), log in zip(groups, pairs, logged, strict=True)]
         return np.array([np.nan if t is None else t for t in each], dtype=np.float64)
 
-    def _plain_times(self, groups: Sequence[str], stamps: NDArray[np.int64]) -> FloatArray | None:
+    def _plain_times(self, groups: Sequence[str], stamps: IntArray) -> FloatArray | None:
         """None, and nothing has changed, unless every stamp follows plainly on a clock that is known."""
         if self.base_ns is None or self.base_ns > _LARGEST_BASE or not np.all(np.any(stamps != 0, axis=1)):
             return None
@@ -145,7 +144,7 @@ class _Part(NamedTuple):
 
     key: tuple[int, str]
     order: int
-    rows: NDArray[np.intp]
+    rows: IndexArray
     values: FloatArray
 
 
@@ -177,9 +176,7 @@ def _add_batch(batch: list[Message], sources: Mapping[int, Source], columns: Col
     return failed
 
 
-def _read_at_once(
-    number: int, source: Source, rows: NDArray[np.intp], data: list[bytes], stamped: NDArray[np.int64]
-) -> list[_Part]:
+def _read_at_once(number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray) -> list[_Part]:
     """Reads all messages of a topic by columns; nothing where that would not be the same as one by one."""
     read = source.layout.read_many(data) if source.layout is not None else None
     signals = None if read is None else source.columns.pick(read.blocks, read.extra)
@@ -190,8 +187,8 @@ def _read_at_once(
 
 
 def _read_each(
-    number: int, source: Source, rows: NDArray[np.intp], data: list[bytes], stamped: NDArray[np.int64],
-    decoded: NDArray[np.bool_],
+    number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray,
+    decoded: BoolArray,
 ) -> list[_Part]:  # fmt: skip
     """Reads the messages of a topic one by one; `decoded` becomes False where that was not possible."""
     parts = []

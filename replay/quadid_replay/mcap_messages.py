@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadid.types import FloatArray
 from quadid_replay.cdr_blocks import Blocks
 from quadid_replay.frames import cross, flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.motors import RPM
 
-FloatArray = NDArray[np.float64]
 Signals = list[tuple[str, Sequence[float]]]
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
 

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.turning import conjugate, rotated
+from quadid.types import FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.topic_writer import TopicWriter
 from quadid_replay.writing import Source, as_recording, in_time_order, union_rows
 
-FloatArray = NDArray[np.float64]
 _Series = tuple[FloatArray, Callable[[int], tuple[str, str, bytes]]]
 _ABSENT = -1.0
 _STAMP = {"sec": 0, "nanosec": 0}

@@ -11,12 +11,11 @@ from collections.abc import Hashable
 
 import numpy as np
 from mcap.exceptions import McapError
-from numpy.typing import NDArray
 
+from quadid.types import FloatArray
 from quadid_replay.cdr_blocks import Blocks
 from quadid_replay.mcap_messages import MessageType
 
-FloatArray = NDArray[np.float64]
 Places = tuple[str, list[tuple[int, int]]]
 """A signal, and where each of its numbers stands: run and place in it."""
 UNDECODABLE = (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError)

@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega
 
 from quadid.errors import LogError
+from quadid.types import FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM
 from quadid_replay.writing import Source, as_recording, in_time_order, open_for_writing, union_rows
 
-FloatArray = NDArray[np.float64]
 dialect = extend_dialect(ardupilotmega)
 SYSTEM, COMPONENT = 1, 1
 _UNIX_START_US = 1_600_000_000_000_000

@@ -18,14 +18,13 @@ from pyulog.exceptions import ULogException
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid.types import FloatArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
-
-FloatArray = NDArray[np.float64]
 
 _TOPICS = frozenset((
     "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid.types import FloatArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble
@@ -22,7 +23,6 @@ from quadid_replay.frames import GRAVITY, flip_body, from_euler
 from quadid_replay.motors import RPM
 from quadid_replay.usd_records import collect_usd_records
 
-FloatArray = NDArray[np.float64]
 FULL_SCALE = 65535.0
 """The firmware's full motor command."""
 

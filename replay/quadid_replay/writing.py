@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.errors import LogError
+from quadid.types import FloatArray
 from quadid.window import CHANNELS, Channel, Recording, Window
 
-FloatArray = NDArray[np.float64]
 Source: TypeAlias = Recording | Window | Sequence[Window]
 """What can be written: a recording, or windows of one log."""
 

@@ -11,12 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.identify.open_loop import lengths
+from quadid.types import FloatArray
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 BINS = 10
 """Parts of the half second over which rotor speeds are averaged."""

@@ -6,16 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from quadid.health.trims import trim_directions
 from quadid.inspection.airborne import flying_spans
 from quadid.rotor_signal import rotor_signal
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Recording
 from studies.health.recorded import CRAZYFLIE, LARGE, Flown
 
-FloatArray = NDArray[np.float64]
 _BAND = (1.5, 15.0)
 """Motion that motors follow and position control does not make alone [Hz]."""
 _LAG = 0.06
@@ -29,7 +28,7 @@ class Feature(NamedTuple):
     value: Callable[[Recording], float]
 
 
-def _steady(t: FloatArray, recording: Recording) -> NDArray[np.bool_]:
+def _steady(t: FloatArray, recording: Recording) -> BoolArray:
     (begin, end), *_ = flying_spans(recording, CRAZYFLIE)
     return np.asarray((t > begin + 1.5) & (t < end - 1.5))
 

@@ -10,13 +10,12 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Channel, Recording
 
-FloatArray = NDArray[np.float64]
 G = 9.80665
 
 

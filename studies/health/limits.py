@@ -11,11 +11,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.health import FlightTrim, Health, Healthy, assess, healthy_spread
 from quadid.health.changes import SIGNIFICANT
 from quadid.health.hypotheses import rotor_effect
+from quadid.types import BoolArray, FloatArray
 from studies.health.recorded import CRAZYFLIE, LARGE, Judged, is_single, kind_right, named_first
 
 AIRFRAMES = ("E8", "E9")
@@ -23,16 +23,14 @@ CUT = 2
 """The rotor whose propeller was cut alone, from 0."""
 SHOWN = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 MASSES = (0.01, 0.02, 0.03, 0.05, 0.08)
-Flags = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 
 class Power(NamedTuple):
     """Draws of one size: called changed, M3 named first, called a rotor and not a weight; each of shape (draws,)."""
 
-    found: Flags
-    named: Flags
-    rotor: Flags
+    found: BoolArray
+    named: BoolArray
+    rotor: BoolArray
 
 
 def loss_per_mm(judged: Sequence[Judged]) -> float:
@@ -95,7 +93,7 @@ def _expected(flown: Sequence[Judged], powers: dict[tuple[str, float], Power], c
     return f"{counts.mean():.1f} ({low:.0f} to {high:.0f})"
 
 
-def _percent(values: Sequence[Flags]) -> str:
+def _percent(values: Sequence[BoolArray]) -> str:
     return " | ".join(f"{100.0 * np.mean(v):.0f} %" for v in values)
 
 

@@ -16,13 +16,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from mujoco import sysid
-from numpy.typing import NDArray
 
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 CHUNK = 1.0
 """Length of the chunks [s]: those of our own last fit."""
 FINER = 2

@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
-from numpy.typing import NDArray
 
 from benchmarks.online.accuracy import CHANGE, CHANGE_AT, PELICAN, flown
 from benchmarks.online.driving import drive, samples
 from quadid.online import Diagnosed, Publish, Session
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from studies.peers.simulated import guessed
 
-FloatArray = NDArray[np.float64]
 NAMES = ("b", "d", "J_xx", "J_yy", "J_zz")
 SEEDS = range(1, 6)
 SECONDS = 60.0

@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, savgol_filter
 
 import quadid
 from quadid.identify.open_loop import mean_errors, no_change
 from quadid.model.layout import Layout
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 from quadid.workflow.loading import load_vehicle
 
-FloatArray = NDArray[np.float64]
 LOG, CUT, MODEL = "arpl/log15.csv", 18.0, "arpl/vehicle.yaml"
 """The log, fitted up to the cut [s] and predicted from there."""
 RATE, LAGS = 1000.0, np.arange(0.01, 0.151, 0.005)

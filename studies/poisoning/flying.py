@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.online import Job, Publish, Session
 from quadid.online.records import OnlineSet
+from quadid.types import FloatArray
 from quadid.window import Block, Recording
 
-FloatArray = NDArray[np.float64]
 MUST = ("b", "J_xx", "J_yy")
 STEP = 0.1
 """Data are handed over in pieces of this length [s]."""

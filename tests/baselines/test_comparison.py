@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.baselines import comparison
 from quadid.baselines.black_box import fit_black_box, score_black_box
@@ -18,9 +17,9 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from quadid.baselines.lshade import LShade, LShadeOptions, Stop
 from quadid.errors import ParameterError
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Cost = Callable[[FloatArray], FloatArray]
 
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.baselines.optimisers import NAMES, NEED_RESIDUAL, Result, Stop, minimise
 from quadid.errors import ParameterError
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Batch = Callable[[FloatArray], FloatArray]
 
 LOWER, UPPER = np.log([0.25, 0.2, 0.5]), np.log([4.0, 3.0, 8.0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
 from quadid.baselines.state_space import predict
@@ -13,8 +12,6 @@ from quadid.errors import WindowError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-FloatArray = NDArray[np.float64]
 
 
 def turning(rows: int = 5) -> Window:

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from quadid.baselines.order import choose_order
 from quadid.baselines.state_space import SubspaceModel, innovations, predict
 from quadid.baselines.subspace import LARGEST_ORDER, METHODS, Loop, fit_orders, fit_subspace
 from quadid.errors import NotIdentifiableError, ParameterError, WindowError
+from quadid.types import ComplexArray, FloatArray
 
-FloatArray = NDArray[np.float64]
 LOOPS: tuple[Loop, Loop] = ("closed", "open")
 VARIANTS = list(itertools.product(METHODS, LOOPS))
 
@@ -33,7 +32,7 @@ class System(NamedTuple):
     K: FloatArray
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> ComplexArray:
         return np.sort_complex(np.linalg.eigvals(self.A).astype(np.complex128))
 
     def markov(self, count: int) -> FloatArray:

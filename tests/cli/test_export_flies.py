@@ -11,17 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from quadid.errors import ParameterError
 from quadid.model.simulate import simulate as fly_file
 from quadid.report.programs import export
 from quadid.report.programs.rotorpy import SHORTEST_LAG
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.model.simulate import held, simulate, state
 
-FloatArray = NDArray[np.float64]
 DT, STEPS = 0.02, 100
 TO_FLU = np.array([1.0, -1.0, -1.0])
 NOMINAL = ("b", "d", "J_xx", "J_yy", "J_zz")

@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model
@@ -18,10 +17,10 @@ from quadid.identify.noise_estimation import noise_floor, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.window import Window
 from tests.identify.flights import PELICAN, guessed
 
-FloatArray = NDArray[np.float64]
 SECONDS = 60.0
 SEED = 5
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from quadid.diagnose.cross_validation import BLOCK_SECONDS, block_labels, held_out_deviance, paired_gain
@@ -16,9 +15,9 @@ from quadid.identify.score import settle_states
 from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import MEASURED, Shooting
 from quadid.model.segments import Segments
+from quadid.types import BoolArray, FloatArray
 from tests.diagnose.problems import cause, fitted, window_with
 
-FloatArray = NDArray[np.float64]
 ROWS, WIDTH = 30, 5
 
 
@@ -103,7 +102,7 @@ def test_the_leave_out_step_is_that_of_full_refits_of_a_nonlinear_model() -> Non
         assert model.held_out[block] - inside[block] == pytest.approx(charge, rel=0.1, abs=0.2)
 
 
-def without_block(shooting: Shooting, keep: NDArray[np.bool_]) -> Shooting:
+def without_block(shooting: Shooting, keep: BoolArray) -> Shooting:
     """The problem on some of its segments."""
     (window,) = [r.window for r in shooting.rollouts]
     out = Shooting.cut([window], shooting.vehicle, shooting.length * shooting.dt, shooting.noise, shooting.layout)

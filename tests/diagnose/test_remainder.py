@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.diagnose.cross_validation import Gain
 from quadid.diagnose.model import Model
@@ -16,9 +15,9 @@ from quadid.diagnose.residual_regressors import SITES, Follows
 from quadid.diagnose.residual_tests import ALARM, Remainder, Structure, remainder
 from quadid.diagnose.result import Verdict
 from quadid.identify.noise_spectrum import mode_power
+from quadid.types import FloatArray
 from tests.diagnose.problems import Problem, clean, fitted, window_with
 
-FloatArray = NDArray[np.float64]
 ROWS = 40_000.0
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.diagnose.residual_regressors import LAGS, SITES, Follows, follows, signals
 from quadid.flight import draw_truth, fly
 from quadid.identify.segment_jacobian import Columns
+from quadid.types import FloatArray
 from tests.diagnose.problems import SEED, Problem, clean, fitted, window_with
 from tests.identify.flights import PELICAN
-
-FloatArray = NDArray[np.float64]
 
 
 def columns(problem: Problem) -> Columns:

@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from quadid.flight import Flight, propeller_radius
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 G = 9.80665
 DOWN = np.array([0.0, 0.0, 1.0])
 

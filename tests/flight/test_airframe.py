@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from quadid.flight import TruthParameters, fly
 from quadid.flight.airframe import STATES, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.rotors import advance
 from quadid.flight.setup import Effects, Setup, prepare
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import butter, lsim
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -13,10 +12,10 @@ from quadid.errors import ParameterError
 from quadid.flight import Flight, check_effects, draw_effect, fly
 from quadid.flight.draw import SIZES
 from quadid.flight.setup import Effects
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.flight.test_airframe import PELICAN, setup_of, slope, state
 
-FloatArray = NDArray[np.float64]
 HOVER = setup_of().truth.hover_speed(4)
 LEVEL = Rotation.identity()
 

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from quadid.errors import ParameterError
 from quadid.flight import PROFILES, Flight, Segment, draw_truth, fly
 from quadid.flight.profiles import scripted, stick_profile
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 
 

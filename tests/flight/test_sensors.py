@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from quadid.errors import ParameterError
 from quadid.flight import Flight, SensorNoise, fly
 from quadid.flight.sensors import butterworth, coloured, quaternion_exp, quaternion_multiply
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 
 

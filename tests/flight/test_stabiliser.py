@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from quadid.errors import ParameterError
@@ -20,7 +19,6 @@ from quadid.flight import (
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import Stabiliser
 
-FloatArray = NDArray[np.float64]
 NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
 
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from numpy.typing import NDArray
 from quadid_replay import open_log, usd_records
 from quadid_replay.frames import from_euler, to_euler
 from quadid_replay.motors import ardupilot_motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
+from quadid.types import BoolArray, IndexArray
 from tests.faults.evidence import Happened
 from tests.fuzz import rosbag2_format
 from tests.fuzz.seeds import mcap_of
@@ -163,7 +163,7 @@ def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypat
     looked: list[int] = []
     kept = np.flatnonzero
 
-    def counted(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def counted(mask: BoolArray) -> IndexArray:
         looked.append(len(mask))
         return kept(mask)
 

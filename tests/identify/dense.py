@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
@@ -18,8 +17,7 @@ from quadid.identify.shooting import Free
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
-
-FloatArray = NDArray[np.float64]
+from quadid.types import FloatArray
 
 STATE_STEP = np.array([1e-5] * 6 + [1e-4] * 6)
 PARAMETER_STEP = 1e-3

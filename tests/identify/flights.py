@@ -7,17 +7,16 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.flight import Flight, TruthParameters, draw_truth, fly
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 SECONDS = 60.0
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.identify import composite_likelihood
 from quadid.identify import fit as fitting
@@ -17,10 +16,10 @@ from quadid.identify.gauss_newton import default_prior, polish
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray, IntArray
 from quadid.window import Window
 from tests.identify.flights import PELICAN, at_truth, flown, values_of, with_noise
 
-FloatArray = NDArray[np.float64]
 WHITE = np.repeat([0.01, 0.003, 0.1], 3)
 DRAWS = 60
 
@@ -118,7 +117,7 @@ def test_a_spike_in_every_hundredth_sample_costs_precision_and_no_more() -> None
     assert np.all(np.abs(error) < 0.02)
 
 
-def spiked(window: Window, rows: Sequence[int] | NDArray[np.int64], size: float) -> Window:
+def spiked(window: Window, rows: Sequence[int] | IntArray, size: float) -> Window:
     """The window with `size` [rad/s] added to r at some rows."""
     assert window.gyro is not None
     gyro = window.gyro.copy()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from quadid.errors import NotIdentifiableError, QuadidError
@@ -29,10 +28,10 @@ from quadid.identify.initial_states import InitialStates
 from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle_parts import ParameterPrior
 from tests.identify.flights import PELICAN, at_truth, flown, guessed, values_of
 
-FloatArray = NDArray[np.float64]
 LAYOUT = Layout(PELICAN)
 MIXED = ("b", "d", "J_xx", "motor_lag.tau", "parasitic_drag.c", "rotor_drag.k_x", "cg_offset.x", "battery_sag.fraction")
 

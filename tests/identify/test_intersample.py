@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.errors import WindowError
 from quadid.flight import fly
@@ -19,12 +18,11 @@ from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import Stabiliser
 from quadid.window import Window
 from tests.identify.fast_loop import EVERY, fly_fast
-
-FloatArray = NDArray[np.float64]
 
 PELICAN = Vehicle.shipped("pelican")
 KP, KD = 70.0, 14.0

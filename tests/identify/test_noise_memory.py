@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 import quadid
@@ -16,10 +15,10 @@ from quadid.identify.fit import FitOptions, fit
 from quadid.identify.noise_memory import MEMORY_SECONDS, attitude_memory
 from quadid.identify.noise_model import ATTITUDE, SLOW_TIME
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.conftest import absent
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 SCALES = tuple(f"gyro_scale.{axis}" for axis in "xyz")
 

@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import freqz, lfilter
 
 from quadid.identify.noise_model import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import LOWEST, shaped_noise
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
+from quadid.types import FloatArray
 from quadid.vehicle_parts import Noise
 from tests.identify.flights import PELICAN, at_truth, flown, turned
 
-FloatArray = NDArray[np.float64]
 DT = 0.02
 WHITE = np.array([0.02, 0.01, 0.03, 0.003, 0.004, 0.002, 0.2, 0.1, 0.3])
 SLOW = np.array([0.0, 0.0, 0.0, 0.004, 0.002, 0.006, 0.0, 0.0, 0.0])

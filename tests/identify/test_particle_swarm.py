@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from quadid.errors import ParameterError
 from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Cost = Callable[[FloatArray], FloatArray]
 
 

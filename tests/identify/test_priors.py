@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 
 from quadid.errors import VehicleError
 from quadid.flight import draw_truth, fly
@@ -17,7 +16,6 @@ from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior, ThrustPoint
 from tests.identify.flights import PELICAN, flown, guessed
 
-FloatArray = NDArray[np.float64]
 SEED = 3
 
 

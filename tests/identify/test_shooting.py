@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from quadid.errors import WindowError
@@ -17,11 +16,11 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import MEASURED, VELOCITY_PRIOR, Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.window import Window
 from tests.identify.dense import DenseProblem, perturbed
 from tests.identify.flights import PELICAN, at_truth, flown, without_rows
 
-FloatArray = NDArray[np.float64]
 NOISE = NoiseModel(
     np.array([0.02] * 3 + [0.003] * 3 + [0.25] * 3), np.array([0.0] * 3 + [0.004] * 3 + [0.0] * 3)
 )  # fmt: skip

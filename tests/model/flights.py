@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.layout import Layout
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling
 from tests.model.independent import Flown, Independent, Input
-
-FloatArray = NDArray[np.float64]
 
 
 def lively_input(vehicle: Vehicle, seconds: float, dt: float, seed: int = 1, sampling: Sampling = "held") -> Input:

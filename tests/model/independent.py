@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import OdeSolution, solve_ivp
 from scipy.spatial.transform import Rotation
 
+from quadid.types import FloatArray, IntArray
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling, Window
 
-FloatArray = NDArray[np.float64]
 G = 9.80665
 DOWN = np.array([0.0, 0.0, 1.0])
 EULER, RATE, VELOCITY, POSITION, FORCE = (slice(i, i + 3) for i in (0, 3, 6, 9, 12))
@@ -81,7 +80,7 @@ class Flown:
         """Specific force at the IMU, body axes, mean over `over` seconds centred on t."""
         return np.asarray(self.at(t + 0.5 * over)[:, FORCE] - self.at(t - 0.5 * over)[:, FORCE]) / over
 
-    def states(self, rows: NDArray[np.int64]) -> FloatArray:
+    def states(self, rows: IntArray) -> FloatArray:
         """Initial states of the rollout at rows: quaternion, rate, velocity, position, shape (len(rows), 13)."""
         y = self.at(self.given.t[rows])
         return np.column_stack([quaternion(y[:, EULER]), y[:, RATE], y[:, VELOCITY], y[:, POSITION]])

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
-FloatArray = NDArray[np.float64]
 DT = 0.01
 HALF = 0.5 * DT
 FLIP = np.array([1.0, -1.0, -1.0])

@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from tests.model.flights import vector
 from tests.model.independent import Input
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling
 from tests.model.flights import fly, lively_input, values_of, vector
-
-FloatArray = NDArray[np.float64]
 
 DRAG = {"rotor_drag.k_x": 0.3, "rotor_drag.k_y": 0.2}
 EFFECTS: dict[str, tuple[dict[str, float], dict[str, float]]] = {

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES
+from quadid.types import FloatArray
 from quadid.window import Window
 from tests.model.test_lanes import N_PRE, NOMINAL, VEHICLE, noisy_window, random_vectors
-
-FloatArray = NDArray[np.float64]
 
 
 def explicit(

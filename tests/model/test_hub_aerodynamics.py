@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.flight.airframe import Air, hub_forces
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.flight.test_airframe import setup_of, slope, state
 from tests.model.simulate import held, simulate
 from tests.model.simulate import state as model_state
 
-FloatArray = NDArray[np.float64]
 AIR = {"rotor_drag.k_x": 0.3, "rotor_drag.k_y": 0.3, "axial_inflow.k_z": 0.5}
 DT, STEPS = 0.005, 40
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
@@ -13,11 +12,11 @@ from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.model.flights import lively_input, values_of, vector
 from tests.model.test_lanes import noisy_window
 
-FloatArray = NDArray[np.float64]
 VEHICLE = Vehicle.shipped("pelican")
 NOMINAL = vector(VEHICLE, values_of(VEHICLE))
 

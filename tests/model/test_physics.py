@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Rotor
 from tests.model.flights import lively_input, values_of
 from tests.model.independent import Input
 from tests.model.simulate import Trajectory, finer, held, simulate, state
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 HOVER = PELICAN.hover_speed()
 FULL = {"rotor_drag.k_x": 1e-30}

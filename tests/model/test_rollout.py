@@ -7,7 +7,6 @@ import sys
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
@@ -20,8 +19,6 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 from tests.model.flights import fly, lively_input, values_of, vector
 from tests.model.test_lanes import NOMINAL, VEHICLE, noisy_window
-
-FloatArray = NDArray[np.float64]
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.05])

@@ -6,19 +6,18 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import butter, lsim
 from scipy.spatial.transform import Rotation
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from tests.model.flights import fly, lively_input, values_of, vector
 from tests.model.independent import EULER, RATE, Flown, quaternion
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 DT = 0.01
 GYRO, ATTITUDE, ACCEL = slice(0, 3), slice(3, 6), slice(6, 9)

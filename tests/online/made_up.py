@@ -13,7 +13,6 @@ from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
@@ -22,11 +21,11 @@ from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Sample
 from tests.online.test_gate import TRUE
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 Worker = Callable[[Job], JobReply | None]
 """Answers a request; None: it is still at work."""

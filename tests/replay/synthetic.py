@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from quadid_replay.frames import from_euler
 
 from quadid.rotation import continuous_sign
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Channel, Recording
 
-FloatArray = NDArray[np.float64]
 PELICAN = Vehicle.shipped("pelican")
 
 

@@ -9,15 +9,13 @@ from random import Random
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadid_replay import open_log
 from quadid_replay.blackbox_frames import FrameDefinition, Reader
 
 from quadid.errors import LogError
+from quadid.types import FloatArray
 from tests.replay import blackbox_writer as writer
 from tests.replay.golden import summary
-
-FloatArray = NDArray[np.float64]
 
 
 def rows(count: int = 400) -> list[list[int]]:

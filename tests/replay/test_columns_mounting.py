@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadid_replay import open_log, write_csv
 from quadid_replay.reading import read_in_child
 
@@ -15,10 +14,10 @@ from quadid.errors import LogError, VehicleError
 from quadid.grid import to_windows
 from quadid.inspection import Verdict, inspect
 from quadid.mounting import mounting_matrix
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.replay.synthetic import PELICAN, Flight, full_recording
 
-FloatArray = NDArray[np.float64]
 NAMES = {"t": "Time_s", "p": "gyro_x", "q": "gyro_y", "r": "gyro_z", "ax": "acc_x"}
 
 

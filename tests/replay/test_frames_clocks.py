@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from quadid_replay.clocks import LogClock, WrapCounter
 from quadid_replay.columns import Columns, RawChannel, clean_channel, fastest_first
 from quadid_replay.frames import (
@@ -21,8 +20,8 @@ from quadid_replay.frames import (
 from scipy.spatial.transform import Rotation
 
 from quadid.rotation import continuous_sign
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 angles = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
 
 

@@ -6,19 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.grid import grid_recording, to_windows
+from quadid.types import FloatArray, IndexArray
 from quadid.window import Channel, Recording
 from tests.replay.synthetic import PELICAN, Flight, with_command
 
-FloatArray = NDArray[np.float64]
 FLIGHT = Flight()
 INSTANT = with_command(PELICAN, sampling="instant")
 
 
-def without_rows(recording: Recording, gone: NDArray[np.intp]) -> Recording:
+def without_rows(recording: Recording, gone: IndexArray) -> Recording:
     channels = {
         n: replace(c, t=np.delete(c.t, gone), values=np.delete(c.values, gone, axis=0))
         for n, c in recording.channels.items()

@@ -9,18 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadid_replay import open_log
 from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
 from quadid.inspection import Check, Inspection, Verdict, inspect
 from quadid.inspection.conventions import fit_axes
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
 from tests.faults.evidence import Happened
 from tests.replay.synthetic import PELICAN, Flight, with_command
 
-FloatArray = NDArray[np.float64]
 FLIGHT = Flight()
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline
 
@@ -23,8 +22,8 @@ from quadid.resample import (
     sample_period,
     split_stretches,
 )
+from quadid.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 STEP = 0.02
 
 

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadid_replay import open_log
 
 from quadid.inspection import Check, Verdict, inspect
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
-
-FloatArray = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")

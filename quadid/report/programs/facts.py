@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quadid.chi_square import Z95
 from quadid.effects import rotor_losses
 from quadid.parameters import NOMINAL_UNITS
 from quadid.sanitise import LONGEST_LINE, plain
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-
-FloatArray = NDArray[np.float64]
 
 TO_FLU = np.diag([1.0, -1.0, -1.0])
 """Turns body FRD into body FLU (its own inverse)."""
