@@ -45,6 +45,11 @@ def test_the_packages_of_the_wheel_are_all_copied(dockerfile: str, repository: P
         assert f"COPY {folder} src/{folder}" in dockerfile
 
 
+def test_the_base_image_is_named_by_its_digest(dockerfile: str) -> None:
+    (base,) = re.findall(r"^FROM (.+)$", dockerfile, re.MULTILINE)
+    assert re.fullmatch(r"ros:jazzy-ros-base@sha256:[0-9a-f]{64}", base)
+
+
 def test_everything_of_the_package_index_is_pinned_with_hashes(dockerfile: str, repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
     wanted = [Requirement(line) for line in (*project["project"]["dependencies"], *project["build-system"]["requires"])]
