@@ -25,6 +25,8 @@ QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "r
 """What is predicted, with units."""
 _PLACES = (12, 9, 3, 0)
 """First of the three residual channels of each quantity."""
+RAN_AWAY = 1e30
+"""Misses from here on, or without a value, are infinite: the simulation has left every scale of a flight."""
 _CHUNK = 256
 """Runs rolled at once; keeps the residuals of a chunk in cache."""
 
@@ -82,7 +84,7 @@ class OpenLoop:
             blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
             residual = np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
             found = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
-            ran = np.nan_to_num(found, nan=np.inf, posinf=np.inf, neginf=np.inf)
+            ran = np.where(np.abs(found) < RAN_AWAY, found, np.inf)  # a comparison with NaN is false, too
             yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
 
     def misses(self, theta: FloatArray, at: IndexArray) -> FloatArray:

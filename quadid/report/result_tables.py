@@ -88,15 +88,19 @@ def horizon_table(result: JsonDict) -> TextTable:
     for entry in [*(result["files"] if many else []), result]:
         label = entry.get("log", "all" if many else result["files"][0]["log"])
         for horizon, errors in entry["horizons"].items():
-            rows.append((label, str(horizon), *(number(errors[n]) for n in QUANTITIES)))
+            rows.append((label, str(horizon), *(_error(errors[n]) for n in QUANTITIES)))
             label = ""
         total = entry["sum"]
-        rows.append(("", f"sum 1..{total['to']}", *(number(total[n]) for n in QUANTITIES)))
+        rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in QUANTITIES)))
     last = list(result["horizons"])[-1]
     for label, key in (("noise floor", "noise_floor"), ("if nothing changed", "no_change")):
         rows.append((label, last, *(number(result[key][last][n]) for n in QUANTITIES)))
     title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
     return TextTable(title, columns, tuple(rows))
+
+
+def _error(value: float | None) -> str:
+    return "ran away" if value == math.inf else number(value)
 
 
 def finding_table(findings: Sequence[JsonDict]) -> TextTable:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,22 @@ def test_without_torque_the_rate_error_is_that_of_no_change(inside: Cli, data_di
     for horizon in (1, 10, 50):
         assert result["horizons"][str(horizon)]["rate"] == pytest.approx(naive[horizon - 1], rel=1e-4)
     assert result["sum"]["rate"] == pytest.approx(sum(naive), rel=1e-4)
+
+
+def test_a_vehicle_that_runs_away_is_called_that_and_warns_of_nothing_else(
+    inside: Cli, data_dir: Path, tmp_path: Path
+) -> None:
+    """Rates that grow by themselves, fifty-fold a second: squares of such misses leave the range of numbers."""
+    vehicle = yaml.safe_load((data_dir / "nanodrone" / "vehicle.yaml").read_text(encoding="utf-8"))
+    vehicle["effects"] = {"rate_damping": {"l_p": -50.0, "m_q": -50.0, "n_r": -50.0}}
+    file = tmp_path / "wild.yaml"
+    file.write_text(yaml.safe_dump(vehicle), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = inside("score", data_dir / "nanodrone" / "square_run1.csv", "--vehicle", file, "--horizons", "1,1500")
+    assert run.code == 0
+    assert "after 1500 samples the simulation runs away" in run.out
+    assert run.out.count("ran away") >= 4
 
 
 def test_rate_and_horizons_are_options(inside: Cli, flights: Flights) -> None:
