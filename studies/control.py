@@ -170,14 +170,11 @@ def tables(results: FloatArray) -> list[str]:
 
 
 REMARK = """\
-* Identified parameters cut the error against the initial guess on every path, intervals far from zero; with lag and
-  drag identified too, the error is that of the true parameters to within 3 %.
 * The nominal parameters alone leave most of the error on the fast paths: it comes from the lag and the drag that they
-  do not hold.
-* On the steps, whose rate reference jumps, making up for the lag drives the rotors into their limits: even the true
-  parameters overshoot more and track worse than the nominal ones. That is the controller's doing, not the model's.
-* Attitude and position come from the simulation with noise, not from an estimator. Parameters so wrong that the
-  vehicle is lost, and what the gate does with them, are looked at by `studies.detuned`."""
+  do not hold. With lag and drag identified too, the error is that of the true parameters to within 3 %.
+* On the steps, making up for the lag drives the rotors into their limits: even the true parameters track worse than the
+  nominal ones. That is the controller's doing, not the model's.
+* Attitude and position come from the simulation with noise, not from an estimator."""
 
 PAIRS = (
     ("initial guess", "identified"), ("initial guess", "identified + lag and drag"),

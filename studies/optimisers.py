@@ -202,20 +202,17 @@ def run(kind: str, bounds: str, seed: int, budget: int) -> dict[str, Outcome]:
     return out
 
 
-def table(outcomes: list[dict[str, Outcome]]) -> list[str]:
-    """Markdown rows of one problem."""
-    rows = [
-        "| method | success | median evaluations to it | median cost / optimum | worst | median seconds |",
-        "|---|---|---|---|---|---|",
-    ]
+def table(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str]:
+    """Markdown: a row a method, a column a problem."""
+    heads = [f"{kind}, {bounds} bounds ({len(runs)} seeds)" for (kind, bounds), runs in results.items()]
+    rows = ["| method | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for name in METHODS:
-        runs = [o[name] for o in outcomes]
-        reached = [o.reached for o in runs if o.reached is not None]
-        ratios = [o.ratio for o in runs]
-        rows.append(
-            f"| {name} | {len(reached)}/{len(runs)} | {round(np.median(reached)) if reached else '–'} | "
-            f"{np.median(ratios):.4g} | {np.max(ratios):.4g} | {np.median([o.seconds for o in runs]):.2f} |"
-        )
+        cells = []
+        for outcomes in results.values():
+            reached, evaluations = successes(outcomes, name)
+            middle, worst = (f([o[name].ratio for o in outcomes]) for f in (np.median, np.max))
+            cells.append(f"{reached}, {f'{evaluations:.0f}' if reached else '–'}, {middle:.4g}, {worst:.4g}")
+        rows.append(f"| {name} | " + " | ".join(cells) + " |")
     return rows
 
 
@@ -250,7 +247,7 @@ def main() -> None:
             if options.finished:
                 seeds = range(finished(options.keep, kind, bounds))
             results[kind, bounds] = [kept_or_run(options.keep, kind, bounds, seed, BUDGET[kind]) for seed in seeds]
-            print(f"## {kind}, {bounds}", *table(results[kind, bounds]), sep="\n", flush=True)
+            print(*table(results), sep="\n", flush=True)
     if options.out is not None:
         text = page(results, options.seeds)
         (options.out / "optimisers.md").write_text(text, encoding="utf-8")
@@ -267,31 +264,21 @@ def best(outcomes: list[dict[str, Outcome]]) -> list[str]:
     return sorted(METHODS, key=lambda name: (-successes(outcomes, name)[0], successes(outcomes, name)[1]))
 
 
-def told(outcomes: list[dict[str, Outcome]], name: str) -> str:
-    """One method in words."""
-    count, evaluations = successes(outcomes, name)
-    return f"{name} {count}/{len(outcomes)}" + (f" in {evaluations:.0f} evaluations" if count else "")
-
-
 def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str]:
     """What the tables say about the swarm."""
-    lines, worth, alone = [], [], []
+    worth, alone = [], []
     for (kind, bounds), outcomes in results.items():
-        names = ("least_squares", "quasi_newton", "pso", "pso_algorithm_1", "pso_polish")
         first = best(outcomes)[0]
-        lines.append(
-            f"* {kind}, {bounds} bounds: {', '.join(told(outcomes, n) for n in names)}; best: "
-            f"{told(outcomes, first) if successes(outcomes, first)[0] else 'none'}."
-        )
         gain = successes(outcomes, "pso_polish")[0] - successes(outcomes, "least_squares")[0]
         if gain >= GAIN * len(outcomes):
             worth.append(f"{kind}, {bounds} bounds (+{gain} successes)")
         if first in ("pso", "pso_algorithm_1") and successes(outcomes, first)[0]:
             alone.append(f"{kind}, {bounds} bounds")
-    lines += ["", f"A swarm before least squares gains at least {GAIN:.0%} of the runs over least squares alone on: "]
-    lines[-1] += f"{'; '.join(worth)}." if worth else "none of these problems."
-    lines += ["", f"A swarm without polish is the best of all on: {'; '.join(alone) if alone else 'none of them'}."]
-    return lines
+    return [
+        f"A swarm before least squares gains at least {GAIN:.0%} of the runs over least squares alone on: "
+        + (f"{'; '.join(worth)}." if worth else "none of these problems."), "",
+        f"A swarm without polish is the best of all on: {'; '.join(alone) if alone else 'none of them'}.",
+    ]  # fmt: skip
 
 
 def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -> str:
@@ -299,10 +286,9 @@ def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -
     lines = [
         "# When is a particle swarm worth it?", "",
         f"`python -m studies.optimisers --seeds {seeds} --out docs/results`", "",
-        "Each seed is a new individual Pelican, a new flight, and a start drawn at random in the box, the same for all "
-        "methods. One evaluation is one simulation of one parameter vector, finite differences included. Success: cost "
-        f"within {SUCCESS - 1.0:.0%} of the lowest that any method, or least squares from the truth, found for that "
-        "seed; evaluations are those until then.", "",
+        "Each seed is a new individual Pelican, flight, and random start in the box, the same for all methods. One "
+        "evaluation is one simulation of one parameter vector, finite differences included. Success: cost within "
+        f"{SUCCESS - 1.0:.0%} of the lowest that any method, or least squares from the truth, found for that seed.", "",
         f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, stretches of {SEGMENT:g} s, "
         f"{BUDGET['smooth']} evaluations.",
         f"* Non-smooth: flights of {SECONDS['non-smooth']:g} s in which commands come {1e3 * DELAY:g} ms late and "
@@ -313,13 +299,9 @@ def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -
         + f", off centre by up to a factor of {np.exp(OFF_CENTRE):.2f}.", "",
         "## Answer", "", *answer(results), "",
     ]  # fmt: skip
-    for (kind, bounds), outcomes in results.items():
-        cut = "" if len(outcomes) == seeds else f" (cut short after {len(outcomes)} seeds)"
-        lines += [f"## {kind.capitalize()}, {bounds} bounds{cut}", "", *table(outcomes), ""]
     lines += [
-        "Medians of seconds are of a shared machine and only compare methods; `pso_algorithm_1` simulates one particle "
-        "at a time, as printed, the others many at once where they can.",
-    ]
+        "Successes, median of the evaluations to them, median and largest cost over the optimum:", "", *table(results),
+    ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
 

@@ -133,37 +133,38 @@ def noise_levels(seeds: int, processes: int) -> str:
     """
     text = [f"## Bias with the noise level: {seeds} flights of 60 s, each flown at three noise levels"]
     parts = {x: study([(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
-    text += ["", "Mean error as a share of the stated standard deviation (± its standard error).", ""]
-    text += ["| parameter | " + " | ".join(f"noise × {x:g}" for x in NOISE_SCALES) + " |"]
-    text += ["|---" * (len(NOISE_SCALES) + 1) + "|"]
+    text += ["", "Mean error as a share of the stated standard deviation (± its standard error); coverage in %.", ""]
+    text += ["| parameter | " + " | ".join(f"noise × {x:g} | coverage" for x in NOISE_SCALES) + " |"]
+    text += ["|---" * (2 * len(NOISE_SCALES) + 1) + "|"]
     shares = {x: np.array([o.error / o.sigma for o in part]) for x, part in parts.items()}
     for j, name in enumerate(NOMINAL_NAMES):
-        cells = [f"{np.mean(z[:, j]):+.3f} ± {np.std(z[:, j]) / np.sqrt(len(z)):.3f}" for z in shares.values()]
+        cells = [
+            f"{np.mean(z[:, j]):+.3f} ± {np.std(z[:, j]) / np.sqrt(len(z)):.3f} | "
+            f"{100.0 * np.mean(np.abs(z[:, j]) <= Z95):.1f}"
+            for z in shares.values()
+        ]
         text.append(f"| {name} | " + " | ".join(cells) + " |")
     worst = max(float(np.abs(np.mean(z, axis=0)).max()) for z in shares.values())
     text += ["", f"The largest mean error is {worst:.2f} standard deviations."]
-    for x, part in parts.items():
-        text += ["", f"### Noise × {x:g}", "", table(part)]
     return "\n".join(text)
 
 
 def status(seeds: int, processes: int) -> str:
     """Section on what is claimed where flights do not move enough."""
-    text = []
-    for profile in ("hover", "one_axis", "roll_pitch"):
-        part = study([(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes)
-        text += [
-            f"### {profile}, {seeds} flights of 60 s",
-            "",
-            "| parameter | status: flights | bound % |",
-            "|---|---|---|",
-        ]
-        for j, name in enumerate(NOMINAL_NAMES):
+    profiles = ("hover", "one_axis", "roll_pitch")
+    parts = [study([(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
+    text = [
+        f"## Status: {seeds} flights of 60 s each, and the bound in %", "",
+        "| parameter | " + " | ".join(profiles) + " |", "|---" * (len(profiles) + 1) + "|",
+    ]  # fmt: skip
+    for j, name in enumerate(NOMINAL_NAMES):
+        cells = []
+        for part in parts:
             names = [o.status[j] for o in part]
-            counts = ", ".join(f"{s}: {names.count(s)}" for s in sorted(set(names)))
-            text.append(f"| {name} | {counts} | {100 * np.median([o.bound[j] for o in part]):.2f} |")
-        text.append("")
-    return "\n".join(["## Status", "", *text]).rstrip()
+            counts = ", ".join(f"{names.count(s)} {s}" for s in sorted(set(names)))
+            cells.append(f"{counts}; {100 * np.median([o.bound[j] for o in part]):.3g}")
+        text.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(text)
 
 
 def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:

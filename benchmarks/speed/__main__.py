@@ -55,7 +55,7 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
 def main() -> None:
     """Measures, prints progress, writes page, pictures and JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for speed.json, speed.md and speed-*.png")
+    parser.add_argument("--out", type=Path, required=True, help="folder for speed.json, speed.md and speed-scaling.png")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--parts", default="", help="comma-separated; all by default")
     parser.add_argument("--longest", type=int, default=100, help="longest log of the scaling, in flights of 360 s")

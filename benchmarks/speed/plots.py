@@ -1,4 +1,4 @@
-"""Pictures of how time and memory grow."""
+"""Picture of how time and memory grow with the log."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ import matplotlib.pyplot as plt
 
 
 def draw(results: Mapping[str, Any], folder: Path) -> None:
-    """Writes speed-scaling.png and speed-size.png, of what was measured."""
+    """Writes speed-scaling.png, if that was measured."""
     if "scaling" in results:
         _scaling(results["scaling"], folder / "speed-scaling.png")
-    if "size" in results:
-        _size(results["size"], folder / "speed-size.png")
 
 
 def _scaling(r: Mapping[str, Any], path: Path) -> None:
@@ -29,21 +27,5 @@ def _scaling(r: Mapping[str, Any], path: Path) -> None:
         axis.loglog(r["hours"], [run[key] for run in r["runs"]], "o-")
         axis.set(xlabel="hours of flight at 50 Hz", ylabel=label, title=f"exponent {r['exponents'][key]:.2f}")
         axis.grid(alpha=0.3, which="both")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def _size(r: Mapping[str, Any], path: Path) -> None:
-    figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    groups: dict[str, list[tuple[int, float]]] = {}
-    for name, t in r["times"].items():
-        what, number = name.split(", ")
-        count, unit = number.split(" ")
-        groups.setdefault(f"{what} by {unit}", []).append((int(count), t["processor_least"]))
-    for label, points in groups.items():
-        axis.loglog(*zip(*points, strict=True), "o-", label=label)
-    axis.set(xlabel="number", ylabel="processor time [s]")
-    axis.legend()
-    axis.grid(alpha=0.3, which="both")
     figure.savefig(path, dpi=110)
     plt.close(figure)

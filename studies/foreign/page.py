@@ -1,4 +1,4 @@
-"""The page of `make foreign`: tables over all sets, then what each gave."""
+"""The page of `make foreign`: tables over all sets; `section` is what the command prints of each."""
 
 from __future__ import annotations
 
@@ -45,31 +45,54 @@ class Row:
 
 
 def page(rows: Mapping[str, Row], notes: str = "") -> str:
-    """Markdown of all sets measured so far; `notes` stand before the sets."""
-    parts = ["# Vehicles of others", _ahead(rows), _kept(rows), notes]
-    return "\n\n".join([p.strip() for p in parts if p] + [section(n, SETS[n], row) for n, row in rows.items()]) + "\n"
+    """Markdown of all sets measured so far, `notes` last; what else each gave stands in `foreign.json`."""
+    head = (
+        f"# Vehicles of others\n\n`{COMMAND}`, {min(row.date for row in rows.values())}; parameters, intervals, sizes "
+        "of causes and terms of every set are in `foreign.json`."
+    )
+    return "\n\n".join(p.strip() for p in (head, _ahead(rows), _kept(rows), _answers(rows), notes) if p) + "\n"
+
+
+def _answers(rows: Mapping[str, Row]) -> str:
+    """Verdict, error and causes of every set."""
+    lines = ["| data | verdict | error on data not fitted [noise variances] | causes (not confident in brackets) |",
+             "|---|---|---|---|"]  # fmt: skip
+    for name, row in rows.items():
+        if row.diagnosed is None:
+            lines.append(f"| {name} | refused | | {row.failed.partition('; fix')[0]} |")
+            continue
+        error = row.diagnosed["validation"]
+        found = [f["effect"] if f["confident"] else f"({f['effect']})" for f in row.diagnosed["findings"]]
+        lines.append(
+            f"| {name} | {row.diagnosed['verdict']} | {error['mse_nominal']:.3g} → {error['mse_extended']:.3g} | "
+            f"{', '.join(found)} |"
+        )
+    return "\n".join(lines)
 
 
 def _ahead(rows: Mapping[str, Row]) -> str:
     """Half-second errors of all sets beside each other."""
     lines = [
         f"Errors {AHEAD:g} s ahead on unseen flights as shares of no change, {' / '.join(QUANTITIES)}; in bold what is "
-        "below ridge and random features.  Without a prediction file the physical one stands in its column.", "",
-        "| data | physical file | prediction file | ridge | random features | logged velocity alone: position, scale | "
-        "noise variances, validation |",
-        "|---|---|---|---|---|---|---|",
+        "below ridge and random features. Without a prediction file the physical one stands in its column.", "",
+        "| data | physical file | prediction file | ridge | random features | logged velocity alone: position, scale |",
+        "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for name, row in rows.items():
         if "ridge" not in row.prediction or row.diagnosed is None:
             continue
         ours = row.prediction.get("prediction file", row.prediction["physical file"])
         rivals = np.min([row.prediction[who] for who in _LEARNT], axis=0)
-        best = [f"**{a:.2f}**" if a < b else f"{a:.2f}" for a, b in zip(ours, rivals, strict=True)]
-        cells = [" / ".join(f"{s:.2f}" for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
+        best = [f"**{_share(a)}**" if a < b else _share(a) for a, b in zip(ours, rivals, strict=True)]
+        cells = [" / ".join(_share(s) for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
         cells.insert(1, " / ".join(best))
-        cells.append(f"{row.velocity[1]:.2f}, {row.velocity[0]:.3f}")
-        lines.append(f"| {name} | {' | '.join(cells)} | {row.diagnosed['validation']['mse_extended']:.3g} |")
+        cells.append(f"{_share(row.velocity[1])}, {_share(row.velocity[0])}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) if len(lines) > 4 else ""
+
+
+def _share(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.2f}"
 
 
 def _kept(rows: Mapping[str, Row]) -> str:

@@ -46,7 +46,6 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
         f"## Recorded flights\n`make health`; {len(judged)} flights of two Crazyflies, each against the healthy "
         f"flights of its airframe ({each}, both kinds of log), itself left out.\n\n"
         f"{recorded.table(judged)}\n\n### Answers\n{recorded.confusion(judged)}\n\n"
-        f"### Large damages that were not found\n{recorded.missed(judged)}\n\n"
         f"### Score against size\n![Score against millimetres cut]({picture.name})"
     )
 
@@ -54,10 +53,9 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
 def _simulated(each: int) -> str:
     return (
         f"## Simulated flights\n`make health`, seed {simulated.SEED}; Pelican (plus and X frame) of "
-        f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each; in closed loop (`quadid.flight`) "
-        "hovering, gentle and lively in turn, and by the balance of a hover (`studies/health/flights.py`). From flight "
-        "to flight every rotor's thrust differs by 1 %, the battery sits 0.7 mm elsewhere, the load differs by 1 % (1 "
-        f"sigma).\n\n{simulated.table(each)}"
+        f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each, in closed loop (`quadid.flight`) and "
+        "by the balance of a hover. From flight to flight every rotor's thrust differs by 1 %, the battery sits 0.7 mm "
+        f"elsewhere, the load differs by 1 % (1 sigma).\n\n{simulated.table(each)}"
     )
 
 

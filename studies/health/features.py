@@ -95,9 +95,8 @@ def positioning(flights: Sequence[Flown]) -> float:
 
 _WHY = """
 None is used. Vibration tells how well propellers are balanced: two equal cuts keep the balance, and healthy sets differ
-by half. The roll command's noise is that of the positioning: over flights it goes with the roll that position control
-asks for (correlation {:.2f}). What M3's command does in motion differs by a factor of {:.1f} between flights (1 sigma),
-whatever was cut. Rotor frequency (300 Hz) lies beyond these 100 Hz logs."""
+by half. The roll command's noise goes with the roll that position control asks for (correlation {:.2f}). What M3's
+command does in motion differs by a factor of {:.1f} between flights (1 sigma), whatever was cut."""
 
 
 def text(flights: Sequence[Flown]) -> str:
@@ -114,7 +113,7 @@ def text(flights: Sequence[Flown]) -> str:
             cut = [feature.value(f.recording) for f in mine if f.rotors == {3} and f.total >= LARGE]
             spreads.append(float(healthy.std(ddof=1)))
             far = (np.array(cut) - healthy.mean()) / spreads[-1]
-            moved.append(f"{np.median(far):+.1f} ({far.min():+.1f} to {far.max():+.1f})")
+            moved.append(f"{np.median(far):+.1f}")
         lines.append(f"| {feature.name} | {spreads[0]:.2f} | {spreads[1]:.2f} | {moved[0]} | {moved[1]} |")
     scatter = float(np.exp(np.std([thrust_in_motion(f.recording) for f in flights if f.condition == "cut"])))
     return "\n".join(lines) + "\n" + _WHY.format(positioning(flights), scatter)

@@ -172,12 +172,9 @@ ROWS: tuple[Row, ...] = (
 
 
 def table(judged: Sequence[Judged]) -> str:
-    """The wanted table as Markdown: all flights, and every other one, which shows how far chance goes."""
-    halves = [judged[::2], judged[1::2]]
-    lines = ["| question | wanted | measured | each half of the files |", "|---|---|---|---|"]
-    for question, wanted, measure in ROWS:
-        split = "" if measure is _orders else " · ".join(measure(half) for half in halves)
-        lines.append(f"| {question} | {wanted} | **{measure(judged)}** | {split} |")
+    """The wanted table as Markdown."""
+    lines = ["| question | wanted | measured |", "|---|---|---|"]
+    lines += [f"| {question} | {wanted} | **{measure(judged)}** |" for question, wanted, measure in ROWS]
     return "\n".join(lines)
 
 
@@ -189,9 +186,9 @@ def confusion(judged: Sequence[Judged]) -> str:
         done = _done(one.flown)
         row = count.setdefault(done, dict.fromkeys(answers, 0))
         row[_answer(one)] += 1
-    lines = ["| done \\ answer | " + " | ".join(answers) + " |", "|---" * (len(answers) + 1) + "|"]
+    lines = ["| done | answered |", "|---|---|"]
     for done in sorted(count):
-        lines.append(f"| {done} | " + " | ".join(str(count[done][a] or "") for a in answers) + " |")
+        lines.append(f"| {done} | " + ", ".join(f"{number} {a}" for a, number in count[done].items() if number) + " |")
     return "\n".join(lines)
 
 
@@ -210,17 +207,6 @@ def _answer(one: Judged) -> str:
     if one.named:
         return f"M{one.named[0]}" if len(one.named) == 1 else ("two rotors", "three rotors")[len(one.named) - 2]
     return "effort" if one.health.changes[0].effect == "thrust_drop" else "weight or CG"
-
-
-def missed(judged: Sequence[Judged]) -> str:
-    """Every large damage that was not found."""
-    lines = ["| file | airframe | done | distance of roll, pitch, yaw, effort | p |", "|---|---|---|---|---|"]
-    for one in judged:
-        if _large(one) and not one.changed:
-            what = one.flown.weight or " + ".join(f"M{j + 1} {s:g} mm" for j, s in enumerate(one.flown.cut) if s)
-            far = ", ".join(f"{d:+.1f}" for d in one.health.distance)
-            lines.append(f"| {one.flown.file} | {one.flown.airframe} | {what} | {far} | {one.health.p_value:.2g} |")
-    return "\n".join(lines)
 
 
 def curve(judged: Sequence[Judged], path: Path) -> None:

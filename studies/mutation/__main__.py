@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from mutmut.stats import status_by_exit_code
 
 from studies.judged import judged as by_hand
 
-MUTATED = ("gate", "ledger", "session")
+MUTATED = ("gate", "active_set", "session")
 """Modules of quadid/online that are spoilt (`[tool.mutmut]` in pyproject.toml)."""
 UNNOTICED = ("survived", "no tests")
 
@@ -73,10 +74,10 @@ def survivor(module: str, name: str, judged: Mapping[str, Mapping[str, str]]) ->
 def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivor]]) -> str:
     """Markdown: counts, then survivors by module."""
     lines = [
-        "# Mutation: lines of gate, ledger and session spoilt one by one", "",
+        "# Mutation: lines of gate, active set and session spoilt one by one", "",
         f"`make mutation`, {time.strftime('%Y-%m-%d')}, mutmut {version('mutmut')}. A mutant is the module with one "
         "small change. Noticed: a test of those in `[tool.mutmut]` went red, or ran into its time limit. What nothing "
-        "noticed is judged by a person below.", "",
+        "noticed is judged by a person, line by line in `studies/mutation/judged.yaml`.", "",
         "| module | mutants | noticed | of these by time | unnoticed | not run | noticed of those run |",
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -91,21 +92,21 @@ def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivo
             f"| `online/{module}.py` | {c.total()} | {noticed} | {c['timeout']} | {unnoticed} | {waiting} "
             f"| {share:.1f} % |"
         )
-    for module, found in left.items():
-        if found:
-            lines += ["", f"## What nothing noticed in `online/{module}.py`", "",
-                      "| in | was | became | judgement |", "|---|---|---|---|",
-                      *(_row(s) for s in sorted(found))]  # fmt: skip
+    counted = Counter((module, _kind(s)) for module, found in left.items() for s in found)
+    lines += ["", "| module | unnoticed | of them |", "|---|---|---|"]
+    lines += [f"| `online/{module}.py` | {what} | {count} |" for (module, what), count in sorted(counted.items())]
     return "\n".join(lines) + "\n"
 
 
-def _row(s: Survivor) -> str:
-    return f"| `{s.function}` | {_code(s.before)} | {_code(s.after)} | {s.judgement or '**not judged**'} |"
+def _kind(s: Survivor) -> str:
+    """Judgement up to its first comma or colon; the whole change where nobody judged it."""
+    if s.judgement:
+        return re.split("[:,;]", s.judgement)[0]
+    return f"**not judged**: in `{s.function}` {_code(s.before)} became {_code(s.after)}"
 
 
 def _code(text: str) -> str:
-    short = text if len(text) <= 110 else f"{text[:109]}…"
-    return f"`{short}`".replace("|", "\\|") if text else "–"
+    return f"`{text}`".replace("|", "\\|") if text else "nothing"
 
 
 if __name__ == "__main__":

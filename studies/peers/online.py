@@ -164,7 +164,7 @@ def section() -> list[str]:
     return [
         "## Online: Kalman filters", "",
         f"`python -m studies.peers online`: {len(SEEDS)} flights of a Pelican (seeds {SEEDS[0]} to {SEEDS[-1]}), the "
-        f"guess off by up to 35 %, J_r known to the filters. Their random walk of {WALK:g} a sample is a compromise: a "
-        "smaller one is more exact and sees a change later. They see it when b has moved half of the change; the "
+        f"guess off by up to 35 %, J_r known to the filters. Their random walk of {WALK:g} a sample is a "
+        "compromise between exactness and speed. They see it when b has moved half of the change; the "
         "session when it says mass_change. The filters are told the true noise.", "", *rows,
     ]  # fmt: skip

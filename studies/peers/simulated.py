@@ -114,9 +114,9 @@ def said(records: Sequence[Record]) -> str:
     ]  # fmt: skip
     missed = sum(bool(out) for out, status in wrong if status == "identified")
     return (
-        f"With the motor lag missing from both models, `mujoco.sysid` says nothing: its intervals are those of a good "
-        f"model. `quadid identify` calls its numbers: {counts}; of those called identified {missed} lie outside their "
-        "interval. `quadid diagnose` names the lag (diagnosis.md)."
+        "With the motor lag missing from both models, `mujoco.sysid` says nothing. `quadid identify` calls its "
+        f"numbers: {counts}; of those called identified {missed} lie outside their interval. `quadid diagnose` names "
+        "the lag ([diagnosis.md](diagnosis.md))."
     )
 
 
@@ -125,9 +125,8 @@ def section(records: Sequence[Record]) -> list[str]:
     return [
         "## mujoco.sysid on simulated flights", "",
         f"`make peers` (`python -m studies.peers simulated --seeds N`): {SECONDS:g} s of a drawn Pelican flown by our "
-        "truth at 1 kHz (equations that neither program fits), logged at 50 Hz, the guess off by up to 35 %. "
-        "`mujoco.sysid` gets the same vehicle as MJCF, chunks of 1 s from the measured attitude and rate, residuals "
-        "over the true noise of each sensor, and its own Gauss-Newton; we get the log and estimate noise ourselves.",
+        "truth, logged at 50 Hz, the guess off by up to 35 %. `mujoco.sysid` gets the vehicle as MJCF, chunks of 1 s "
+        "from the measured state, and the true noise of each sensor; we estimate the noise.",
         "",
         *table(records), "", said(records),
     ]  # fmt: skip

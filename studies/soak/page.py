@@ -43,8 +43,7 @@ def _accelerated(r: Result) -> list[str]:
         f"{GROUND:.0f} s of silence, and again; a fit every {r['refit']:.0f} s, a diagnosis every "
         f"{r['diagnose']:.0f} s ({last['fits']} in all), {last['published']} sets published. The history keeps the "
         f"newest {r['kept']} candidates and events here, so that its limit is reached (in service "
-        f"{KEPT['candidates']} and {KEPT['events']}); numbered sets "
-        "are kept for ever.", "",
+        f"{KEPT['candidates']} and {KEPT['events']}).", "",
         f"Samples sent {last['sent']:,}, taken {last['taken']:,}, dropped {last['dropped']:,}: "
         f"**{last['sent'] - last['taken'] - last['dropped']} lost without a word**. Slopes over the last three "
         f"quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files {slope(points, 'files_mib'):+.3f} MiB/h, "
@@ -52,7 +51,7 @@ def _accelerated(r: Result) -> list[str]:
         "| flight h | memory MiB | history MiB | us a sample | ms a fit or diagnosis | dropped |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
-    chosen = points if len(points) <= 13 else [*points[1::2]]
+    chosen = points[:: -max(len(points) // 4, 1)][::-1]
     lines += [
         f"| {p['hours']:.1f} | {p['memory_mib']:.1f} | {p['files_mib']:.1f} | {p['us_a_sample']:.1f} | "
         f"{p['ms_a_fit']:.0f} | {p['dropped']} |" for p in chosen
@@ -80,10 +79,10 @@ def _live(r: Result) -> list[str]:
         "| min | memory MiB | fit process MiB | history and log MiB | handles | threads | load average |",
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
-    every = max(len(points) // 10, 1)
+    every = max(len(points) // 4, 1)
     lines += [
         f"| {60 * p['hours']:.0f} | {p['memory_mib']:.1f} | {p['worker_mib']:.1f} | {p['files_mib']:.2f} | "
-        f"{p['handles']:.0f} | {p['threads']:.0f} | {p['load']:.1f} |" for p in points[::every]
+        f"{p['handles']:.0f} | {p['threads']:.0f} | {p['load']:.1f} |" for p in points[::-every][::-1]
     ]  # fmt: skip
     if r["problems"]:
         lines += ["", "Said: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]

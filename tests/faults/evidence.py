@@ -98,12 +98,12 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
         "# Faults, what is promised, what happened",
         "",
         f"Written by `{command}`: tests with the real thing failing. A sentence stands here only when its test passed; "
-        "of tests of one file the first is quoted. All sentences, with test and day: `faults.json` beside this page.",
+        "the first of a row is quoted. All sentences, with test and day: `faults.json` beside this page.",
         "",
-        f"{green} of {len(FAULTS)} rows have evidence.",
+        f"{green} of {len(FAULTS)} rows have evidence{_days(evidence)}.",
         "",
-        "| # | fault | promise | what happened | tests | passed |",
-        "|---|---|---|---|---|---|",
+        "| # | fault | promise | what happened | tests |",
+        "|---|---|---|---|---|",
         *(_row(number, *FAULTS[number], rows[number]) for number in FAULTS),
     ]
     for title, names in (("Failed", failed), ("Skipped", skipped)):
@@ -115,11 +115,13 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
 def _row(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> str:
     left = f"| {number} | {_cell(fault)} | {_cell(promise)} |"
     if not said:
-        return f"{left} **no test of this row passed** | | |"
-    first = {e.test.partition("::")[0]: e for e in sorted(said, key=lambda e: e.test, reverse=True)}
-    quoted = "; ".join(_cell(first[file].text) for file in sorted(first))
-    days = sorted({e.date for e in said})
-    return f"{left} {quoted} | {len({e.test for e in said})} | {' … '.join(dict.fromkeys((days[0], days[-1])))} |"
+        return f"{left} **no test of this row passed** | |"
+    return f"{left} {_cell(min(said, key=lambda e: e.test).text)} | {len({e.test for e in said})} |"
+
+
+def _days(evidence: Sequence[Evidence]) -> str:
+    days = sorted({e.date for e in evidence if e.date})
+    return f", of {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else ""
 
 
 def _cell(text: str) -> str:

@@ -48,13 +48,11 @@ def page(book: Mapping[str, Sequence[Run]]) -> str:
     lines = [
         "# Fuzzing of the binary readers",
         "",
-        "Written by `make fuzz`. Small whole logs are mutated with knowledge of their format (bits, integers, records "
-        "lost, doubled, swapped or spliced; lengths that lie, records cut to nothing; message definitions, formats and "
-        "headers that say something else; chunks made to inflate; records or filler repeated up to 1 MiB; checksums "
-        "repaired or not; cuts) and opened in process, each under a guard of 0.5 s of processor time and 3 µs for each "
-        "byte, 64 MiB of growth and 1 GiB in all. Allowed is a recording that keeps its promises (finite values, "
-        "rising times) or one line of a documented error; anything else, a warning of numpy included, is a finding. "
-        "Input number n is the same everywhere; findings become tests (`tests/fuzz/test_findings.py`).",
+        "Written by `make fuzz`. Small whole logs are mutated with knowledge of their format (`tests/fuzz`) and opened "
+        "under a guard of 0.5 s of processor time and 3 µs for each byte, 64 MiB of growth and 1 GiB in all. Allowed "
+        "is a recording of finite values and rising times, or one line of a documented error; anything else, a warning "
+        "of numpy included, is a finding. Findings are mended and become tests (`tests/fuzz/test_findings.py`); runs "
+        "and notes are in `fuzz.json`.",
         "",
         f"Goal: {GOAL:,} inputs of each format.",
         "",
@@ -70,17 +68,4 @@ def page(book: Mapping[str, Sequence[Run]]) -> str:
         lines.append(
             f"| {kind} | {tried:,} | {tried / GOAL:.0%} | {read:,} | {refused:,} | {findings} | {rate} | {slowest} |"
         )
-    lines += [
-        "",
-        "## Runs",
-        "",
-        "| format | inputs from | to | findings | date | revision | note |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for kind in FORMATS:
-        for run in book.get(kind, []):
-            span = f"{run['start']:,} | {run['stop'] - 1:,}"
-            lines.append(
-                f"| {kind} | {span} | {run['findings']} | {run['date']} | {run['revision']} | {run.get('note', '')} |"
-            )
     return "\n".join(lines) + "\n"
