@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import numpy as np
@@ -100,6 +101,16 @@ class ParameterPrior(Strict):
     def limits(self) -> tuple[float, float]:
         """Bounds, by default a factor of 4 each way."""
         return self.bounds or (self.initial / DEFAULT_BOUND_FACTOR, self.initial * DEFAULT_BOUND_FACTOR)
+
+    @property
+    def log_halfwidth(self) -> float:
+        """Half the distance of the bounds on the log scale."""
+        return 0.5 * math.log(self.limits[1] / self.limits[0])
+
+    @property
+    def log_sigma(self) -> float:
+        """Standard deviation of the logarithm: that of the file, else `log_halfwidth`."""
+        return self.sigma / self.initial if self.sigma else self.log_halfwidth
 
 
 class Noise(Strict):

@@ -19,7 +19,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from quadid.chi_square import Z95
 from quadid.experiment import Limits, Proposal, Simulator, propose
 from quadid.flight import Flight, draw_truth, fly
 from quadid.identify.fit import FitOptions, fit
@@ -44,7 +43,7 @@ def quiet(stage: str, share: float) -> None:
 def obtained(windows: list[Window], vehicle: Vehicle, seed: int) -> FloatArray:
     """Relative 95 % half-widths (6,) after identifying `windows`."""
     found = fit(windows, vehicle, FitOptions(iterations=0, seed=seed))
-    return np.asarray(np.expm1(np.minimum(Z95 * found.uncertainty.sigma, 50.0)))
+    return halfwidths(np.linalg.inv(found.uncertainty.covariance))
 
 
 def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:

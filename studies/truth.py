@@ -72,7 +72,7 @@ def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
     lin = settle_states(shooting, theta)
     shooting = shooting.with_noise(shaped_noise(shooting, theta, shooting.free([]), lin.states))
     lin = settle_states(shooting, theta)
-    return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES), lin.states).gram.sum(axis=0))
+    return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES), lin.states).information)
 
 
 def run(job: tuple[int, str, float, float]) -> Outcome:

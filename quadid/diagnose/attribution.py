@@ -215,7 +215,7 @@ def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = No
     labels = block_labels(lin)
     total = np.zeros(int(labels.max()) + 1)
     np.add.at(total, labels, lin.cost + lin.occam)
-    return total, float(lin.rows.sum())
+    return total, lin.total_rows
 
 
 class _Halves(NamedTuple):

@@ -41,7 +41,7 @@ def log_evidence(model: Model, calibration: float) -> float:
         model: fitted; its deviance holds the quadratic part of its prior.
         calibration: `calibration` of the two models compared.
     """
-    gram = model.lin.gram.sum(axis=0) / np.sqrt(np.outer(model.precision, model.precision))
+    gram = model.lin.information / np.sqrt(np.outer(model.prior.precision, model.prior.precision))
     occam = float(np.linalg.slogdet(np.eye(len(gram)) + gram / calibration)[1])
     prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes)
     return -model.deviance / calibration - occam - float(prior)

@@ -11,17 +11,10 @@ import numpy as np
 from quadid.diagnose.cross_validation import block_labels, held_out_deviance
 from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import NEVER
-from quadid.identify.covariance import Uncertainty, score_products, uncertainty
-from quadid.identify.gauss_newton import (
-    Polished,
-    Prior,
-    bounded_step,
-    default_prior,
-    polish,
-    prior_terms,
-    scaled_difference,
-)
+from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
+from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
+from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance, prior_terms
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -61,28 +54,22 @@ class Model:
     @property
     def rows(self) -> float:
         """Independent residuals."""
-        return float(self.lin.rows.sum())
+        return self.lin.total_rows
 
     @property
     def reduced_chi_square(self) -> float:
         """Deviance per independent residual; 1 at the noise floor."""
-        return float(self.lin.cost.sum()) / max(self.rows, 1.0)
-
-    @property
-    def precision(self) -> FloatArray:
-        """Of the prior on each scaled parameter, shape (P,)."""
-        return np.asarray(self.prior.sigma**-2.0)
+        return self.lin.reduced_chi_square
 
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""
-        covariance = np.linalg.inv(self.lin.gram.sum(axis=0) + np.diag(self.precision))
-        return np.asarray(np.diag(covariance @ score_products(self.lin)[0] @ covariance) / np.diag(covariance))
+        return variance_ratio(self.lin, posterior_covariance(self.lin.information, self.prior))[0]
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
-        return uncertainty(self.lin, self.free, self.prior, self.theta)
+        return uncertainty(self.lin, self.prior)
 
     @property
     def deviations(self) -> dict[str, float]:
@@ -170,12 +157,12 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Sketch:
 
 def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: FloatArray) -> Sketch:
     lin = shooting.linearise(theta, free, model.states)
-    precision, pull, cost = prior_terms(free, prior, theta)
-    h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
+    h, g = normal_equations(lin, free, prior, theta)
     z = bounded_step(free, theta, h, g)
-    deviance = float(lin.cost.sum() + lin.occam.sum()) + cost + float(2.0 * g @ z + z @ h @ z)
+    here = lin.total_cost + float(lin.occam.sum()) + prior_terms(free, prior, theta)[2]
+    deviance = here + float(2.0 * g @ z + z @ h @ z)
     moved = free.move(theta, z)
-    return Sketch(moved, model.deviance - deviance, lin.stepped(scaled_difference(free, theta, moved)))
+    return Sketch(moved, model.deviance - deviance, lin.stepped(free.step(theta, moved)))
 
 
 def extend(

@@ -179,7 +179,7 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
         start, _ = swarm_search(short, start, free, settings, swarm.particles, swarm.seed, report)
     report("fit", 0.0)
     typical, first = short.noise, polish(short, start, free, iterations=8)
-    far = first.cost > LINEAR_MISFIT * float(first.lin.rows.sum())
+    far = first.cost > LINEAR_MISFIT * first.lin.total_rows
     short = short.with_noise(residual_noise(short, first))
     first = polish(short, first.theta, free, states=first.states, iterations=8)
     report("noise floor", 0.0)

@@ -19,6 +19,7 @@ import numpy as np
 
 from quadid.diagnose.cross_validation import Gain, block_labels, held_out_deviance, paired_gain
 from quadid.diagnose.model import Model
+from quadid.identify.schur_complement import eliminated
 from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
 from quadid.types import FloatArray, IndexArray
@@ -153,7 +154,7 @@ def _judge(
     pieces = [_products(site, p) for p in prepared]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
     own = model.lin.gram.shape[1]
-    precision = np.concatenate([1.0 / model.prior.sigma**2, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
+    precision = np.concatenate([model.prior.precision, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
     both = replace(model.lin, gram=gram, grad=grad)
     none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
     gain = paired_gain(held_out_deviance(none, precision[:own], labels), held_out_deviance(both, precision, labels))
@@ -189,12 +190,10 @@ def _t(a: FloatArray) -> FloatArray:
 
 def _chi_squares(gram: FloatArray, grad: FloatArray, precision: FloatArray, own: int) -> FloatArray:
     """How much each probe alone lowers the deviance, the model's own parameters refitted."""
-    h_oo = gram[:own, :own] + np.diag(precision[:own])
-    solved = np.linalg.solve(h_oo, np.column_stack([gram[:own, own:], grad[:own]]))
-    s = np.diag(gram[own:, own:]) - np.sum(gram[:own, own:] * solved[:, :-1], axis=0)
-    g = grad[own:] - gram[own:, :own] @ solved[:, -1]
-    informed = s > 1e-6 * np.diag(gram[own:, own:])
-    return np.asarray(np.where(informed, g * g / np.maximum(s, 1e-12), 0.0))
+    alone = np.diag(gram)[own:]
+    h, gain = eliminated(alone[:, None, None], gram[own:, None, :own], gram[:own, :own] + np.diag(precision[:own]))
+    g, left = grad[own:] - gain[:, 0] @ grad[:own], h[:, 0, 0]
+    return np.asarray(np.where(left > 1e-6 * alone, g * g / np.maximum(left, 1e-12), 0.0))
 
 
 def signals(part: Columns) -> dict[str, FloatArray]:

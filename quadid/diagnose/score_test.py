@@ -15,7 +15,8 @@ import numpy as np
 
 from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
 from quadid.diagnose.model import Model, settled_states, taken_out_causes
-from quadid.identify.gauss_newton import prior_terms
+from quadid.identify.priors import prior_terms
+from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.types import FloatArray, IndexArray
 
@@ -121,8 +122,8 @@ class Everything:
         place = np.array([self.place[model.free.names[i]] for i in kept])
         precision, pull, _ = prior_terms(model.free, model.prior, model.theta)
         lin, risen = self._moved(lost)
-        h = lin.gram.sum(axis=0)[np.ix_(place, place)] + np.diag(precision[kept])
-        return lin, _Own(h, lin.grad.sum(axis=0)[place] + pull[kept], place), risen
+        h = lin.information[np.ix_(place, place)] + np.diag(precision[kept])
+        return lin, _Own(h, lin.gradient[place] + pull[kept], place), risen
 
     def _moved(self, lost: Sequence[str]) -> tuple[Linearised, float]:
         """The quadratic around the point where entries `lost` are neutral, and by how much it is higher there."""
@@ -142,7 +143,7 @@ def missed(model: Model, least: float) -> tuple[Candidate, ...]:
 
     Half of them at most are let go: the linear picture does not hold for all at once.
     """
-    h = model.lin.gram.sum(axis=0) + np.diag(model.precision)
+    h = model.lin.information + np.diag(model.prior.precision)
     z, place = model.free.from_neutral(model.theta), {n: i for i, n in enumerate(model.free.names)}
     kept, alive = list(model.causes), np.ones(len(place), dtype=bool)
     for _ in range(max(len(kept) // 2, 1)):
@@ -152,9 +153,8 @@ def missed(model: Model, least: float) -> tuple[Candidate, ...]:
                 continue
             mine = np.array([place[n] for n in cause.names])
             rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))
-            cross = h[np.ix_(rest, mine)]
-            schur = h[np.ix_(mine, mine)] - cross.T @ np.linalg.solve(h[np.ix_(rest, rest)], cross)
-            losses.append((float(z[mine] @ schur @ z[mine]), cause, mine))
+            left = eliminated(h[np.ix_(mine, mine)], h[np.ix_(mine, rest)], h[np.ix_(rest, rest)])
+            losses.append((float(z[mine] @ left.h @ z[mine]), cause, mine))
         if not losses:
             break
         loss, cause, mine = min(losses, key=lambda item: item[0])
@@ -174,18 +174,16 @@ def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> 
         g_m: gradient of the parameters (n, m).
         own: the model's parameters.
     """
-    n, m, o = h_mo.shape
-    solved = np.linalg.solve(own.h, np.column_stack([h_mo.reshape(n * m, o).T, own.g]))
-    s = h_mm - np.matmul(h_mo, solved[:, :-1].T.reshape(n, m, o).transpose(0, 2, 1))
-    g = g_m - h_mo @ solved[:, -1]
+    h, gain = eliminated(h_mm, h_mo, own.h)
+    g, m = g_m - gain @ own.g, range(h_mm.shape[-1])
     # Directions the model's own parameters already explain carry no information; keep them finite.
-    s[:, range(m), range(m)] += 1e-9 * np.einsum("nii->ni", h_mm) + 1e-2
-    z = -np.linalg.solve(s, g[..., None])[..., 0]
+    h[:, m, m] += 1e-9 * h_mm[:, m, m] + 1e-2
+    z = -np.asarray(np.linalg.solve(h, g[..., None]))[..., 0]
     return own.fall - np.sum(g * z, axis=1), z
 
 
 def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
-    h, g = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
+    h, g = lin.information, lin.gradient
     drop, z = _reduced(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
     return Score(candidate, float(drop[0]), z[0])
 

@@ -268,7 +268,7 @@ def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Mode
         for offset in (-2.0, -1.0, 0.0, 1.0, 2.0):
             theta = best_theta.copy()
             theta[candidate.timed] += offset * step
-            costs.append((float(shooting.linearise(theta, none, model.states).cost.sum()), offset, theta))
+            costs.append((shooting.linearise(theta, none, model.states).total_cost, offset, theta))
         best_theta = min(costs, key=lambda c: c[0])[2]
         step *= 0.25
     return replace(fit_model(shooting, best_theta, model.causes, model.states, iterations=4), tried=model.tried)

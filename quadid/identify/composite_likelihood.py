@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, scaled_difference
+from quadid.identify.gauss_newton import Polished, polish
+from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.types import FloatArray, IndexArray
 
@@ -66,15 +67,15 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
     if second.count < enough or shooting.local or not np.isfinite(found.cost):
         return None
     other = polish(second, found.theta, free, prior, iterations=ITERATIONS, robust=robust)
-    if not other.cost / other.lin.rows.sum() < WORSE * found.cost / found.lin.rows.sum():
+    if not other.cost * found.lin.total_rows < WORSE * found.cost * other.lin.total_rows:
         return None
-    precision = np.diag(prior_terms(free, prior, found.theta)[0])
-    h_one, h_other = found.lin.gram.sum(axis=0), other.lin.gram.sum(axis=0)
-    away = scaled_difference(free, found.theta, other.theta)
+    precision = np.diag(prior.precision)
+    h_one, h_other = found.lin.information, other.lin.information
+    away = free.step(found.theta, other.theta)
     step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
     h = 0.5 * (h_one + h_other)
     information = _information(h, *_shared(shooting, second, found, other, free))
-    return BothCuts(free.move(found.theta, step), information, other.iterations)
+    return BothCuts(free.move(found.theta, np.asarray(step)), information, other.iterations)
 
 
 def _shared(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.identify.gauss_newton import Prior, prior_terms
+from quadid.identify.priors import Prior, posterior_covariance
 from quadid.identify.shooting import Free, Linearised
 from quadid.parameters import Parameter, ParameterSet, Status, at_bound
 from quadid.types import FloatArray
@@ -61,9 +61,7 @@ class Uncertainty:
         return self.sigma if self.grown is None else self.sigma / self.grown
 
 
-def uncertainty(
-    lin: Linearised, free: Free, prior: Prior, theta: FloatArray, information: FloatArray | None = None
-) -> Uncertainty:
+def uncertainty(lin: Linearised, prior: Prior, information: FloatArray | None = None) -> Uncertainty:
     """Posterior covariance, widened where the segment scores are larger or more correlated than the noise model says.
 
     The widening is the ratio of the heteroscedasticity- and autocorrelation-consistent ("sandwich") variance (Newey and
@@ -71,23 +69,28 @@ def uncertainty(
     that well-modelled data keep the efficient interval.
 
     Args:
-        lin: linearisation at `theta`.
-        free: parameters.
-        prior: what is known of them beforehand.
-        theta: full vector.
+        lin: linearisation at the optimum.
+        prior: what is known of the parameters beforehand.
         information: of the data, shape (P, P), where more was used than `lin`; by default its own.
     """
-    precision, _, _ = prior_terms(free, prior, theta)
-    covariance = np.linalg.inv(lin.gram.sum(axis=0) + np.diag(precision))
-    inflation = np.ones(len(free.entries))
+    covariance = posterior_covariance(lin.information, prior)
+    inflation = np.ones(len(prior.sigma))
     if len(lin.grad) >= 10:
-        meat, lags = score_products(lin)
-        ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
+        ratio, lags = variance_ratio(lin, covariance)
         sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
         inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
     if information is not None:
-        covariance = np.linalg.inv(information + np.diag(precision))
+        covariance = posterior_covariance(information, prior)
     return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
+
+
+def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray, int]:
+    """True variance of each parameter over that in `covariance` (P, P), shape (P,), and the number of lags used.
+
+    The true one is the "sandwich" of `score_products`.
+    """
+    meat, lags = score_products(lin)
+    return np.asarray(np.diag(covariance @ meat @ covariance) / np.diag(covariance)), lags
 
 
 def score_products(lin: Linearised) -> tuple[FloatArray, int]:
@@ -105,25 +108,20 @@ def score_products(lin: Linearised) -> tuple[FloatArray, int]:
 
 def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncertainty) -> ParameterSet:
     """Parameters with units, intervals (log scale for nominal ones) and status."""
-    sigma = unc.sigma
+    scale, at = free.jacobian(theta), theta[free.index]
+    sigma = unc.sigma * scale
+    low, high = (free.shifted(at, z) for z in (-Z95 * unc.sigma, Z95 * unc.sigma))
     out = []
     for j, e in enumerate(free.entries):
-        value, half = float(theta[e.index]), Z95 * float(sigma[j])
-        log = bool(free.is_log[j])
-        ci = (
-            (value * math.exp(-half), value * math.exp(half))
-            if log
-            else (value - half * e.typical, value + half * e.typical)
-        )
+        value, ci = float(at[j]), (float(low[j]), float(high[j]))
         status, partner = _status(j, free, unc, value, ci)
         out.append(
             Parameter(
-                e.name, e.unit, value, float(sigma[j]) * (value if log else e.typical), float(initial[e.index]),
+                e.name, e.unit, value, float(sigma[j]), float(initial[e.index]),
                 (e.lower, e.upper), status, partner, ci, float(unc.prior_share[j]),
-                log and float(unc.prior_sigma[j]) < 0.49 * math.log(e.upper / e.lower),
+                bool(free.is_log[j]) and float(unc.prior_sigma[j]) < 0.49 * math.log(e.upper / e.lower),
             )
         )  # fmt: skip
-    scale = free.jacobian(theta)
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
 
 

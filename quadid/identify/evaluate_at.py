@@ -8,8 +8,9 @@ import numpy as np
 
 from quadid.identify.covariance import parameter_set, uncertainty
 from quadid.identify.fit import FIT_SECONDS, Fit
-from quadid.identify.gauss_newton import Convergence, default_prior
+from quadid.identify.gauss_newton import Convergence
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.priors import default_prior, posterior_covariance
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -35,10 +36,9 @@ def fit_at(
     free = shooting.free(NOMINAL_NAMES)
     lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
     prior = default_prior(shooting, free)
-    unc = uncertainty(lin, free, prior, theta)
+    unc = uncertainty(lin, prior)
     parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
-    precision = lin.gram.sum(axis=0) + np.diag(1.0 / prior.sigma**2)
-    step = np.linalg.solve(precision, lin.grad.sum(axis=0))
+    step = posterior_covariance(lin.information, prior) @ lin.gradient
     warnings = []
     far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
     if far:

@@ -60,7 +60,7 @@ def excitation(
     shooting = Shooting.cut(windows, vehicle, seconds, noise)
     free = shooting.free(list(names))
     point = shooting.layout.initial(vehicle) if theta is None else theta
-    information = shooting.linearise(point, free).gram.sum(axis=0)
+    information = shooting.linearise(point, free).information
     diagonal = np.maximum(np.diag(information), 0.0)
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), np.inf)

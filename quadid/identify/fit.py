@@ -11,7 +11,7 @@ from quadid.errors import WindowError
 from quadid.identify.answer import final_answer
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
-from quadid.identify.gauss_newton import Convergence, Polished, default_prior, polish
+from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
 from quadid.identify.noise_estimation import flexible_names as flexible_names
@@ -21,6 +21,7 @@ from quadid.identify.noise_estimation import reweighted_fit
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
+from quadid.identify.priors import default_prior
 from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
@@ -181,7 +182,7 @@ def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Fre
     Aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model that lacks them otherwise takes them
     for a large inertia.
     """
-    if plain.lin.cost.sum() < MOMENT_MISFIT * plain.lin.rows.sum() and _at_rest(free, plain.theta):
+    if plain.lin.total_cost < MOMENT_MISFIT * plain.lin.total_rows and _at_rest(free, plain.theta):
         return None
     apart = short.with_local(SLOW_MOMENTS)
     best = polish(apart, start, free, iterations=10)
@@ -206,7 +207,7 @@ def _finish(
     prior = default_prior(shooting, free)
     both = None if polished is None else with_second_cut(shooting, polished, free, prior, robust)
     lin = polished.lin if polished is not None else shooting.linearise(theta, free)
-    unc = uncertainty(lin, free, prior, theta, None if both is None else both.information)
+    unc = uncertainty(lin, prior, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)

@@ -10,11 +10,10 @@ import numpy as np
 from quadid.errors import NotIdentifiableError
 from quadid.identify.box_qp import least_within
 from quadid.identify.initial_states import InitialStates
+from quadid.identify.priors import Prior, default_prior, normal_equations, prior_terms
 from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
-from quadid.types import FloatArray as FloatArray
+from quadid.types import FloatArray
 
-PRIOR_SIGMA_LINEAR = 10.0
-"""Weak prior of an effect parameter: this many typical sizes."""
 HUBER = 4.0
 """Residuals beyond this many sigma are down-weighted (Huber); Gaussian data lose nothing measurable."""
 
@@ -38,14 +37,6 @@ _STEADY_WEIGHT = 0.01
 
 
 @dataclass(frozen=True)
-class Prior:
-    """Gaussian prior on the scaled parameters: ``mean`` of the parameter, ``sigma`` in scaled units."""
-
-    mean: FloatArray
-    sigma: FloatArray
-
-
-@dataclass(frozen=True)
 class Polished:
     """Result of a polish.
 
@@ -66,33 +57,6 @@ class Polished:
     def states(self) -> InitialStates:
         """Initial states of the optimum."""
         return self.lin.states
-
-
-def default_prior(shooting: Shooting, free: Free) -> Prior:
-    """Prior of each free parameter: thrust stand, else the file's sigma, else half of its bounds on the log scale."""
-    mean, sigma = [], []
-    stand = shooting.vehicle.stand_thrust
-    for e in free.entries:
-        if e.name == "b" and stand is not None:
-            mean.append(stand[0])
-            sigma.append(stand[1])
-            continue
-        if e.name in shooting.vehicle.parameters:
-            p = shooting.vehicle.parameters[e.name]
-            low, high = p.limits
-            mean.append(p.initial)
-            sigma.append(p.sigma / p.initial if p.sigma else 0.5 * np.log(high / low))
-        else:
-            mean.append(e.neutral)
-            sigma.append(PRIOR_SIGMA_LINEAR)
-    return Prior(np.array(mean), np.array(sigma))
-
-
-def prior_terms(free: Free, prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Precision (P,), gradient (P,) and cost of the prior at `theta`, in scaled parameters."""
-    z = free.difference(theta[free.index], prior.mean)
-    precision = 1.0 / prior.sigma**2
-    return precision, precision * z, float(np.sum(precision * z * z))
 
 
 def robust_weights(shooting: Shooting, lin: Linearised) -> list[FloatArray]:
@@ -149,18 +113,16 @@ def _descend(
         shooting = shooting.with_robust(robust_weights(shooting, lin))
         lin = shooting.linearise(theta, free, lin.states)
     damping, refused, spent, outcome = 0.0, 0, 3 if robust else 1, Convergence.BUDGET
-    cost = float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
+    cost = lin.total_cost + prior_terms(free, prior, theta)[2]
     while spent < iterations:
-        precision, pull, _ = prior_terms(free, prior, theta)
-        h = lin.gram.sum(axis=0) + np.diag(precision)
-        g = lin.grad.sum(axis=0) + pull
+        h, g = normal_equations(lin, free, prior, theta)
         z = bounded_step(free, theta, h + damping * np.diag(np.diag(h)), g)
         z *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(z), initial=0.0)), 1e-12))
         moved = free.move(theta, z)
-        actual = scaled_difference(free, theta, moved)
+        actual = free.step(theta, moved)
         trial = shooting.linearise(moved, free, lin.stepped(actual))
         spent += 1
-        trial_cost = float(trial.cost.sum()) + prior_terms(free, prior, moved)[2]
+        trial_cost = trial.total_cost + prior_terms(free, prior, moved)[2]
         # The first step also moves the initial states away from single noisy samples; it may cost a little.
         least = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
         if not (trial_cost <= least and _leads_on(trial)):
@@ -184,7 +146,7 @@ def _descend(
             # A cost under old weights says nothing about one under new weights.
             shooting = shooting.with_robust(weights)
             lin = shooting.linearise(theta, free, lin.states)
-            spent, cost = spent + 1, float(lin.cost.sum()) + prior_terms(free, prior, theta)[2]
+            spent, cost = spent + 1, lin.total_cost + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
 
 
@@ -192,19 +154,19 @@ def _worse_than_measured(shooting: Shooting, free: Free, found: Polished) -> boo
     """Whether the states of an unfinished descent cost more than twice what measured ones would."""
     if found.outcome is Convergence.CONVERGED:
         return False
-    return 2.0 * float(shooting.linearise(found.theta, free).cost.sum()) < float(found.lin.cost.sum())
+    return 2.0 * shooting.linearise(found.theta, free).total_cost < found.lin.total_cost
 
 
 def _leads_on(lin: Linearised) -> bool:
     """Whether a next step can be worked out: a simulation that runs away leaves slopes beyond the digits of a float."""
-    gram = lin.gram.sum(axis=0)
-    return bool(np.isfinite(gram).all() and np.isfinite(lin.grad).all() and (np.diag(gram) >= 0.0).all())
+    h = lin.information
+    return bool(np.isfinite(h).all() and np.isfinite(lin.grad).all() and (np.diag(h) >= 0.0).all())
 
 
 def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:
     """Whether initial states, moved alone, miss the cost that their linearisation counts on."""
-    reached = float(shooting.linearise(theta, free, lin.stepped()).cost.sum())
-    return not reached <= (1.0 + _SETTLED) * float(lin.cost.sum())
+    reached = shooting.linearise(theta, free, lin.stepped()).total_cost
+    return not reached <= (1.0 + _SETTLED) * lin.total_cost
 
 
 def _renewed(shooting: Shooting, lin: Linearised) -> list[FloatArray] | None:
@@ -248,8 +210,3 @@ def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]
     """Smallest and largest scaled step of each parameter within its bounds, shapes (P,)."""
     low, high = (free.difference(bound, theta[free.index]) for bound in free.bounds)
     return np.minimum(low, 0.0), np.maximum(high, 0.0)
-
-
-def scaled_difference(free: Free, theta: FloatArray, moved: FloatArray) -> FloatArray:
-    """The scaled step that leads from `theta` to `moved`, shape (P,)."""
-    return free.difference(moved[free.index], theta[free.index])

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.effects import EFFECTS
-from quadid.identify.gauss_newton import FloatArray, Polished, polish
+from quadid.identify.gauss_newton import Polished, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import SLOW_TIME, NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.window import Window
 
 SPECTRUM_SECONDS = 0.5
@@ -51,7 +52,7 @@ def residual_noise(
         slow_time: correlation time of the attitude's slow part [s].
     """
     lin = polished.lin
-    used = float(lin.rows.sum())
+    used = lin.total_rows
     fitted = lin.gram.shape[1] if parameters is None else parameters
     freedom = max(used - fitted, 1.0) / max(used, 1.0)
     return estimate_noise(lin.residuals, lin.weights, shooting.dt, freedom, slow_time)

@@ -13,6 +13,7 @@ import numpy as np
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.controller_gains import Autopilot
+from quadid.identify.parameterization import Free
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
@@ -72,18 +73,17 @@ class PaperProblem:
             )  # fmt: skip
         self._loops = [ClosedLoop(w, vehicle, autopilot.gains, autopilot.rate) for w in usable]
         self._measured = [measured_outputs(w) for w in usable]
-        self._theta = Layout(vehicle).initial(vehicle)
-        self.lower, self.upper = np.log(vehicle.bounds).T
-        self.start = np.clip(np.log(vehicle.initial), self.lower, self.upper)
+        layout = Layout(vehicle)
+        self._theta, self._free = layout.initial(vehicle), Free(tuple(layout.entry(n) for n in NOMINAL_NAMES))
+        self.lower, self.upper = (self._free.scaled(bound) for bound in self._free.bounds)
+        self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
         rows = np.concatenate(self._measured)
         # Every output counts alike, however many of its samples are missing.
         self._weight = 1.0 / np.sqrt(np.maximum(np.count_nonzero(np.isfinite(rows), axis=0), 1) * _seen(rows))
 
     def theta(self, point: FloatArray) -> FloatArray:
         """Full parameter vector of a point, shape (size,)."""
-        out = self._theta.copy()
-        out[: len(NOMINAL_NAMES)] = np.exp(point)
-        return out
+        return self._free.placed(self._theta, point)
 
     def residual(self, points: FloatArray) -> FloatArray:
         """Shapes (k, 6) -> (k, samples); the sum of squares is twice the mean squared error."""

@@ -49,21 +49,32 @@ class Free:
         """Lower and upper bounds of the values, shapes (parameters,)."""
         return np.array([e.lower for e in self.entries]), np.array([e.upper for e in self.entries])
 
+    @cached_property
+    def _origin(self) -> FloatArray:
+        return np.where(self.is_log, 1.0, 0.0)
+
     def scaled(self, values: FloatArray) -> FloatArray:
         """Scaled parameters of values, last axis of both (parameters,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.is_log, np.log(values), values / self.scale)
+        return self.difference(values, self._origin)
 
     def unscaled(self, z: FloatArray) -> FloatArray:
         """Values of scaled parameters, last axis of both (parameters,)."""
-        with np.errstate(over="ignore"):
-            return np.where(self.is_log, np.exp(z), z * self.scale)
+        return self.shifted(self._origin, z)
+
+    def shifted(self, values: FloatArray, z: FloatArray) -> FloatArray:
+        """Values moved by the scaled step `z`, bounds or not, last axis of all (parameters,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.where(self.is_log, values * np.exp(z), values + z * self.scale)
 
     def placed(self, theta: FloatArray, z: FloatArray) -> FloatArray:
         """Full vector `theta` with the free entries replaced by scaled parameters `z`."""
         out = theta.copy()
         out[self.index] = self.unscaled(z)
         return out
+
+    def step(self, theta: FloatArray, moved: FloatArray) -> FloatArray:
+        """The scaled step that leads from full vector `theta` to `moved`, shape (parameters,)."""
+        return self.difference(moved[self.index], theta[self.index])
 
     def difference(self, values: FloatArray, start: FloatArray) -> FloatArray:
         """The scaled step that leads from values `start` to `values`, shape (parameters,)."""
@@ -77,10 +88,7 @@ class Free:
     def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
         """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
         out = theta.copy()
-        old = out[self.index]
-        with np.errstate(over="ignore", invalid="ignore"):
-            moved = np.where(self.is_log, old * np.exp(z), old + z * self.scale)
-        out[self.index] = np.minimum(np.maximum(moved, self.bounds[0]), self.bounds[1])
+        out[self.index] = np.minimum(np.maximum(self.shifted(out[self.index], z), self.bounds[0]), self.bounds[1])
         return out
 
     def jacobian(self, theta: FloatArray) -> FloatArray:

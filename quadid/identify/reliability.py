@@ -15,9 +15,10 @@ import numpy as np
 
 from quadid.chi_square import exceeded
 from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, uncertainty
-from quadid.identify.gauss_newton import Polished, Prior, bounded_step, default_prior, polish, prior_terms
+from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_estimation import flexible_names
+from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance
 from quadid.identify.shooting import Free, Shooting
 from quadid.types import FloatArray, IndexArray
 
@@ -97,14 +98,14 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         # Sharp priors pull against a wrong mass or arm; that is settled by `with_uncertain_scale`, and no misfit.
         prior = Prior(prior.mean, np.maximum(prior.sigma, WIDE))
         found = polish(problem, found.theta, free, prior, found.states, settled=True)
-    own = uncertainty(found.lin, free, prior, found.theta)
+    own = uncertainty(found.lin, prior)
     between, mean = _between_blocks(found, prior, own)
-    left = float(found.lin.cost.sum() / found.lin.rows.sum())
+    left = found.lin.reduced_chi_square
     misfit = bool(problem.local) or left > MISFIT
     if problem.local:
         # Other models of the same data: nothing that they differ by is chance.
         longer = _longer(problem, short, free, prior)
-        steps = [free.difference(theta[free.index], found.theta[free.index]) for theta in (short.theta, longer.theta)]
+        steps = [free.step(found.theta, theta) for theta in (short.theta, longer.theta)]
         names = ["without the slow moments set aside", "in longer segments"]
     else:
         steps, names = [_other_band(found, free, own, short, prior)], ["in short segments"]
@@ -125,9 +126,10 @@ def _between_blocks(found: Polished, prior: Prior, own: Uncertainty) -> tuple[Fl
     if count < 3:
         return np.zeros(p), np.zeros(p)
     steps, variances = np.empty((count, p)), np.empty((count, p))
+    thin = Prior(prior.mean, np.sqrt(count) * prior.sigma)
     for k, part in enumerate(np.array_split(np.arange(len(lin.cost)), count)):
-        covariance = np.linalg.inv(lin.gram[part].sum(axis=0) + np.diag(1.0 / (count * prior.sigma**2)))
-        steps[k] = -covariance @ (lin.grad[part].sum(axis=0) - lin.grad.sum(axis=0) / count)
+        covariance = posterior_covariance(lin.gram[part].sum(axis=0), thin)
+        steps[k] = -covariance @ (lin.grad[part].sum(axis=0) - lin.gradient / count)
         variances[k] = np.diag(covariance) * own.inflation**2
     weight = 1.0 / variances
     total = weight.sum(axis=0)
@@ -150,7 +152,7 @@ def _other_band(found: Polished, free: Free, own: Uncertainty, short: Polished, 
     if not np.isfinite(short.cost):
         return np.zeros(len(free.entries))
     step = free.difference(short.theta[free.index], found.theta[free.index])
-    chance = exceeded(CHANCE, 1) * (uncertainty(short.lin, free, prior, short.theta).sigma ** 2 + own.sigma**2)
+    chance = exceeded(CHANCE, 1) * (uncertainty(short.lin, prior).sigma ** 2 + own.sigma**2)
     return np.where(step**2 > chance, step, 0.0)
 
 
@@ -163,16 +165,15 @@ def _with_causes(
     states = found.states.taking(places)
     asked = _asked_for(few, found.theta, states, free) if np.isfinite(found.cost) else []
     base = polish(few, found.theta, free, prior, states, iterations=4, settled=True) if asked else found
-    cost = float(base.lin.cost.sum())
+    cost = base.lin.total_cost
     for name, names in asked:
         extended = few.free([*free.names, *names])
         wide = default_prior(few, extended)
         wide = Prior(wide.mean, np.concatenate([prior.sigma, wide.sigma[len(prior.sigma) :]]))
         trial = polish(few, base.theta, extended, wide, base.states, iterations=8)
-        after = float(trial.lin.cost.sum())
-        if cost - after > LEAST_GAIN * cost / float(base.lin.rows.sum()):
-            step = free.difference(trial.theta[free.index], base.theta[free.index])
-            yield name, step, after / float(trial.lin.rows.sum())
+        after = trial.lin.total_cost
+        if cost - after > LEAST_GAIN * cost / base.lin.total_rows:
+            yield name, free.step(base.theta, trial.theta), after / trial.lin.total_rows
 
 
 def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Free) -> list[tuple[str, list[str]]]:
@@ -180,8 +181,7 @@ def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Fr
     known = {*free.names, *few.local}
     everything = few.free([*free.names, *(n for n in flexible_names(few.layout, few) if n not in known)])
     lin = few.linearise(theta, everything, few.linearise(theta, everything, states).stepped())
-    precision, pull, _ = prior_terms(everything, default_prior(few, everything), theta)
-    h, g = lin.gram.sum(axis=0) + np.diag(precision), lin.grad.sum(axis=0) + pull
+    h, g = normal_equations(lin, everything, default_prior(few, everything), theta)
     own = np.arange(len(free.entries))
     none = bounded_step(free, theta, h[np.ix_(own, own)], g[own])
     start = float(2.0 * g[own] @ none + none @ h[np.ix_(own, own)] @ none)
@@ -191,7 +191,7 @@ def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Fr
         part = Free(tuple(everything.entries[int(i)] for i in all_of_it))
         z = bounded_step(part, theta, h[np.ix_(all_of_it, all_of_it)], g[all_of_it])
         drop = start - float(2.0 * g[all_of_it] @ z + z @ h[np.ix_(all_of_it, all_of_it)] @ z)
-        if drop > LEAST_GAIN * max(float(lin.cost.sum() / lin.rows.sum()), 1.0):
+        if drop > LEAST_GAIN * max(lin.reduced_chi_square, 1.0):
             moved = float(np.max(np.abs(z[own] - none)))
             promises.append((drop, moved, name, [everything.names[int(i)] for i in place]))
     promises.sort(key=lambda p: -p[0])

@@ -17,6 +17,7 @@ from itertools import combinations_with_replacement, islice
 import numpy as np
 
 from quadid.identify.run_errors import STAGES, RunErrors
+from quadid.identify.schur_complement import eliminated
 from quadid.model.layout import Layout
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
 from quadid.types import FloatArray
@@ -192,7 +193,8 @@ def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds:
     typical = _typical(physical.model_copy(update={"residual": terms}))
     values = np.array([t.value for t in terms])
     j, errors = _slopes(windows, physical, terms, (), seconds, MOST_RUNS)
-    change = _solved(j @ j.T, j @ errors, values / typical, list(range(len(terms)))) * typical
+    h, g = j @ j.T + RIDGE * np.eye(len(terms)), j @ errors + RIDGE * values / typical
+    change = -np.linalg.solve(h, g) * typical
     before = _share(windows, physical, terms, seconds)
     for part in _STEPS:
         moved = tuple(
@@ -203,25 +205,14 @@ def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds:
     return terms
 
 
-def _solved(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int]) -> FloatArray:
-    """Best change of the chosen coefficients."""
-    inner = h[np.ix_(chosen, chosen)] + RIDGE * np.eye(len(chosen))
-    return np.asarray(np.linalg.solve(inner, -(g[chosen] + RIDGE * z[chosen])))
-
-
 def _pursued(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int], size: int) -> list[int]:
     """Adds the term that lowers the linear problem's error most, the others adjusted, until there are `size`."""
     chosen = list(chosen)
-    curvature = np.diag(h) + RIDGE
+    h, g = h + RIDGE * np.eye(len(z)), g + RIDGE * z
     while len(chosen) < min(size, len(z)):
-        change = np.zeros(len(z))
-        left = curvature
-        if chosen:
-            change[chosen] = _solved(h, g, z, chosen)
-            inner = h[np.ix_(chosen, chosen)] + RIDGE * np.eye(len(chosen))
-            left = curvature - np.einsum("ij,ij->j", h[chosen], np.linalg.solve(inner, h[chosen]))
-        slope = g + h @ change + RIDGE * (z + change)
-        gain = slope**2 / np.maximum(left, RIDGE)
+        left, share = eliminated(np.diag(h)[:, None, None], h[:, None, chosen], h[np.ix_(chosen, chosen)])
+        slope = g - share[:, 0] @ g[chosen]
+        gain = slope**2 / np.maximum(left[:, 0, 0], RIDGE)
         gain[chosen] = -np.inf
         chosen.append(int(np.argmax(gain)))
     return chosen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,12 +46,42 @@ class Linearised:
     states: InitialStates
     n_pre: int
 
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of all segments on the scaled parameters, shape (P, P), read-only."""
+        return _sealed(self.gram.sum(axis=0))
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Half the slope of the cost of all segments, shape (P,), read-only."""
+        return _sealed(self.grad.sum(axis=0))
+
+    @cached_property
+    def total_cost(self) -> float:
+        """Cost of all segments."""
+        return float(self.cost.sum())
+
+    @cached_property
+    def total_rows(self) -> float:
+        """Independent residuals of all segments."""
+        return float(self.rows.sum())
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Cost per independent residual; 1 at the noise floor."""
+        return self.total_cost / max(self.total_rows, 1.0)
+
     def stepped(self, z: FloatArray | None = None) -> InitialStates:
         """Initial states after the scaled parameter step `z`, or with parameters held."""
         offset, slope = self.back
         da = -(offset if z is None else offset + slope @ z)
         limit = _LONGEST_STEP[: da.shape[1]]
         return self.states.stepped(self.n_pre, np.clip(da, -limit, limit))
+
+
+def _sealed(values: FloatArray) -> FloatArray:
+    values.setflags(write=False)
+    return values
 
 
 def join(parts: list[Linearised]) -> Linearised:

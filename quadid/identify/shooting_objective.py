@@ -43,19 +43,16 @@ class BoxProblem:
             raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
         self._shooting = shooting = shooting.at_most(SEGMENTS)
         self._theta = shooting.layout.initial(vehicle)
-        none = shooting.free([])
-        self._index = shooting.free(NOMINAL_NAMES).index
+        self._free, none = shooting.free(NOMINAL_NAMES), shooting.free([])
         self._bases = [np.ascontiguousarray(c.basis) for c in shooting.columns(self._theta, none)]
         self._n_pre = shooting.start_of(self._theta, none)[0]
         self._x0 = [x.copy() for x in shooting.starts(self._n_pre).x0]
-        self.lower, self.upper = np.log(vehicle.bounds).T
-        self.start = np.clip(np.log(vehicle.initial), self.lower, self.upper)
+        self.lower, self.upper = (self._free.scaled(bound) for bound in self._free.bounds)
+        self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
 
     def theta(self, point: FloatArray) -> FloatArray:
         """Full parameter vector of a point, shape (size,)."""
-        out = self._theta.copy()
-        out[self._index] = np.exp(point)
-        return out
+        return self._free.placed(self._theta, point)
 
     def residual(self, points: FloatArray) -> FloatArray:
         """Residuals in standard deviations, shapes (k, 6) -> (k, samples)."""

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from quadid.identify.covariance import Uncertainty
-from quadid.identify.gauss_newton import Prior, scaled_difference
+from quadid.identify.priors import Prior
+from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Free
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -40,17 +41,17 @@ def with_uncertain_scale(
     if not some.any():
         return theta, unc
     directions = _directions(free, theta)[:, some]
-    p = np.diag(1.0 / prior.sigma**2)
+    p = np.diag(prior.precision)
     values, vectors = np.linalg.eigh(np.linalg.inv(unc.covariance) - p)
     h = (vectors * np.maximum(values, 0.0)) @ vectors.T
     reach = h @ directions
-    gain = np.linalg.solve(directions.T @ reach + np.diag(spread[some] ** -2.0), reach.T)
-    covariance = np.linalg.inv(h - reach @ gain + p)
+    left = eliminated(h, reach, directions.T @ reach + np.diag(spread[some] ** -2.0))
+    covariance = np.asarray(np.linalg.inv(left.h + p))
     start = theta.copy()
     start[free.index] = prior.mean
-    pull = p @ scaled_difference(free, theta, start)
+    pull = p @ free.step(theta, start)
     # At the mode the data pull exactly against the prior; the part of that pull along the scales is worth less now.
-    step = covariance @ (gain.T @ (directions.T @ pull))
+    step = covariance @ (left.gain @ (directions.T @ pull))
     return free.move(theta, step), replace(unc, covariance=covariance)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
 from quadid.errors import QuadidError
-from quadid.identify.gauss_newton import Prior, polish
+from quadid.identify.gauss_newton import polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.priors import Prior, posterior_covariance
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout
@@ -166,10 +167,9 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: Init
         np.concatenate([request.theta[: len(NOMINAL_NAMES)], np.zeros(len(place))]), np.concatenate([known, width])
     )
     result = polish(shooting, theta, free, prior, states, iterations=8)
-    covariance = np.linalg.inv(result.lin.gram.sum(axis=0) + np.diag(1.0 / prior.sigma**2))
-    sigma = np.sqrt(np.diag(covariance))[len(NOMINAL_NAMES) :] * free.scale[len(NOMINAL_NAMES) :]
-    rows = max(float(result.lin.rows.sum()), 1.0)
-    return _Outcome(cause, result.theta, sigma, result.cost, float(result.lin.cost.sum()) / rows, result.states)
+    sigma = np.sqrt(np.diag(posterior_covariance(result.lin.information, prior))) * free.jacobian(result.theta)
+    mse = result.lin.reduced_chi_square
+    return _Outcome(cause, result.theta, sigma[len(NOMINAL_NAMES) :], result.cost, mse, result.states)
 
 
 def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]) -> OnlineFinding:

@@ -16,10 +16,12 @@ from dataclasses import replace
 import numpy as np
 
 from quadid.effects import EFFECTS
-from quadid.identify.covariance import score_products
-from quadid.identify.gauss_newton import Polished, Prior, polish, prior_terms, robust_weights
+from quadid.identify.covariance import variance_ratio
+from quadid.identify.gauss_newton import Polished, polish, robust_weights
 from quadid.identify.noise_estimation import residual_noise
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.priors import Prior, prior_terms
+from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import B, Layout
 from quadid.online.fusion import WindowEstimate
@@ -100,25 +102,22 @@ def reduced(
     """
     lin, six = result.lin, len(NOMINAL_NAMES)
     precision, pull, _ = prior_terms(free, prior, result.theta)
-    gram, score, scores = lin.gram.sum(axis=0), lin.grad.sum(axis=0), lin.grad
-    gram[six:, six:] += np.diag(precision[six:])
-    score[six:] += pull[six:]
+    effects = np.arange(len(precision)) >= six
+    h, g, scores = lin.information + np.diag(precision * effects), lin.gradient + pull * effects, lin.grad
     z = free.scaled(result.theta[free.index])[:six]
     if "thrust_curve" not in vehicle.effects:
         z[B], slopes = _at_hover(layout, vehicle.mass * GRAVITY, free, result.theta)
-        back = np.eye(len(score))
+        back = np.eye(len(g))
         back[B] = -slopes / slopes[B]
         back[B, B] = 1.0 / slopes[B]
-        gram, score, scores = back.T @ gram @ back, back.T @ score, scores @ back
-    gain = np.linalg.solve(gram[six:, six:], gram[six:, :six]).T
-    information = gram[:six, :six] - gain @ gram[six:, :six]
-    step = np.linalg.solve(information, score[:six] - gain @ score[six:])
-    covariance = np.linalg.inv(information)
-    meat, _ = score_products(replace(lin, grad=scores[:, :six] - scores[:, six:] @ gain.T))
-    excess = np.sqrt(np.maximum(np.diag(covariance @ meat @ covariance) / np.diag(covariance), 1.0))
+        h, g, scores = back.T @ h @ back, back.T @ g, scores @ back
+    information, gain = eliminated(h[:six, :six], h[:six, six:], h[six:, six:])
+    step = np.linalg.solve(information, g[:six] - gain @ g[six:])
+    own = replace(lin, grad=scores[:, :six] - scores[:, six:] @ gain.T)
+    excess = np.sqrt(np.maximum(variance_ratio(own, np.asarray(np.linalg.inv(information)))[0], 1.0))
     information = 0.5 * (information + information.T) / np.outer(excess, excess)
     return WindowEstimate(
-        start, stop, z, information, information @ step, float(lin.cost.sum()), float(lin.rows.sum())
+        start, stop, z, information, information @ step, lin.total_cost, lin.total_rows
     )  # fmt: skip
 
 

@@ -11,11 +11,12 @@ from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS
-from quadid.identify.gauss_newton import Polished, Prior, polish, robust_weights
+from quadid.identify.gauss_newton import Polished, polish, robust_weights
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import residual_noise, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
+from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced
@@ -148,13 +149,8 @@ class FitReply(JobReply):
 
 def prior_of(vehicle: Vehicle) -> Prior:
     """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
-    sigma = []
-    for name in NOMINAL_NAMES:
-        p = vehicle.parameters[name]
-        low, high = p.limits
-        wide = 0.5 * float(np.log(high / low))
-        sigma.append(min(max(p.sigma / p.initial, TIGHTEST), wide) if p.sigma else wide)
-    return Prior(vehicle.initial, np.array(sigma))
+    given = [vehicle.parameters[name] for name in NOMINAL_NAMES]
+    return Prior(vehicle.initial, np.array([min(max(p.log_sigma, TIGHTEST), p.log_halfwidth) for p in given]))
 
 
 def fit_window(request: FitRequest) -> FitReply:
@@ -189,10 +185,10 @@ def _fit(request: FitRequest) -> FitReply:
     if not np.isfinite(result.cost):
         return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     lin = result.lin
-    information = lin.gram.sum(axis=0)
+    information = lin.information
     estimate = WindowEstimate(
-        request.start, request.stop, free.scaled(result.theta[free.index]), information, lin.grad.sum(axis=0),
-        float(lin.cost.sum()), float(lin.rows.sum()),
+        request.start, request.stop, free.scaled(result.theta[free.index]), information, lin.gradient,
+        lin.total_cost, lin.total_rows,
     )  # fmt: skip
     measured = None
     if request.measure:
@@ -242,11 +238,9 @@ def _lack_of_fit(problem: Shooting, result: Polished) -> LackOfFit:
     rigid |= {n for e in EFFECTS.values() if e.flexible == "never" for n in e.entries}
     free = problem.free([n for n in moving_names(problem) if n not in rigid])
     lin = problem.linearise(result.theta, free)
-    gram, score = lin.gram.sum(axis=0), lin.grad.sum(axis=0)
     weight = np.where(free.is_log, 0.0, 1.0 / EFFECT_WIDTH**2) + 1e-9
-    drop = float(score @ np.linalg.solve(gram + np.diag(weight), score))
-    cost = float(lin.cost.sum())
-    return LackOfFit(drop * float(lin.rows.sum()) / max(cost, 1.0), len(score), float(lin.rows.sum()))
+    drop = float(lin.gradient @ np.linalg.solve(lin.information + np.diag(weight), lin.gradient))
+    return LackOfFit(drop * lin.total_rows / max(lin.total_cost, 1.0), len(weight), lin.total_rows)
 
 
 def is_excited(bounds: FloatArray) -> bool:
@@ -256,7 +250,7 @@ def is_excited(bounds: FloatArray) -> bool:
 
 
 def _bounds(shooting: Shooting, theta: FloatArray, free: Free) -> FloatArray:
-    return bounds_of(shooting.linearise(theta, free).gram.sum(axis=0))
+    return bounds_of(shooting.linearise(theta, free).information)
 
 
 def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:

@@ -65,12 +65,8 @@ def knowledge(
     if windows:
         fit = search("pso_polish", windows, vehicle, seed, advance)
         return fitted_vehicle(fit), np.asarray(np.linalg.inv(fit.uncertainty.covariance), dtype=np.float64), fit.noise
-    sigma = []
-    for name in NOMINAL_NAMES:
-        prior = vehicle.parameters[name]
-        low, high = prior.limits
-        sigma.append(prior.sigma / prior.initial if prior.sigma else 0.5 * math.log(high / low))
-    return vehicle, np.diag(1.0 / np.array(sigma) ** 2), None
+    sigma = np.array([vehicle.parameters[name].log_sigma for name in NOMINAL_NAMES])
+    return vehicle, np.diag(1.0 / sigma**2), None
 
 
 def propose(

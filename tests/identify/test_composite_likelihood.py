@@ -12,8 +12,9 @@ from quadid.identify import composite_likelihood
 from quadid.identify import fit as fitting
 from quadid.identify.composite_likelihood import BothCuts, with_second_cut
 from quadid.identify.fit import FitOptions, fit
-from quadid.identify.gauss_newton import default_prior, polish
+from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.priors import default_prior
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IntArray

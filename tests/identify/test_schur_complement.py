@@ -1,0 +1,41 @@
+"""Parameters eliminated from normal equations: what is left is the cost with them at their best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadid.identify.schur_complement import eliminated
+
+
+@pytest.mark.parametrize(("stay", "go"), [(1, 4), (3, 2), (3, 0), (0, 2)])
+def test_what_is_left_is_the_cost_at_the_best_of_the_others(stay: int, go: int) -> None:
+    rng = np.random.default_rng(stay + 10 * go)
+    a, y = rng.standard_normal((20, stay + go)), rng.standard_normal(20)
+    h, g, m, o = a.T @ a, -a.T @ y, slice(0, stay), slice(stay, None)
+    left = eliminated(h[m, m], h[m, o], h[o, o])
+    g_left = g[m] - left.gain @ g[o]
+    own = g[o] @ np.linalg.solve(h[o, o], g[o])
+    for z in rng.standard_normal((5, stay)):
+        best = np.linalg.lstsq(a[:, o], y - a[:, m] @ z, rcond=None)[0]
+        cost = np.sum((y - a[:, m] @ z - a[:, o] @ best) ** 2)
+        assert cost == pytest.approx(y @ y - own + 2.0 * g_left @ z + z @ left.h @ z)
+
+
+def test_the_covariance_of_what_is_left_is_that_of_the_whole() -> None:
+    a = np.random.default_rng(3).standard_normal((30, 5))
+    h = a.T @ a
+    left = eliminated(h[:2, :2], h[:2, 2:], h[2:, 2:])
+    np.testing.assert_allclose(np.linalg.inv(left.h), np.linalg.inv(h)[:2, :2])
+
+
+def test_many_at_once_are_as_one_at_a_time() -> None:
+    a = np.random.default_rng(5).standard_normal((30, 9))
+    h = a.T @ a
+    h_mm = np.stack([h[k : k + 2, k : k + 2] for k in (0, 2, 4)])
+    h_mo = np.stack([h[k : k + 2, 6:] for k in (0, 2, 4)])
+    whole = eliminated(h_mm, h_mo, h[6:, 6:])
+    for k in range(3):
+        one = eliminated(h_mm[k], h_mo[k], h[6:, 6:])
+        np.testing.assert_allclose(whole.h[k], one.h)
+        np.testing.assert_allclose(whole.gain[k], one.gain)
