@@ -27,8 +27,9 @@ from quadid_replay.bag_topics import Topic, usable_definition
 from quadid_replay.mcap_order import Message, Part, in_log_time
 
 MAGIC = b"\x89MCAP0\r\n"
-RATIO, FLOOR, CEILING = 50, 64 << 20, 4 << 30
-"""A file may inflate to 50 times its size, at least to 64 MiB, and beyond 4 GiB only to 3 times its size."""
+RATIO, FLOOR, CEILING = 50, 16 << 20, 4 << 30
+"""A file may inflate to 50 times its size, at least to 16 MiB (lz4 takes twice that meanwhile), and beyond 4 GiB only
+to 3 times its size."""
 LARGEST_CHUNK = 128 << 20
 MOST_DEFINITIONS = 5000
 """Channels, and schemas, of one file; a large robot has hundreds."""

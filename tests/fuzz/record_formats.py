@@ -60,7 +60,7 @@ def define_tlog(rng: Random, record: bytes) -> bytes:
         changed[11 if record[8] == 0xFE else 13] = rng.choice((0, 1, 2, 255))
     else:
         moved = int.from_bytes(record[:8], "big") + rng.choice((-1, 1)) * 10 ** rng.randrange(14)
-        changed[:8] = moved.to_bytes(8, "big")
+        changed[:8] = (moved % 2**64).to_bytes(8, "big")
     return repair_tlog(rng, bytes(changed))
 
 

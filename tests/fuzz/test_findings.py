@@ -5,9 +5,12 @@ from __future__ import annotations
 import sqlite3
 import struct
 import time
+import tracemalloc
 import warnings
+import zlib
 from pathlib import Path
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zstandard
@@ -147,16 +150,14 @@ def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> N
     kind = "quadid_msgs/msg/MotorCommand"
     message = ("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5] * 4})
     log = mcap_of([message], False)
-    packed = zstandard.compress(bytes(60 << 20))
-    body = struct.pack("<QQQII", 0, 1, 60 << 20, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    packed = zstandard.compress(bytes(15 << 20))
+    body = struct.pack("<QQQII", 0, 1, 15 << 20, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
     hostile = opened(tmp_path, log + bytes([6]) + struct.pack("<Q", len(body)) + body)
     began = time.process_time()
     recording = open_log(hostile)
     seconds = time.process_time() - began
-    assert any("damaged chunks" in warning for warning in recording.warnings), (
-        "before, seven million records of nothing"
-    )
-    happened(5, f"a chunk of 60 MiB of zeros: refused as no records after {seconds:.2f} s of CPU")
+    assert any("damaged chunks" in warning for warning in recording.warnings), "before, two million records of nothing"
+    happened(5, f"a chunk of 15 MiB of zeros: refused as no records after {seconds:.2f} s of CPU")
 
 
 def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,3 +175,26 @@ def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypat
     tables = usd_records.collect_usd_records(log.closed(), "log").tables
     assert {name: len(table) for name, table in tables.items()} == {"fixedFrequency": 2000, "modeChanged": 2000}
     assert sum(looked) < 100 * 4000, "each run used to look at all that follows"
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_small_file_never_takes_much_memory(tmp_path: Path, compression: str, happened: Happened) -> None:
+    """Two chunks of 32 MiB of zeros in 140 kB: each was allowed, and lz4 takes twice what it returns."""
+    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
+    content = bytes(32 << 20)
+    body, name = pack(content), compression.encode()
+    head = struct.pack("<QQQII", 0, 1, len(content), zlib.crc32(content), len(name)) + name
+    chunk = head + struct.pack("<Q", len(body)) + body
+    kind = "quadid_msgs/msg/MotorCommand"
+    message = ("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5] * 4})
+    data = mcap_of([message], False)
+    path = opened(tmp_path, data + 2 * (struct.pack("<BQ", 6, len(chunk)) + chunk))
+    tracemalloc.start()
+    with pytest.raises(LogError, match="inflate to more than 50 times"):
+        open_log(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 16 << 20
+    happened(
+        1, f"two {compression} chunks of 32 MiB in {path.stat().st_size >> 10} kB: refused within {most >> 20} MiB"
+    )
