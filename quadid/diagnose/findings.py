@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from quadid.chi_square import Z95, survival
-from quadid.diagnose.attribution import Worth
+from quadid.diagnose.attribution import Benefit, Worth
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.diagnose.result import Alternative, Finding, FoundParameter
@@ -42,7 +42,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         gain=benefit,
         p_value=_p_value(search, cause),
         alternatives=_alternatives(search, cause, benefit.mse_after),
-        evidence=_sentence(cause.effect, values, benefit.mse_before, benefit.mse_after),
+        evidence=_sentence(cause.effect, values, benefit),
         per_log=EFFECTS[cause.effect].per_log,
         ordinary=worth.ordinary,
     )
@@ -118,16 +118,16 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
     return tuple(sorted(found.values(), key=lambda a: a.mse_after))
 
 
-def _sentence(effect: str, values: Mapping[str, float], before: float, after: float) -> str:
+def _sentence(effect: str, values: Mapping[str, float], benefit: Benefit) -> str:
     """Sentence of one finding.
 
     Args:
         effect: contract name.
         values: its numbers in contract units.
-        before: mean squared error on unseen data without it (noise floor 1).
-        after: the same with it.
+        benefit: errors on unseen data without and with it.
     """
     body = EFFECTS[effect].told(values)
     return (
-        f"{body[0].upper()}{body[1:]}; on unseen data the error falls from {before:.3g} to {after:.3g} times the noise."
+        f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "
+        f"{benefit.mse_before:.3g} to {benefit.mse_after:.3g} times the noise."
     )

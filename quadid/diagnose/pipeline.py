@@ -24,7 +24,7 @@ from quadid.identify.covariance import parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
-from quadid.identify.noise_estimation import flexible_fit, noise_floor, residual_noise
+from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
@@ -42,8 +42,6 @@ DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (`climb.USUAL_SECONDS` says when the longest may), longest first; below them
 only the short ones of the first fit."""
 FEWEST_SEGMENTS = 5
-FAR_ITERATIONS = 10
-"""Linearisations of the flexible fit where the nominal one is far off."""
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8

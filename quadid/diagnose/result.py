@@ -89,6 +89,7 @@ class Finding:
                 "mse_before": self.gain.mse_before,
                 "mse_after": self.gain.mse_after,
                 "ci95": list(self.gain.ci95),
+                "seconds": self.gain.seconds,
             },
             "p_value": self.p_value,
             "alternatives": [{"effect": a.effect, "mse_after": a.mse_after} for a in self.alternatives],

@@ -14,10 +14,10 @@ from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
+from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, reweighted_fit
 from quadid.identify.noise_estimation import flexible_names as flexible_names
 from quadid.identify.noise_estimation import noise_floor as noise_floor
 from quadid.identify.noise_estimation import residual_noise as residual_noise
-from quadid.identify.noise_estimation import reweighted_fit
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
@@ -76,7 +76,7 @@ class Fit:
         vehicle: the vehicle as given.
         theta: full parameter vector.
         parameters: free parameters with intervals and status.
-        noise: estimated sensor noise.
+        noise: estimated sensor noise, in which errors are stated.
         uncertainty: covariance of the scaled parameters.
         outcome: how the polish ended.
         evaluations: parameter vectors simulated over the data (finite differences included).
@@ -152,12 +152,16 @@ def fit(
     report("polish", 0.0)
     short = short.at_most(SHORT_SEGMENTS)
     free = short.free(free_names)
+    typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
     moments = _slow_moments(short, theta, first, free)
     if moments is not None:
         # Longer segments would only let the missing moments in again.
         final, result = moments
-        spent, said = 0, (*said, _SET_ASIDE)
+        # What the moments leave is no measure of the noise, nor are its weights a start for one.
+        starts = [result.theta, first.theta]
+        flexible = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS)
+        noise, spent, said = flexible.noise, flexible.simulated, (*said, _SET_ASIDE)
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
@@ -173,7 +177,7 @@ def fit(
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     judge = None if set(INERTIAS) & set(out_of_reach or ()) else first
     found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, judge)
-    return final_answer(replace(found, warnings=(*said, *found.warnings)), out_of_reach or {})
+    return final_answer(replace(found, noise=noise, warnings=(*said, *found.warnings)), out_of_reach or {})
 
 
 def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> tuple[Shooting, Polished] | None:

@@ -25,6 +25,8 @@ LINE_SEGMENTS = 100
 """Fewest of them: from fewer, so fine a spectrum would be known too poorly to weigh by."""
 FLEXIBLE_DRAG = 0.1
 """Rotor drag [1/s] the flexible fit starts from: velocities and moments of drag show only where there is any."""
+FAR_ITERATIONS = 10
+"""Linearisations of the flexible fit where the nominal one is far off."""
 GROWS = 3.0
 """Growth of a channel's residual variance, from short segments to longer ones, that no sensor noise shows …"""
 STAYS = 1.2

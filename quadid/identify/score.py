@@ -104,10 +104,64 @@ def mse_score(
         )  # fmt: skip
     shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
     lin = settle_states(shooting, theta)
-    expected = expected_squares(shooting, theta, lin.states)
     series = _series(shooting, lin)
     known = shooting.channels if noise is None else len(noise.white)
-    return SetScore(*_compare(lin, expected, series, known), series)
+    tally = tallied(shooting, theta, lin, known)
+    return SetScore(tally.mse, _channels(tally, series), series)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What `mse_score` compares, summed over segments; tallies of different data add up.
+
+    Attributes:
+        squares: of the residuals of each channel, shape (channels,).
+        expected: what pure noise would leave of them; 0 for channels of unknown noise.
+        samples: measured ones.
+        ran_away: whether a simulation left every scale of a flight.
+    """
+
+    squares: FloatArray
+    expected: FloatArray
+    samples: FloatArray
+    ran_away: bool
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(
+            self.squares + other.squares, self.expected + other.expected, self.samples + other.samples,
+            self.ran_away or other.ran_away,
+        )  # fmt: skip
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Squares over what pure noise leaves, shape (channels,); NaN where nothing is known.
+
+        A channel whose samples are so few that the initial states take them all says nothing about the model.
+        """
+        told = self.expected > 1e-9 * np.maximum(self.squares, 1e-300)
+        return np.asarray(np.divide(self.squares, self.expected, out=np.full(len(told), np.nan), where=told))
+
+    @property
+    def mse(self) -> float:
+        """Mean of the ratios over channels and samples; infinite when a simulation ran away, or nothing is known."""
+        ratio = self.ratio
+        weight = np.where(np.isnan(ratio), 0.0, self.samples)
+        if self.ran_away or weight.sum() == 0.0:
+            return np.inf
+        return float(np.sum(weight * np.nan_to_num(ratio)) / weight.sum())
+
+
+def tallied(shooting: Shooting, theta: FloatArray, lin: Linearised | None = None, known: int | None = None) -> Tally:
+    """The tally of `theta` on a problem; `known` channels at most have a known noise, all by default."""
+    lin = settle_states(shooting, theta) if lin is None else lin
+    used = lin.weights > 0.0
+    expected = expected_squares(shooting, theta, lin.states).sum(axis=0)
+    if known is not None:
+        expected[known:] = 0.0
+    return Tally(
+        np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1)), expected,
+        np.count_nonzero(used, axis=(0, 1)).astype(np.float64), not np.isfinite(lin.cost).all(),
+    )  # fmt: skip
 
 
 def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:
@@ -182,25 +236,13 @@ def expected_squares(shooting: Shooting, theta: FloatArray, states: InitialState
     return np.concatenate(parts)
 
 
-def _compare(
-    lin: Linearised, expected: FloatArray, series: Series, known: int
-) -> tuple[float, tuple[ChannelScore, ...]]:
-    """Total and per-channel scores; channels from `known` on have no noise to be measured by."""
-    used = lin.weights > 0.0
-    squares = np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1))
-    samples = np.count_nonzero(used, axis=(0, 1))
-    total = expected.sum(axis=0)
-    # A channel whose samples are so few that the initial states take them all says nothing about the model.
-    told = (total > 1e-9 * np.maximum(squares, 1e-300)) & (np.arange(len(total)) < known)
-    ratio = np.where(told, squares / np.where(told, total, 1.0), np.nan)
-    channels = []
-    for c, name in enumerate(CHANNEL_NAMES[: len(samples)]):
+def _channels(tally: Tally, series: Series) -> tuple[ChannelScore, ...]:
+    out = []
+    for c, name in enumerate(CHANNEL_NAMES[: len(tally.samples)]):
         rmse, percent = _errors(series.measured[:, c], series.simulated[:, c])
-        channels.append(ChannelScore(name, CHANNEL_UNITS[c], float(ratio[c]), rmse, percent, int(samples[c])))
-    weight = np.where(told, samples, 0)
-    if not np.isfinite(lin.cost).all() or weight.sum() == 0:
-        return np.inf, tuple(channels)
-    return float(np.sum(weight * np.where(told, ratio, 0.0)) / weight.sum()), tuple(channels)
+        ratio, samples = float(tally.ratio[c]), int(tally.samples[c])
+        out.append(ChannelScore(name, CHANNEL_UNITS[c], ratio, rmse, percent, samples))
+    return tuple(out)
 
 
 def _errors(measured: FloatArray, simulated: FloatArray) -> tuple[float, float]:

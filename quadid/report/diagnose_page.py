@@ -9,6 +9,7 @@ from typing import Any
 from quadid.effects import EFFECTS
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
+from quadid.identify.score import SCORE_SECONDS
 from quadid.report.figures import MODELS, MOST_LOGS, channel_figures, error_figure, gain_figure
 from quadid.report.identify_page import noise_rows, parameter_row
 from quadid.report.page import number
@@ -44,9 +45,11 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
         headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
     where = "held-out blocks of the same flight" if v.get("on") == HELD_OUT else "unseen flights"
-    before, after = _short(v["mse_nominal"]), _short(v["mse_extended"])
-    change = f"falls from {before} to {after}" if result["findings"] else f"is {before}"
+    change = _change(v, bool(result["findings"]))
     details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
+    deciding = v.get("deciding")
+    if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
+        details = (*details, f"Over runs of {deciding['seconds']:g} s, which decided, it {_change(deciding, True)}.")
     level = _LEVELS[verdict]
     steps = _next_steps(result)
     if v.get("on") == HELD_OUT:
@@ -54,6 +57,15 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
         details = (*details, "Not proven: no flight was given that the diagnosis has not seen.")
         steps = ("To prove it, give another flight with --validate.", *steps)
     return Verdict(level, headline, details, steps)
+
+
+def _change(errors: JsonDict, found: bool) -> str:
+    """What findings make of the error."""
+    before, after = errors["mse_nominal"], errors["mse_extended"]
+    if not found:
+        return f"is {_short(before)}"
+    rises = before is not None and after is not None and after > before
+    return f"{'rises' if rises else 'falls'} from {_short(before)} to {_short(after)}"
 
 
 def chance(p_value: float) -> str:
@@ -155,7 +167,8 @@ def finding_part(finding: JsonDict, floor: float, identifier: str, seen: Residua
     name, gain = finding["effect"].replace("_", " "), finding["gain"]
     low, high = gain.get("ci95", (None, None))
     gained = [
-        f"The error on unseen data falls by {_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
+        f"The error of {gain['seconds']:g} s runs on unseen data falls by "
+        f"{_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
     ]
     if low is not None and high is not None:
         gained.append(f" (95 % interval {low:.3g} to {high:.3g})")

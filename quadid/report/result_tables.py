@@ -110,7 +110,9 @@ def finding_table(findings: Sequence[JsonDict]) -> TextTable:
         Column("95 % interval", rank=2), Column("rejected alternative", rank=1),
     )  # fmt: skip
     rows = [row for finding in findings for row in _finding_rows(finding)]
-    return TextTable("What the simulation gets wrong (error in noise variances, 1 = noise floor)", columns, tuple(rows))
+    runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
+    title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"
+    return TextTable(title, columns, tuple(rows))
 
 
 def _finding_rows(finding: JsonDict) -> list[tuple[str | Cell, ...]]:

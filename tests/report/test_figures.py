@@ -96,6 +96,10 @@ def test_parameter_figure_is_relative_to_the_current_value() -> None:
 
 def test_gain_figure_names_the_finding_and_its_rivals() -> None:
     rivals = [{"effect": "imu_lag", "mse_after": None}]
-    finding = {"effect": "motor_lag", "gain": {"mse_before": 3.0, "mse_after": 1.0}, "alternatives": rivals}
+    finding = {
+        "effect": "motor_lag",
+        "gain": {"mse_before": 3.0, "mse_after": 1.0, "seconds": 4.0},
+        "alternatives": rivals,
+    }
     data = gain_figure(finding, 1.0, "g")["views"][0]["data"]
     assert [(d["y"], d["x"]) for d in data] == [(["imu lag"], [None]), (["motor lag"], [1.0]), (["without it"], [3.0])]

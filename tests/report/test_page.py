@@ -198,7 +198,7 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
     finding = {
         "effect": "motor_lag", "confident": True, "p_value": 1e-9, "evidence": EVIL,
         "parameters": [{"name": "tau", "unit": "s", "value": 0.05, "ci95": [0.04, None]}],
-        "gain": {"mse_before": 3.1, "mse_after": 1.0, "ci95": [1.9, 2.2]},
+        "gain": {"mse_before": 3.1, "mse_after": 1.0, "ci95": [1.9, 2.2], "seconds": 4.0},
         "alternatives": [{"effect": "command_delay", "mse_after": 1.3}],
     }  # fmt: skip
     data = {

@@ -1,0 +1,62 @@
+"""One flight, one error: what `identify` states for it is what `diagnose` starts from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadid
+from quadid.workflow.diagnose import Diagnosed
+from quadid.workflow.identify import Identified
+from quadid.workflow.loading import Log
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Log]:
+    """Two flights with rotor drag and a weak rotor, as in the tutorial."""
+    folder = tmp_path_factory.mktemp("flown")
+    hidden = ("rotor_drag:k_x=0.3,k_y=0.3", "weak_rotor:rotor=2,loss=0.04")
+    paths = [quadid.simulate(seconds=40, seed=s, effects=hidden).save(folder / f"{s}.mcap") for s in (3, 4)]
+    return quadid.load(paths[0], vehicle="pelican"), quadid.load(paths[1], vehicle="pelican")
+
+
+def test_on_an_unseen_flight(flown: tuple[Log, Log]) -> None:
+    train, unseen = flown
+    fit, found = quadid.identify(train, validate=unseen), quadid.diagnose(train, validate=unseen)
+    assert_alike(fit, found)
+    stated = found.result["validation"]
+    assert stated["mse_nominal"] == fit.result["sets"][1]["mse"]["fitted"] > 10.0
+    assert stated["mse_extended"] == pytest.approx(1.0, abs=0.1)
+    assert stated["deciding"]["seconds"] == found.result["findings"][0]["gain"]["seconds"] != 1.0
+    assert f"falls from {stated['mse_nominal']:.3g} to" in found.verdict.details[0]
+    assert f"Over runs of {stated['deciding']['seconds']:g} s" in found.verdict.details[1]
+
+
+def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: tuple[Log, Log]) -> None:
+    train, _ = flown
+    fit, found = quadid.identify(train), quadid.diagnose(train)
+    assert_alike(fit, found)
+    stated, fitted = found.result["validation"], found.result["sets"][0]["mse"]
+    assert stated["on"] == "held-out blocks"
+    assert "held-out blocks of the same flight" in found.verdict.details[0]
+    assert 1.0 < stated["mse_nominal"] / fitted["nominal"] < 2.0
+    assert 1.0 < stated["mse_extended"] / fitted["extended"] < 1.1
+
+
+def test_on_motion_capture(data_dir: Path) -> None:
+    """Noise of two millimetres, and a model that misses slow moments: the figures are large, and the same."""
+    folder = data_dir / "crazyflie_rpm"
+    log = quadid.load(f"{folder / 'figure8_27.csv'}@0:25", vehicle=folder / "vehicle.yaml")
+    fit, found = quadid.identify(log), quadid.diagnose(log)
+    assert_alike(fit, found)
+    assert any("slow roll and pitch moments" in warning for warning in fit.warnings)
+    # What the model lacks is no noise: a Crazyflie's gyro is quieter than 0.15 rad/s.
+    assert np.all(np.sqrt(fit.fit.noise.variance[:3]) < 0.15)
+
+
+def assert_alike(fit: Identified, found: Diagnosed) -> None:
+    """Every log has one error without the findings, in both results."""
+    assert [s["mse"]["fitted"] for s in fit.result["sets"]] == [s["mse"]["nominal"] for s in found.result["sets"]]
+    assert [s["log"] for s in fit.result["sets"]] == [s["log"] for s in found.result["sets"]]
