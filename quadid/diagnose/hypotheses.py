@@ -39,6 +39,10 @@ class Candidate:
         """Look-alikes; when one of a family is short-listed all of it is refitted."""
         return EFFECTS[self.effect].family
 
+    def carries(self, other: Candidate) -> bool:
+        """Whether `other` can only be in a model that has this one; a refinement carries nothing."""
+        return not self.refines and other.requires in (self.effect, self.label)
+
     def __post_init__(self) -> None:
         """Labels the candidate by its effect, and by its rotor for `weak_rotor`."""
         if not self.label:
@@ -72,8 +76,9 @@ def candidates(
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
         out.append(Candidate(effect, spec.entries, spec.starts, spec.requires, timed))
         out += _refinements(spec)
+    out += [_pair(out, effect, f"{effect} central", 1.0, "at the CG") for effect in ("rotor_drag", "axial_inflow")]
     if has_velocity:
-        out.append(_in_wind(out))
+        out.append(_pair(out, "rotor_drag", "wind", 0.0, "in wind"))
     return out
 
 
@@ -87,12 +92,14 @@ def _refinements(spec: Effect) -> list[Candidate]:
     ]
 
 
-def _in_wind(listed: list[Candidate]) -> Candidate:
-    """Rotor drag with wind free beside it: drag alone explains nothing when the air moves faster than the vehicle."""
-    drag = next(c for c in listed if c.effect == "rotor_drag")
-    wind = next(c for c in listed if c.effect == "wind")
-    start = (*drag.starts[0], 0.0, 0.0)
-    return Candidate("rotor_drag", (*drag.names, *wind.names), (start,), label="rotor_drag in wind", split=(drag, wind))
+def _pair(listed: list[Candidate], label: str, beside: str, start: float, name: str) -> Candidate:
+    """Two causes at once where the first explains nothing alone.
+
+    Drag in air that moves faster than the vehicle; air at the rotors that damps no rotation, since it acts at the CG.
+    """
+    one, other = (next(c for c in listed if c.label == wanted) for wanted in (label, beside))
+    begin = (*one.starts[0], *[start] * len(other.names))
+    return Candidate(one.effect, (*one.names, *other.names), (begin,), label=f"{label} {name}", split=(one, other))
 
 
 def all_names(listed: Sequence[Candidate]) -> list[str]:

@@ -190,7 +190,7 @@ def extend(
 
 def taken_out_causes(causes: Sequence[Candidate], cause: Candidate) -> tuple[Candidate, ...]:
     """`causes` without `cause` and what requires it."""
-    return tuple(c for c in causes if c.label != cause.label and c.requires not in (cause.effect, cause.label))
+    return tuple(c for c in causes if c.label != cause.label and not cause.carries(c))
 
 
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:

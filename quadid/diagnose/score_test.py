@@ -149,7 +149,7 @@ def missed(model: Model, least: float) -> tuple[Candidate, ...]:
     for _ in range(max(len(kept) // 2, 1)):
         losses = []
         for cause in kept:
-            if any(c.requires == cause.effect for c in kept):
+            if any(cause.carries(c) for c in kept):
                 continue
             mine = np.array([place[n] for n in cause.names])
             rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))

@@ -236,7 +236,7 @@ def _refits(
 
 
 def _removable(model: Model) -> list[Candidate]:
-    return [c for c in model.causes if not any(x.requires in (c.effect, c.label) and x is not c for x in model.causes)]
+    return [c for c in model.causes if not any(c.carries(x) for x in model.causes)]
 
 
 def _draft(shooting: Shooting, model: Model, score: Score) -> tuple[Score, FloatArray | Sketch]:

@@ -20,6 +20,8 @@ def _change(*fractions: EffectParameter) -> tuple[EffectParameter, ...]:
     return (P("time", "s", float("inf"), 0.0, float("inf"), 1.0), *fractions)
 
 
+_CENTRAL = P("central", "", 0.0, -0.5, 1.5, 0.3, optional=True)
+"""By how much of its arm the air of a hub acts nearer to the centre of gravity; 1 in simulators without hubs."""
 _TURNS = ("p: p_dot", "q: q_dot", "r: r_dot")
 _STEPS = ("a_z: time", "p': time", "q': time", "r': time")
 _CORNER = ("p': thrust", "q': thrust", "r': thrust", "p': time")
@@ -59,7 +61,7 @@ TABLE: tuple[Effect, ...] = (
     ),
     Effect(
         "rotor_drag", "air",
-        tuple(P(n, "1/s", 0.0, -0.1, 3.0, 0.25, start=0.2, sign=1) for n in ("k_x", "k_y")),
+        (*(P(n, "1/s", 0.0, -0.1, 3.0, 0.25, start=0.2, sign=1) for n in ("k_x", "k_y")), _CENTRAL),
         summary="The turning rotors drag against sideways flight.",
         sentence="the rotors drag against sideways flight by {k_x:.2f} and {k_y:.2f} m/s^2 for each m/s",
         advice="Usual; leaving it out makes a simulated vehicle glide too far.",
@@ -101,7 +103,7 @@ TABLE: tuple[Effect, ...] = (
         shows=("p': p", "q': q", "r': r"),
     ),
     Effect(
-        "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1),),
+        "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1), _CENTRAL),
         summary="Thrust falls when climbing.",
         sentence="thrust falls by {k_z:.2f} m/s^2 for each m/s of climb",
         advice="Usual; matters for climbs and descents.",

@@ -70,6 +70,7 @@ class Air(NamedTuple):
 
     Attributes:
         drag_x, drag_y: k_x, k_y of rotor_drag [1/s].
+        drag_reach, axial_reach: shares of a hub's arm at which its drag and its inflow act.
         parasitic, parasitic_z: c, c_z [1/m].
         lift: k of translational_lift [1/m].
         moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the hubs.
@@ -82,6 +83,8 @@ class Air(NamedTuple):
 
     drag_x: float
     drag_y: float
+    drag_reach: float
+    axial_reach: float
     parasitic: float
     parasitic_z: float
     lift: float
@@ -177,18 +180,20 @@ def hub_forces(
     for i in range(omega.shape[0]):
         x, y, z = body.arms[changed, i, 0], body.arms[changed, i, 1], body.arms[changed, i, 2]
         weight = body.mass * omega[i] / air.hover_sum
+        near, far = air.drag_reach, air.axial_reach
+        along = -weight * air.drag_x * (velocity[0] + near * (rates[1] * z - rates[2] * y))
+        across = -weight * air.drag_y * (velocity[1] + near * (rates[2] * x - rates[0] * z))
+        lost = -weight * air.axial * (velocity[2] + far * (rates[0] * y - rates[1] * x))
         ahead = velocity[0] + rates[1] * z - rates[2] * y
         aside = velocity[1] + rates[2] * x - rates[0] * z
-        along, across = -weight * air.drag_x * ahead, -weight * air.drag_y * aside
-        lost = -weight * air.axial * (velocity[2] + rates[0] * y - rates[1] * x)
-        lost -= body.mass / omega.shape[0] * air.lift * (ahead * ahead + aside * aside)
+        lift = -body.mass / omega.shape[0] * air.lift * (ahead * ahead + aside * aside)
         fx += along
         fy += across
-        fz += lost
+        fz += lost + lift
         # arm x force, the force in the rotor plane acting higher by the height of `rotor_drag_moment`
-        roll += y * lost - (z - air.moment_y) * across
-        pitch += (z - air.moment_x) * along - x * lost
-        yaw += x * across - y * along
+        roll += y * (far * lost + lift) - (near * z - air.moment_y) * across
+        pitch += (near * z - air.moment_x) * along - x * (far * lost + lift)
+        yaw += near * (x * across - y * along)
     return fx, fy, fz, roll, pitch, yaw
 
 

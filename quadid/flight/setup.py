@@ -173,6 +173,8 @@ def _air(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Air:
     return Air(
         drag_x=value("rotor_drag", "k_x"),
         drag_y=value("rotor_drag", "k_y"),
+        drag_reach=1.0 - value("rotor_drag", "central"),
+        axial_reach=1.0 - value("axial_inflow", "central"),
         parasitic=value("parasitic_drag", "c"),
         parasitic_z=value.beside("parasitic_drag", "c_z", "c"),
         lift=value("translational_lift", "k"),

@@ -17,11 +17,11 @@ from quadid.types import FloatArray
 # isort: off
 from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
-    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HUB, C_HX, C_HY, C_INVM,
-    C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY,
-    C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF, L_FX, L_FY, L_FZ, L_MX,
-    L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW,
-    X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HUB,
+    C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ,
+    C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF,
+    L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E,
+    X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -47,7 +47,7 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
         # Specific force of the unloaded mass; im scales all of it when mass is taken up.
         thrust = b * s2
         sx, sy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0
-        fx, fy, fz, mx, my, mz, u1, v1, cx, cy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        fx, fy, fz, mx, my, mz, cx, cy, cz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if air:
             # Velocity relative to the air, in body axes.  This form of the rotation matrix keeps the heading of the
             # world's axes out of the motion even at the inner stages, where the quaternion is not of unit length.
@@ -61,21 +61,26 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
             w = r02 * rn + r12 * re + r22 * rd
         if hub:
             # Air at each hub, v + nu x r_i: sums over rotors of omega_i times products of their places, about the
-            # middle of the hubs at (cx, cy, cz) from the CG.
-            cz = s[C_HUB + lane]
+            # middle of the hubs at (cx, cy, cz) from the CG.  Arms of drag and inflow are shorter by `central`.
+            cz, hd, hf = s[C_HUB + lane], 1.0, 1.0
             if solid:
                 cx, cy = -s[C_CGX + lane], -s[C_CGY + lane]
-            u1, v1, w1 = u + q * cz - r * cy, v + r * cx - p * cz, w + p * cy - q * cx
+                hd, hf = s[C_DRAG_ARM + lane], s[C_FLOW_ARM + lane]
+            u1, v1 = u + hd * (q * cz - r * cy), v + hd * (r * cx - p * cz)
+            w1 = w + hf * (p * cy - q * cx)
             kx, ky, kz = s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane]
             o, ox = _at(A_S1, wa, wb, lane, s), _at(A_X1, wa, wb, lane, s)
             oy, oz = _at(A_Y1, wa, wb, lane, s), _at(A_Z1, wa, wb, lane, s)
             xx, yy, zz = _at(A_XX, wa, wb, lane, s), _at(A_YY, wa, wb, lane, s), _at(A_ZZ, wa, wb, lane, s)
             xy, xz, yz = _at(A_XY, wa, wb, lane, s), _at(A_XZ, wa, wb, lane, s), _at(A_YZ, wa, wb, lane, s)
-            fx, fy = -kx * (u1 * o + q * oz - r * oy), -ky * (v1 * o + r * ox - p * oz)
-            fz = -kz * (w1 * o + p * oy - q * ox)
-            mx = ky * (v1 * oz + r * xz - p * zz) - kz * (w1 * oy + p * yy - q * xy) + cy * fz - cz * fy
-            my = kz * (w1 * ox + p * xy - q * xx) - kx * (u1 * oz + q * zz - r * yz) + cz * fx - cx * fz
-            mz = kx * (u1 * oy + q * yz - r * yy) - ky * (v1 * ox + r * xx - p * xz) + cx * fy - cy * fx
+            fx, fy = -kx * (u1 * o + hd * (q * oz - r * oy)), -ky * (v1 * o + hd * (r * ox - p * oz))
+            fz = -kz * (w1 * o + hf * (p * oy - q * ox))
+            mx = hd * (ky * (v1 * oz + hd * (r * xz - p * zz)) - cz * fy)
+            my = hd * (cz * fx - kx * (u1 * oz + hd * (q * zz - r * yz)))
+            mx -= hf * (kz * (w1 * oy + hf * (p * yy - q * xy)) - cy * fz)
+            my += hf * (kz * (w1 * ox + hf * (p * xy - q * xx)) - cx * fz)
+            mz = kx * (u1 * oy + hd * (q * yz - r * yy)) - ky * (v1 * ox + hd * (r * xx - p * xz))
+            mz = hd * (mz + cx * fy - cy * fx)
             sx, sy = fx * s[C_INVM + lane], fy * s[C_INVM + lane]
         sz = (fz - thrust) * s[C_INVM + lane]
         if rare:
@@ -84,6 +89,7 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
             sx, sy = sx - flat * u + s[L_FX + lane], sy - flat * v + s[L_FY + lane]
             sz += s[L_FZ + lane] - tall * w
             # Lift of each hub's own sideways speed, u1 - r y and v1 + r x: means over the hubs of its products.
+            u1, v1 = u + q * cz - r * cy, v + r * cx - p * cz
             gx, gy, gxx = s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane]
             gyy, gxy, k, square = s[C_GYY + lane], s[C_GXY + lane], s[C_LIFT + lane], u1 * u1 + v1 * v1
             up = k * (square + 2.0 * r * (v1 * gx - u1 * gy) + r * r * (gxx + gyy))

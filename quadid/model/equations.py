@@ -35,6 +35,8 @@ Air at each hub: (u_i, v_i, w_i) = (u, v, w) + nu x r_i, r_i from the CG to the 
     axial_inflow        force -(m / N) k_z (0, 0, w_i) omega_i / omega_h at the hub: what momentum theory takes from
                         thrust in climb, to first order.
                         Both with moment r_i x force; omega_h carries the weight: b (omega_h - dead_speed)^2 + offset.
+                        central: r_i times 1 - central, in the hub's velocity and in the moment; 1 in simulators whose
+                        rotor aerodynamics act at the CG.
     translational_lift  force -(m / N) k (0, 0, u_i^2 + v_i^2) at the hub, with its moment.  Svacha et al. 2017,
                         doi:10.1109/ICUAS.2017.7991501.
     rotor_drag_moment   the force in the rotor plane acts h above the hub: tau_x += h_y F_y, tau_y -= h_x F_x (blade

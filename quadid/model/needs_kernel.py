@@ -49,13 +49,13 @@ class Needs(NamedTuple):
     learned: bool
 
 
-HUB_ENTRIES = places("rotor_drag", "axial_inflow")
+HUB_ENTRIES = places("rotor_drag.k_x", "rotor_drag.k_y", "axial_inflow.k_z")
 RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift")
 PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
 FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
 SOLID_ENTRIES = places(
     "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm",
-    "no_gyroscopic_coupling",
+    "no_gyroscopic_coupling", "rotor_drag.central", "axial_inflow.central",
 )  # fmt: skip
 IMU_ENTRIES = places("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
 DELAY_ENTRIES = places("command_delay", "rotor_telemetry_delay")

@@ -40,7 +40,6 @@ from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached,
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""
-HUB_ROWS = (A_X1, A_Y1, A_Z1, A_XX, A_YY, A_ZZ, A_XY, A_XZ, A_YZ)
 (EXPONENT,) = places("supply_voltage.exponent")
 (GROWTH,) = places("drag_torque_curve")
 

@@ -88,12 +88,16 @@ class SecondOpinion:
             lifting = p.b * max(omega[i] - self.get("thrust_curve", "dead_speed"), 0.0) ** 2
             thrust = power * (1.0 - loss * weak) * lift * (lifting + self.get("thrust_curve", "offset"))
             arm = np.array(rotor.position) - cg
+            pull = np.array([0.0, 0.0, -thrust])
             at_hub = v_body + np.cross(nu, arm)
-            air = -p.mass / self.n * k * at_hub * omega[i] / self.omega_h
-            air[2] -= p.mass / self.n * self.get("translational_lift", "k") * float(at_hub[:2] @ at_hub[:2])
-            pull = air + [0.0, 0.0, -thrust]
+            pull[2] -= p.mass / self.n * self.get("translational_lift", "k") * float(at_hub[:2] @ at_hub[:2])
             force += pull
-            torque += np.cross(arm, pull) + [h_y * air[1], -h_x * air[0], 0.0]
+            torque += np.cross(arm, pull)
+            for effect, acts in {"rotor_drag": [1.0, 1.0, 0.0], "axial_inflow": [0.0, 0.0, 1.0]}.items():
+                nearer = arm * (1.0 - self.get(effect, "central"))
+                air = -p.mass / self.n * k * acts * (v_body + np.cross(nu, nearer)) * omega[i] / self.omega_h
+                force += air
+                torque += np.cross(nearer, air) + [h_y * air[1], -h_x * air[0], 0.0]
             dragging = 1.0 - self.get("weak_rotor", "drag_loss", loss) * weak
             grown = 1.0 + self.get("drag_torque_curve", "growth") * (omega[i] / self.omega_h - 1.0)
             torque += rotor.spin * power * dragging * p.d * omega[i] ** 2 * grown * DOWN

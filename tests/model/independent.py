@@ -144,14 +144,18 @@ class Independent:
         torque += power * self.d * (self.spins @ (self.torque_gains * grown * omega**2)) * DOWN  # Eqs. 4 and 6
         torque += cross(nu, self["J_r"] * (self.spins @ omega) * DOWN)  # Eq. 7
         torque += self["rotor_spin_up.J"] * (self.spins @ turning) * DOWN
-        k = np.array([self["rotor_drag.k_x"], self["rotor_drag.k_y"], self["axial_inflow.k_z"]])
+        drag, inflow = np.array([self["rotor_drag.k_x"], self["rotor_drag.k_y"], 0.0]), self["axial_inflow.k_z"] * DOWN
         higher = np.array([self["rotor_drag_moment.h_y"], -self["rotor_drag_moment.h_x"], 0.0])
         for arm, speed in zip(arms, omega, strict=True):
             wind = v_air + cross(nu, arm)
-            hub = -self.m / self.n * (k * wind * speed / self.hover)
-            hub[2] -= self.m / self.n * self["translational_lift.k"] * float(wind[:2] @ wind[:2])
-            force = force + hub
-            torque += cross(arm, hub) + higher * hub[[1, 0, 2]]
+            lift = -self.m / self.n * self["translational_lift.k"] * float(wind[:2] @ wind[:2]) * DOWN
+            force = force + lift
+            torque += cross(arm, lift)
+            for k, effect in ((drag, "rotor_drag"), (inflow, "axial_inflow")):
+                nearer = arm * (1.0 - self[f"{effect}.central"])
+                hub = -self.m / self.n * k * (v_air + cross(nu, nearer)) * speed / self.hover
+                force = force + hub
+                torque += cross(nearer, hub) + higher * hub[[1, 0, 2]]
         c = self["parasitic_drag.c"]
         drag = np.array([c, c, c + self["parasitic_drag.beside_z"]]) * np.linalg.norm(v_air) * v_air
         return force - self.m * drag, torque

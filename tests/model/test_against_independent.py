@@ -25,6 +25,8 @@ EFFECTS: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "rotor_drag_moment": (DRAG, {"rotor_drag_moment.h_x": 0.03, "rotor_drag_moment.h_y": 0.02}),
     "rate_damping": ({}, {"rate_damping.l_p": 2.0, "rate_damping.m_q": 1.0, "rate_damping.n_r": 0.7}),
     "axial_inflow": ({}, {"axial_inflow.k_z": 0.3}),
+    "rotor_drag at the CG": (DRAG, {"rotor_drag.central": 1.0}),
+    "axial_inflow nearer to the CG": ({"axial_inflow.k_z": 0.5}, {"axial_inflow.central": 0.6}),
     "wind": (DRAG, {"wind.north": 3.0, "wind.east": -2.0}),
     "weak_rotor": ({}, {"weak_rotor.loss_2": 0.02}),
     "cg_offset": ({}, {"cg_offset.x": 0.0008, "cg_offset.y": -0.0005}),
