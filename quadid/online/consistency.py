@@ -5,13 +5,15 @@
   the tilt the pull of the accelerometer, which reads level in flight however the vehicle tilts.
 * Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays small.
 
-Every factor is a weighted mean over the last `MEMORY` of data that tell it, with its standard deviation; 1 is what it
-ought to be.  A factor that is not 1 has two channels that may be to blame: both are named.
+Every factor is estimated from the last data that tell it, with its standard deviation; 1 is what it ought to be.  A
+factor that is not 1 has two channels that may be to blame: both are named.  Data fade, and in the end are dropped: a
+channel that was wrong by a thousand would outweigh for minutes all that is right after it.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +27,8 @@ ALLOWED = 0.03
 """Calibrated sensors differ by less than this share."""
 ERRORS = 2.0
 """... and these many standard deviations, when they are compared."""
-MEMORY = 30.0
-"""Time constant of forgetting [s] of data that tell a factor."""
+MEMORY, GONE = 30.0, 45.0
+"""Data that tell a factor fade with this time constant, and are gone at this age [s of such data]."""
 TURN = 0.2
 """Gyro and attitude are compared over turns of this length [s]."""
 MOVING = 0.1
@@ -67,6 +69,26 @@ class Factor:
         return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
 
 
+class _Lately:
+    """Moments of data that tell a factor, fading; what is older than `GONE` leaves no trace."""
+
+    def __init__(self, *shape: int) -> None:
+        self._parts: deque[tuple[float, FloatArray]] = deque()
+        self.seconds, self.sum = 0.0, np.zeros(shape)
+
+    def add(self, seconds: float, moments: FloatArray) -> None:
+        """Takes in the moments of some seconds of data."""
+        self._parts.appendleft((seconds, moments))
+        lengths = np.array([length for length, _ in self._parts])
+        ages = np.cumsum(lengths) - lengths
+        while ages[-1] > GONE - 0.5 * seconds:
+            self._parts.pop()
+            ages = ages[:-1]
+        fade = np.exp(-ages / MEMORY)
+        self.seconds = float(fade @ lengths[: len(ages)])
+        self.sum = np.asarray(sum(f * part for f, (_, part) in zip(fade, self._parts, strict=True)))
+
+
 class Consistency:
     """Factors of the channels of one stream."""
 
@@ -77,8 +99,8 @@ class Consistency:
     def restart(self) -> None:
         """Begins anew: another stream."""
         # Moments of (1, turn by gyro, change of rate, tilt, turn by attitude), an axis each.
-        self._turns = np.zeros((3, 5, 5))
-        self._weight = self._force = 0.0
+        self._turns = [_Lately(5, 5) for _ in AXES]
+        self._force = _Lately()
 
     def add(self, rows: Rows | None) -> None:
         """Takes in rows of a second or so."""
@@ -90,9 +112,8 @@ class Consistency:
         if "accel" in rows.columns:
             force = -np.sum(down(q) * rows.columns["accel"], axis=1)
             force = force[np.isfinite(force)]
-            fade = math.exp(-len(force) * step / MEMORY)
-            self._weight = fade * self._weight + len(force) * step
-            self._force = fade * self._force + float(force.sum()) * step
+            if len(force):
+                self._force.add(len(force) * step, np.asarray(force.sum() * step))
 
     def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
         long = max(round(TURN / step), 1)
@@ -109,17 +130,16 @@ class Consistency:
             return
         rows = np.stack([np.ones_like(change), by_gyro, change, tilt, by_attitude], axis=-1)[good]
         moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
-        fade = math.exp(-len(rows) * long * step / MEMORY)
         for axis in np.flatnonzero(moving):
-            self._turns[axis] = fade * self._turns[axis] + rows[:, axis].T @ rows[:, axis]
+            self._turns[axis].add(len(rows) * long * step, rows[:, axis].T @ rows[:, axis])
 
     def factors(self) -> tuple[Factor, ...]:
         """Every factor of which there are data: of the gyro by axis, of the accelerometer."""
-        found = [_gyro_factor(axis, m) for axis, m in zip(AXES, self._turns, strict=True) if m.any()]
-        if self._weight > 0.0:
+        found = [_gyro_factor(axis, m) for axis, m in zip(AXES, (t.sum for t in self._turns), strict=True) if m.any()]
+        if self._force.seconds > 0.0:
             # The mean of an acceleration is a change of velocity over a time.
-            sigma = math.sqrt(2.0) * VERTICAL / self._weight / GRAVITY
-            mean = self._force / self._weight / GRAVITY
+            sigma = math.sqrt(2.0) * VERTICAL / self._force.seconds / GRAVITY
+            mean = float(self._force.sum) / self._force.seconds / GRAVITY
             found.append(Factor("accelerometer over gravity by the attitude", mean, sigma))
         return tuple(found)
 

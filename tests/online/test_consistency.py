@@ -108,6 +108,24 @@ def test_while_sensors_contradict_each_other_nothing_is_learned_or_published(
     happened(28, f"{channel} × {factor:g} from {begin:g} s on: nothing published; '{status.reason[:90]}'")
 
 
+@pytest.mark.parametrize(("channel", "factor"), [("gyro", 180.0 / np.pi), ("accel", 1000.0)])
+def test_a_fault_that_is_over_is_forgotten_however_wild_it_was(channel: str, factor: float, happened: Happened) -> None:
+    """Five seconds in another unit: what came before and after is right, and alone decides in the end."""
+    stream = [
+        replace(s, values=tuple(factor * v for v in s.values)) if s.channel == channel and 15.0 <= s.t < 20.0 else s
+        for s in light_flight(100.0)
+    ]
+    session = Session(PELICAN, QUICK)
+    works(session, between(stream, 0.0, 25.0), tells())
+    assert session.status().phase is Phase.BLOCKED
+    assert "sensors disagree" in session.status().reason
+    sets = published(works(session, between(stream, 25.0, 100.0), tells()))
+    assert session.status().phase is not Phase.BLOCKED
+    assert sets
+    assert all(s.start > 20.0 for s in sets)
+    happened(28, f"{channel} × {factor:.0f} for 5 s: blocked, and {sets[0].stop - 20.0:.0f} s later a set again")
+
+
 def test_a_vehicle_file_that_knows_b_limits_the_first_set(happened: Happened) -> None:
     """All rotor speeds wrong by one factor look like another b: only what was known before tells."""
     knows = PELICAN.parameters | {"b": ParameterPrior(initial=TRUE["b"] * 1.2, sigma=TRUE["b"] * 0.02)}
