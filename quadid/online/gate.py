@@ -48,7 +48,7 @@ class GateSettings(BaseModel):
     yaw_width: float = Field(default=0.3, gt=0.0, le=3.0)
     step: float = Field(default=0.25, gt=0.0, le=2.0)
     creep: float = Field(default=0.4, gt=0.0, le=4.0)
-    reference: float = Field(default=0.04, gt=0.0, le=4.0)
+    reference: float = Field(default=0.025, gt=0.0, le=4.0)
     inertia_slack: float = Field(default=1.5, ge=1.0, le=3.0)
     gain: float = Field(default=6.0, gt=0.0)
     sharper: float = Field(default=0.8, gt=0.0, lt=1.0)
@@ -194,7 +194,7 @@ def _agreement(case: Case, settings: GateSettings) -> str | None:
         return f"{case.agreeing} of {settings.windows} windows without a common sample agree so far: keep flying"
     for name, (change, sigma) in case.walked.items():
         if _far(change, sigma, settings):
-            return f"torque over inertia ({name}) walks: {math.expm1(change):+.0%} from the first to the last of them"
+            return f"torque over inertia ({name}) walks: {math.expm1(change):+.1%} from the first to the last of them"
     return None
 
 
@@ -256,8 +256,8 @@ def _reference(case: Case, settings: GateSettings) -> str | None:
                 change += sign * math.log(p.value / value)
                 variance += (p.sigma / p.value) ** 2 + (sigma / value) ** 2
         if _far(change, math.sqrt(variance), settings):
-            off = f"torque over inertia ({name}) is {math.expm1(change):+.0%} off {what}"
-            return f"{off}, allowed {settings.reference:.0%}: rotor speeds wrong by a factor look like this"
+            off = f"torque over inertia ({name}) is {math.expm1(change):+.1%} off {what}"
+            return f"{off}, allowed {settings.reference:.1%}: rotor speeds wrong by a factor look like this"
     return None
 
 

@@ -48,7 +48,7 @@ PARAMETERS: tuple[NodeParameter, ...] = (
     P("gate.yaw_width", 0.3, "Largest half-width of the interval of d, J_zz, J_r, relative.", (0.001, 3.0)),
     P("gate.step", 0.25, "Largest change of a parameter from the set in force, relative.", (0.001, 2.0)),
     P("gate.creep", 0.4, "Largest change from the last set that a person approved, or the first.", (0.001, 4.0)),
-    P("gate.reference", 0.04, "Largest change of torque over inertia without a person, see docs.", (0.001, 4.0)),
+    P("gate.reference", 0.025, "Largest change of torque over inertia without a person, see docs.", (0.001, 4.0)),
     P("history", "", "History file; default QUADID_HISTORY, else in the user's data folder; 'none' keeps none."),
     P("record", "", "MCAP file to record what arrives to; 'quadid replay --as-recorded' repeats the run bit for bit."),
     P("observer", False, "Keep no history and publish nothing: for a second node on one vehicle."),

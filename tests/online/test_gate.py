@@ -133,7 +133,7 @@ def test_rotor_speeds_that_may_be_wrong_wait_for_a_person(changes: dict[str, Any
     decision = decide(good(**changes), GateSettings())
     assert (decision.state, decision.check) == (SetState.PENDING, "reference")
     assert word in decision.reason
-    assert "-20%" in decision.reason
+    assert "-20.0%" in decision.reason
     assert "a person must approve it" in decision.reason
 
 
@@ -149,7 +149,7 @@ def test_mass_leaves_torque_over_inertia_as_it_is() -> None:
 def test_windows_whose_torque_over_inertia_walks_do_not_agree() -> None:
     decision = decide(good(walked={"J_xx": (0.08, 0.01)}), GateSettings())
     assert (decision.state, decision.check) == (SetState.REJECTED, "agreement")
-    assert "+8%" in decision.reason
+    assert "+8.3%" in decision.reason
     assert decide(good(walked={"J_xx": (0.08, 0.03)}), GateSettings()).state is SetState.ACCEPTED
 
 

@@ -49,7 +49,7 @@ def led_by(item: OnlineSet | ParameterSet, value: float, sigma: float = 0.01) ->
         ({"in_force": online_set(scaled(b=2.0))}, "step_limit", "b would change by -50% from the set in force, all"),
         ({"baseline": online_set(scaled(b=2.0))}, "step_limit", "b would change by -50% from the approved baseline"),
         ({"parameters": parameter_set(scaled(b=1.2, J_xx=0.84)), "baseline": online_set(TRUE)}, "reference",
-         "torque over inertia (J_xx) is +43% off the first accepted or last approved set, allowed 4%: rotor speeds"),
+         "torque over inertia (J_xx) is +42.9% off the first accepted or last approved set, allowed 2.5%: rotor"),
     ],
 )  # fmt: skip
 def test_who_decided_and_why_is_told_in_these_words(changes: dict[str, Any], check: str, reason: str) -> None:
