@@ -6,6 +6,7 @@ Only this much is needed of a statistics library, whose import would take longer
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 Z95 = 1.959963984540054
 """Standard deviations of a normal variable that 95 % lie within."""
@@ -41,6 +42,7 @@ def exceeded(probability: float, freedom: int) -> float:
     return 0.5 * (low + high)
 
 
+@lru_cache(maxsize=64)
 def lower_mean(share: float, freedom: int) -> float:
     """Mean of the lowest `share` of a chi-square variable, relative to the mean of all of it."""
     # The density times x is that of two more degrees, times the mean.

@@ -164,11 +164,11 @@ def _spectra(window: Window, every: int) -> list[ComplexArray]:
     return out
 
 
-def _weighted(spectra: ComplexArray, rounds: int = 3) -> tuple[FloatArray, FloatArray]:
+def _weighted(spectra: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """Shares of the rates and their change in the surplus, from spectra (stretches, frequencies, 4); covariance."""
     x, y = spectra[:, :, :-1], spectra[:, :, -1]
     weights = np.ones(x.shape[1])
-    for _ in range(rounds):
+    for _ in range(3):
         inverse = np.linalg.inv(np.einsum("sfi,sfj,f->ij", x.conj(), x, weights).real)
         shares = inverse @ np.einsum("sfi,sf,f->i", x.conj(), y, weights).real
         power = np.pad(np.mean(np.abs(y - x @ shares) ** 2, axis=0), NEIGHBOURS // 2, mode="edge")

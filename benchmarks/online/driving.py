@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
 
-from quadid.online import FitRequest, Session, fit_window
-from quadid.online.fault_isolation import ChangeRequest, isolate_fault
+from quadid.online import Job, JobReply, Session
 from quadid.online.outbox import Action
 from quadid.window import Recording, Sample
 
-Fit = Callable[[FitRequest], Any]
+Work = Callable[[Job], JobReply]
 
 
 def samples(recording: Recording, shift: float = 0.0) -> Iterator[Sample]:
@@ -25,16 +23,11 @@ def samples(recording: Recording, shift: float = 0.0) -> Iterator[Sample]:
         yield Sample(shift + t, name, tuple(row))
 
 
-def drive(session: Session, stream: Iterable[Sample], fit: Fit = fit_window) -> Iterator[Action]:
-    """Pushes samples one by one, does every fit at once, and yields what the session says."""
+def drive(session: Session, stream: Iterable[Sample], work: Work = Job.run) -> Iterator[Action]:
+    """Pushes samples one by one, does every job at once, and yields what the session says."""
     for sample in stream:
         session.push(sample)
-        while True:
+        yield from session.poll()
+        while session.running is not None:
+            session.deliver(work(session.running))
             yield from session.poll()
-            request = session.running
-            if isinstance(request, ChangeRequest):
-                session.deliver(isolate_fault(request))
-            elif request is not None:
-                session.deliver(fit(request))
-            else:
-                break

@@ -15,7 +15,7 @@ from quadid_node.worker import InlineWorker
 
 from benchmarks.online.accuracy import PELICAN, flown
 from benchmarks.online.driving import samples
-from quadid.online import FitRequest, SessionSettings, fit_window
+from quadid.online import FitRequest, Job, JobReply, SessionSettings
 from quadid.online.outbox import Action
 from quadid.window import Sample
 
@@ -69,10 +69,11 @@ def refits(seconds: float) -> dict[str, Any]:
 
     spent: list[tuple[bool, float, float]] = []
 
-    def timed(request: FitRequest) -> Any:
+    def timed(job: Job) -> JobReply:
         wall, cpu = time.perf_counter(), time.process_time()
-        reply = fit_window(request)
-        spent.append((request.search, time.process_time() - cpu, time.perf_counter() - wall))
+        reply = job.run()
+        if isinstance(job, FitRequest):
+            spent.append((job.search, time.process_time() - cpu, time.perf_counter() - wall))
         return reply
 
     from benchmarks.online.driving import drive

@@ -18,7 +18,7 @@ from quadid.flight import draw_truth, fly
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.model.layout import Layout
-from quadid.online.window_fit import FitRequest, fit_window
+from quadid.online.window_fit import FitRequest
 from quadid.vehicle import Vehicle
 
 FULL = FitOptions(64, 100, SwarmOptions(tolerance=0.0, patience=None), seed=1)
@@ -67,12 +67,12 @@ def refits(rounds: int) -> dict[str, Any]:
     vehicle, window = Vehicle.shipped("pelican"), flight(60.0).slice(500, 1000)
     start = Layout(vehicle).initial(vehicle)
     cold = FitRequest(1, vehicle, (window,), 10.0, 20.0, start, None, True, 1)
-    first = fit_window(cold)
+    first = cold.answer()
     if first.theta is None:
         raise AssertionError(first.problem)
     warm = replace(cold, theta=first.theta, noise=first.noise, search=False)
     later = replace(warm, windows=(flight(60.0).slice(550, 1050),))
-    cases = {"cold": lambda: fit_window(cold), "warm, one second later": lambda: fit_window(later)}
+    cases = {"cold": cold.run, "warm, one second later": later.run}
     return {"times": interleaved(cases, rounds)}
 
 

@@ -65,14 +65,6 @@ class SubspaceModel:
         poles = np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
         return poles[np.lexsort((poles.imag, -np.abs(poles)))]
 
-    def markov(self, count: int) -> FloatArray:
-        """Impulse response D, CB, CAB, ..., shape (count, p, m): free of the basis of the state."""
-        out, x = [self.D], self.B
-        for _ in range(count - 1):
-            out.append(self.C @ x)
-            x = self.A @ x
-        return np.array(out[:count])
-
 
 class Prediction(NamedTuple):
     """Segments simulated from their estimated initial states.
@@ -162,20 +154,3 @@ def _free(model: SubspaceModel, length: int) -> FloatArray:
         out[k] = row
         row = row @ model.A
     return out
-
-
-def innovations(model: SubspaceModel, inputs: ArrayLike, outputs: ArrayLike, warm_up: int = 0) -> FloatArray:
-    """One-step prediction errors of the Kalman predictor in one record without gaps, shape (rows - warm_up, p).
-
-    Args:
-        model: n states.
-        inputs: shape (rows, m), finite.
-        outputs: shape (rows, p), finite.
-        warm_up: rows at the beginning, where the state is not known yet, to be left out.
-    """
-    u, y = np.array(inputs, dtype=np.float64), np.array(outputs, dtype=np.float64)
-    x, e = np.zeros(model.order), np.empty_like(y)
-    for k in range(len(y)):
-        e[k] = y[k] - model.C @ x - model.D @ u[k] - model.output_offset
-        x = model.A @ x + model.B @ u[k] + model.K @ e[k] + model.state_offset
-    return e[warm_up:]

@@ -111,12 +111,10 @@ def fit_model(
     return as_model(shooting, result, free, causes)
 
 
-def as_model(
-    shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...], prior: Prior | None = None
-) -> Model:
-    """Wraps a polish result with its held-out deviance; `prior` as in the polish, weak by default."""
-    prior = prior or default_prior(shooting, free)
-    held_out = held_out_deviance(result.lin, 1.0 / prior.sigma**2, block_labels(result.lin))
+def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
+    """Wraps the result of a polish with the default prior, with its held-out deviance."""
+    prior = default_prior(shooting, free)
+    held_out = held_out_deviance(result.lin, prior.precision, block_labels(result.lin))
     return Model(causes, free, prior, result.theta, result.lin, result.cost, result.states, held_out)
 
 

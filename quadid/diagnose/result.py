@@ -130,7 +130,7 @@ class Diagnosis:
             for f in self.remainder.followed
         ]
 
-    def to_dict(self, vehicle_file: str | None = None) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain data of contract form."""
         return {
             "schema": "quadid.diagnose/1",
@@ -147,7 +147,7 @@ class Diagnosis:
             },
             "unexplained": self.unexplained,
             "unexplained_follows": self.unexplained_follows,
-            "vehicle_file": vehicle_file,
+            "vehicle_file": None,
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "prediction_file": None,
             "warnings": list(self.warnings),

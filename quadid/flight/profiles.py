@@ -55,21 +55,21 @@ def doublets(rng: np.random.Generator, n: int, every: float, width: tuple[float,
     return out
 
 
-def _tilt(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
+def _tilt(rng: np.random.Generator, n: int) -> FloatArray:
     a, b, c = rng.spawn(3)
     slow, quick = band_noise(a, n, 0.06, 0.25, 0.115), band_noise(b, n, 0.25, 1.5, 0.05)
-    return scale * (slow + quick + doublets(c, n, 10.0, (0.25, 0.6), 0.2))
+    return slow + quick + doublets(c, n, 10.0, (0.25, 0.6), 0.2)
 
 
-def _yaw(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
+def _yaw(rng: np.random.Generator, n: int) -> FloatArray:
     a, b = rng.spawn(2)
     rate = band_noise(a, n, 0.01, 0.5, 0.5) + doublets(b, n, 9.0, (0.6, 1.5), 0.9)
-    return np.asarray(scale * np.cumsum(np.clip(rate, -1.2, 1.2)) * PILOT_STEP)
+    return np.asarray(np.cumsum(np.clip(rate, -1.2, 1.2)) * PILOT_STEP)
 
 
-def _collective(rng: np.random.Generator, n: int, scale: float = 1.0) -> FloatArray:
+def _collective(rng: np.random.Generator, n: int) -> FloatArray:
     a, b = rng.spawn(2)
-    return scale * (band_noise(a, n, 0.15, 1.8, 0.09) + doublets(b, n, 11.0, (0.3, 0.7), 0.13))
+    return band_noise(a, n, 0.15, 1.8, 0.09) + doublets(b, n, 11.0, (0.3, 0.7), 0.13)
 
 
 def excited(rng: np.random.Generator, n: int) -> FloatArray:

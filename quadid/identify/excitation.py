@@ -14,6 +14,9 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
+SECONDS = 1.0
+"""Length of the segments [s]."""
+
 
 @dataclass(frozen=True)
 class Excitation:
@@ -45,7 +48,6 @@ def bounds_of(information: FloatArray) -> FloatArray:
 
 def excitation(
     windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray | None = None, noise: NoiseModel | None = None,
-    names: Sequence[str] = NOMINAL_NAMES, seconds: float = 1.0,
 ) -> Excitation:  # fmt: skip
     """Computes the bounds for `windows` at `theta` (default: the vehicle's initial guess).
 
@@ -54,11 +56,9 @@ def excitation(
         vehicle: the vehicle.
         theta: full parameter vector.
         noise: sensor noise; typical MEMS noise by default.
-        names: parameters of interest.
-        seconds: segment length.
     """
-    shooting = Shooting.cut(windows, vehicle, seconds, noise)
-    free = shooting.free(list(names))
+    shooting = Shooting.cut(windows, vehicle, SECONDS, noise)
+    free = shooting.free(NOMINAL_NAMES)
     point = shooting.layout.initial(vehicle) if theta is None else theta
     information = shooting.linearise(point, free).information
     diagonal = np.maximum(np.diag(information), 0.0)

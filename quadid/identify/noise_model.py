@@ -172,7 +172,7 @@ def estimate_noise(
         # Trim segments with outliers: the middle 98 % of segment powers.
         power = np.sum(r * r, axis=1)
         r = r[power <= np.quantile(power, 0.98)]
-        keep = 1.0 if len(r) < 50 else _trim_gain(len(power), length - basis.shape[1])
+        keep = 1.0 if len(r) < 50 else lower_mean(0.98, length - basis.shape[1])
         moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
         var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
         if c in ATTITUDE and length >= 8:
@@ -193,9 +193,3 @@ def _forms(length: int, step: float, order: int) -> tuple[FloatArray, tuple[Floa
     forms = [np.eye(length), slow]
     expectation = np.array([[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms])
     return basis, (forms[0], forms[1], expectation)
-
-
-@lru_cache(maxsize=64)
-def _trim_gain(segments: int, freedom: int) -> float:
-    """Mean power of the lower 98 % of chi-square segments relative to all."""
-    return lower_mean(0.98, freedom)

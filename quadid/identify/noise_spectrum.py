@@ -74,14 +74,14 @@ def _cosines(length: int) -> FloatArray:
     return np.asarray(modes)
 
 
-def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: InitialStates, seed: int = 0) -> NoiseModel:
+def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: InitialStates) -> NoiseModel:
     """Noise model of `shooting` with the spectrum of its inertial channels, from the residual at `theta` and `states`.
 
     `shooting.noise` must be white in those channels.  Attitude keeps its slow part; channels with few segments stay
     white.
     """
     noise = shooting.noise
-    found, null, counts = mode_power(shooting, theta, free, np.random.default_rng(seed), states)
+    found, null, counts = mode_power(shooting, theta, free, np.random.default_rng(0), states)
     channels, length = found.shape
     frequency = 0.5 * np.arange(length) / (length * shooting.dt)
     grid = np.linspace(0.0, 0.5 / shooting.dt, SHAPE_POINTS)

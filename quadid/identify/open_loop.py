@@ -134,17 +134,16 @@ def mean_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, 
     return _by_quantity([lengths(OpenLoop(w, vehicle, samples).misses(theta[None], at)[0, :, 0]) for w in windows])
 
 
-def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int, longest: int = 0) -> dict[str, float]:
+def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict[str, float]:
     """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack.
 
     Args:
         windows: of one or more files, on one grid.
         vehicle: geometry and mass.
         samples: after the start.
-        longest: counts only starts of runs of so many samples; by default of `samples`.
     """
     at = np.array([samples])
-    return _by_quantity([OpenLoop(w, vehicle, max(samples, longest)).no_change(at)[:, 0] for w in windows])
+    return _by_quantity([OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows])
 
 
 def _by_quantity(errors: Sequence[FloatArray]) -> dict[str, float]:

@@ -114,25 +114,6 @@ def _file_tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, 
     return tally
 
 
-def rate_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> FloatArray:
-    """Error of the predicted body rates `samples` after every start, axis by axis.
-
-    Args:
-        windows: of one or more files, on one grid.
-        vehicle: geometry and mass.
-        theta: full parameter vector, shape (size,).
-        samples: horizon, 1 to `LONGEST`.
-
-    Returns:
-        Predicted - measured p, q, r [rad/s], body FRD, shape (starts, 3), windows one after the other; rows without a
-        measurement at the target are left out.
-    """
-    at = np.array([samples])
-    parts = [OpenLoop(w, vehicle, samples).misses(theta[None], at)[0, :, 0, 3] for w in windows]
-    errors = np.concatenate(parts) if parts else np.zeros((0, 3))
-    return np.asarray(errors[~np.isnan(errors).any(axis=1)])
-
-
 def _window_tally(window: Window, vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
     loop, at, tally = OpenLoop(window, vehicle, longest), 1 + np.arange(longest), _empty(longest)
     for rows, misses in loop.parts(theta[None], at):

@@ -17,7 +17,7 @@ from quadid.effects.kinds import Scale
 from quadid.errors import ParameterError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.residual import MOST_FACTORS, SIGNALS, TARGETS
-from quadid.types import FloatArray, IndexArray, IntArray
+from quadid.types import FloatArray, IntArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 B, D, JXX, JYY, JZZ, JR = range(6)
@@ -112,10 +112,6 @@ class Layout:
         if name not in self.entries:
             raise ParameterError(f"unknown parameter '{name}'", fix=nearest(name, self.entries))
         return self.entries[name]
-
-    def indices(self, names: list[str] | tuple[str, ...]) -> IndexArray:
-        """Returns the vector indices of `names`."""
-        return np.array([self.entry(n).index for n in names], dtype=np.intp)
 
     def neutral(self) -> FloatArray:
         """Returns a vector with every effect neutral and the six nominal entries NaN, shape (size,)."""

@@ -3,7 +3,7 @@
 session = Session(vehicle)                  one vehicle, one flight after another
 session.push(sample)                        cheap; any order, any rate
 for action in session.poll(): ...           what to fit, publish and journal
-session.deliver(fit_window(request))        the answer to a `FitRequest`
+session.deliver(job.run())                  the answer to a `Job`
 
 The same samples, commands and seed give the same actions bit for bit, however `push` and `poll` are interleaved.
 """
@@ -21,7 +21,7 @@ from quadid.online.records import (
 from quadid.online.session import Session
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
-from quadid.online.window_fit import FitReply, FitRequest, fit_window
+from quadid.online.window_fit import FitReply, FitRequest
 
 __all__ = [
     "Diagnosed",
@@ -38,5 +38,4 @@ __all__ = [
     "SessionSettings",
     "SessionStatus",
     "SetState",
-    "fit_window",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from quadid.chi_square import Z95
 from quadid.errors import QuadidError
@@ -17,7 +17,9 @@ from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, Diagnosed, OnlineFinding
 from quadid.vehicle import Vehicle
-from quadid.window import Window
+
+if TYPE_CHECKING:
+    from quadid.diagnose.result import Finding
 
 DIAGNOSED_SECONDS = 60.0
 """Flight that a diagnosis looks at [s]."""
@@ -30,22 +32,20 @@ class DiagnosisRequest(Job):
     """The last minute, to be diagnosed.
 
     Attributes:
-        vehicle: nominal vehicle.
-        windows: data; start, stop: their time [s].
         seed: of what is drawn.
     """
 
     background: ClassVar[bool] = True
+    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, ArithmeticError, ValueError)
 
-    vehicle: Vehicle
-    windows: tuple[Window, ...]
-    start: float
-    stop: float
     seed: int
 
-    def run(self) -> DiagnosisReply:
+    def answer(self) -> DiagnosisReply:
         """Diagnoses the windows."""
-        return diagnose_window(self)
+        from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
+
+        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True)
+        return DiagnosisReply(self.number, "", tuple(map(_online, result.findings)), result.verdict.value)
 
     def failed(self, problem: str) -> DiagnosisReply:
         """The reply of a diagnosis that could not be run."""
@@ -65,23 +65,13 @@ class DiagnosisReply(JobReply):
     verdict: str = ""
 
 
-def diagnose_window(request: DiagnosisRequest) -> DiagnosisReply:
-    """Diagnoses; trouble is told in the reply, never raised."""
-    from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
-
-    try:
-        result, _ = diagnose(request.windows, request.vehicle, seed=request.seed, swarm=True)
-    except (QuadidError, ArithmeticError, ValueError) as error:
-        return request.failed(str(error))
-    findings = []
-    for f in result.findings:
-        findings.append(OnlineFinding(
-            f.effect, {p.name: p.value for p in f.parameters},
-            {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
-            {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
-            tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
-        ))  # fmt: skip
-    return DiagnosisReply(request.number, "", tuple(findings), result.verdict.value)
+def _online(f: Finding) -> OnlineFinding:
+    return OnlineFinding(
+        f.effect, {p.name: p.value for p in f.parameters},
+        {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
+        {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
+        tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
+    )  # fmt: skip
 
 
 class BackgroundDiagnosis:

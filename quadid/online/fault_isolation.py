@@ -8,7 +8,6 @@ import numpy as np
 
 from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
-from quadid.errors import QuadidError
 from quadid.identify.gauss_newton import polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
@@ -21,8 +20,6 @@ from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""
@@ -44,29 +41,24 @@ EFFECT_SIGMA = 0.3
 class ChangeRequest(Job):
     """A change to be explained.
 
+    The windows hold data from the change on.
+
     Attributes:
-        vehicle: the vehicle.
-        windows: data from the change on.
-        start, stop: their time [s].
         theta: full vector known before; z_sigma: standard deviations of its nominal entries, log scale, shape (6,).
         noise: sensor noise.
         change: what was seen, at session time.
         time: when, refined; in the time of the stream's stamps [s].
     """
 
-    vehicle: Vehicle
-    windows: tuple[Window, ...]
-    start: float
-    stop: float
     theta: FloatArray
     z_sigma: FloatArray
     noise: NoiseModel | None
     change: Change
     time: float
 
-    def run(self) -> ChangeReply:
-        """Isolates the fault."""
-        return isolate_fault(self)
+    def answer(self) -> ChangeReply:
+        """Fits every look-alike to the data after the change."""
+        return _explain(self)
 
     def failed(self, problem: str) -> ChangeReply:
         """The reply where nothing could be fitted."""
@@ -96,14 +88,6 @@ class _Outcome:
     deviance: float
     mse: float
     states: InitialStates
-
-
-def isolate_fault(request: ChangeRequest) -> ChangeReply:
-    """Fits every look-alike to the data after the change; trouble is told in the reply, never raised."""
-    try:
-        return _explain(request)
-    except (QuadidError, np.linalg.LinAlgError) as error:
-        return request.failed(str(error))
 
 
 def _explain(request: ChangeRequest) -> ChangeReply:

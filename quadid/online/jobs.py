@@ -9,6 +9,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, TypeGuard
 
+import numpy as np
+
+from quadid.errors import QuadidError
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+
 
 @dataclass(frozen=True)
 class JobReply:
@@ -28,17 +34,33 @@ class Job(ABC):
     """A pure function of its own fields.
 
     Attributes:
-        number: counts the jobs of a session.
         background: whether the session goes on meanwhile; it stands still for all others.
+        trouble: what may go wrong with data that nobody foresaw.
+        number: counts the jobs of a session.
+        vehicle: the vehicle.
+        windows: stretches of data on one grid.
+        start, stop: the time they stand for [s].
     """
 
     background: ClassVar[bool] = False
+    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, np.linalg.LinAlgError)
 
     number: int
+    vehicle: Vehicle
+    windows: tuple[Window, ...]
+    start: float
+    stop: float
 
-    @abstractmethod
     def run(self) -> JobReply:
         """Does it; trouble is the reply's `problem`, never raised."""
+        try:
+            return self.answer()
+        except self.trouble as error:
+            return self.failed(str(error))
+
+    @abstractmethod
+    def answer(self) -> JobReply:
+        """Does it; raises what is `trouble`."""
 
     @abstractmethod
     def failed(self, problem: str) -> JobReply:

@@ -105,7 +105,7 @@ class Supervisor:
         if reply.vehicle is not None and not self._estimator.flexible:
             self._join(request, reply, reply.vehicle)
         if not self._estimator.fusion.judge(reply.estimate).agrees:
-            self._odd(request, reply)
+            self._odd(request)
             return
         self._odd_since = None
         self._estimator.take(reply, trusted=True)
@@ -121,7 +121,7 @@ class Supervisor:
         text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"
         self._outbox.say(request.stop, "info", "model", text)
 
-    def _odd(self, request: FitRequest, reply: FitReply) -> None:
+    def _odd(self, request: FitRequest) -> None:
         """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed."""
         if self._odd_since is None:
             self._odd_since = request.stop

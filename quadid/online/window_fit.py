@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.effects import EFFECTS
-from quadid.errors import QuadidError
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import Polished, polish, robust_weights
@@ -60,9 +59,6 @@ class FitRequest(Job):
     """A window to be fitted.
 
     Attributes:
-        vehicle: the vehicle.
-        windows: stretches of data on one grid.
-        start, stop: the time they stand for [s].
         theta: full parameter vector to start from.
         noise: sensor noise; None lets the fit estimate it.
         search: run the swarm first: nothing is known yet, or the vehicle has changed.
@@ -71,10 +67,6 @@ class FitRequest(Job):
         flexible: fit every effect that moves the vehicle along.
     """
 
-    vehicle: Vehicle
-    windows: tuple[Window, ...]
-    start: float
-    stop: float
     theta: FloatArray
     noise: NoiseModel | None
     search: bool
@@ -82,9 +74,9 @@ class FitRequest(Job):
     measure: bool = False
     flexible: bool = False
 
-    def run(self) -> FitReply:
-        """Fits the window."""
-        return fit_window(self)
+    def answer(self) -> FitReply:
+        """Fits the windows."""
+        return _fit(self)
 
     def failed(self, problem: str) -> FitReply:
         """The reply of a fit that could not be run."""
@@ -151,14 +143,6 @@ def prior_of(vehicle: Vehicle) -> Prior:
     """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
     given = [vehicle.parameters[name] for name in NOMINAL_NAMES]
     return Prior(vehicle.initial, np.array([min(max(p.log_sigma, TIGHTEST), p.log_halfwidth) for p in given]))
-
-
-def fit_window(request: FitRequest) -> FitReply:
-    """Fits one window; trouble is told in the reply, never raised."""
-    try:
-        return _fit(request)
-    except (QuadidError, np.linalg.LinAlgError) as error:
-        return request.failed(str(error))
 
 
 def _fit(request: FitRequest) -> FitReply:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
@@ -26,8 +26,8 @@ LIBRARY = "a call of the library"
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
-def identify_html(done: Identified, truth: Mapping[str, float] | None = None, command: str = LIBRARY) -> str:
-    """The HTML report of an identification; `truth` where a simulation knows it."""
+def identify_html(done: Identified, command: str = LIBRARY) -> str:
+    """The HTML report of an identification."""
     from quadid.report.identify_page import correlation_section, identify_page
     from quadid.report.page import render
 
@@ -41,7 +41,7 @@ def identify_html(done: Identified, truth: Mapping[str, float] | None = None, co
         {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
         {"name": "taken as known", "value": known(fit.vehicle)},
     ]
-    page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows, truth)
+    page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows)
     page["sections"] = [correlation_section(fit.parameters)]
     page["excitation"] = told(fit, [log for log, s in zip(done.logs, done.sets, strict=True) if s.role == "train"])
     return render(page)

@@ -24,7 +24,7 @@ from quadid_replay.writing import Source, as_recording, in_time_order, open_for_
 
 dialect = extend_dialect(ardupilotmega)
 SYSTEM, COMPONENT = 1, 1
-_UNIX_START_US = 1_600_000_000_000_000
+_UNIX_START_US = 1_600_000_000_000_000  # receive time at recording time 0
 _TYPES = {3: 15, 4: 2, 6: 13, 8: 14, 10: 35, 12: 29}  # rotors to MAV_TYPE
 _GENERIC_AUTOPILOT, _ACTIVE = 0, 4
 _LONGEST_MS = 2**32
@@ -32,13 +32,12 @@ _GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
 _Series = tuple[FloatArray, Callable[[int], list[Any]]]
 
 
-def write_tlog(file: str | Path | BinaryIO, source: Source, unix_start_us: int = _UNIX_START_US) -> None:
+def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
     """Writes a recording or windows to a telemetry log.
 
     Args:
         file: path or binary stream.
         source: what to write.
-        unix_start_us: receive time at recording time 0 [us, UNIX].
 
     Raises:
         LogError: nothing to write, times that boot clocks cannot tell, or a file that cannot be written.
@@ -50,7 +49,7 @@ def write_tlog(file: str | Path | BinaryIO, source: Source, unix_start_us: int =
         for t, message in mavlink_messages(recording):
             frame = message.pack(mav)
             mav.seq = (mav.seq + 1) % 256
-            stream.write(struct.pack(">Q", unix_start_us + round(t * 1e6)) + frame)
+            stream.write(struct.pack(">Q", _UNIX_START_US + round(t * 1e6)) + frame)
     finally:
         if stream is not file:
             stream.close()

@@ -8,8 +8,8 @@ import pytest
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
 from quadid.identify.noise_model import NoiseModel
-from quadid.identify.open_loop import true_rate
-from quadid.identify.prediction import horizon_scores, rate_errors
+from quadid.identify.open_loop import OpenLoop, true_rate
+from quadid.identify.prediction import horizon_scores
 from quadid.identify.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
@@ -140,7 +140,8 @@ def test_impossible_horizons(flight: Flight) -> None:
 
 def test_rate_errors_by_axis_are_those_of_the_score(flight: Flight) -> None:
     theta = Layout(PELICAN).initial(PELICAN)
-    errors = rate_errors([flight.window], PELICAN, theta, 10)
+    misses = OpenLoop(flight.window, PELICAN, 10).misses(theta[None], np.array([10]))[0, :, 0, 3]
+    errors = misses[~np.isnan(misses).any(axis=1)]
     pooled, _ = horizon_scores([[flight.window]], PELICAN, theta, [10])
     # The score's longest run is fifty samples, so it leaves out the last forty starts.
     mean = np.linalg.norm(errors[: pooled.samples], axis=1).mean()

@@ -8,7 +8,7 @@ import pytest
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.change_detection import Change, ChangeDetector
-from quadid.online.fault_isolation import ChangeRequest, isolate_fault
+from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.resampler import Rows
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
@@ -89,7 +89,7 @@ def explained(profile: str, effects: Effects, change: Change) -> ChangeRequest:
     ],
 )
 def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, float], name: str, number: str) -> None:
-    reply = isolate_fault(explained("excited", effects, Change(40.0, *seen, 30.0)))
+    reply = explained("excited", effects, Change(40.0, *seen, 30.0)).answer()
     assert reply.finding is not None, reply.problem
     assert reply.finding.effect == name
     assert reply.finding.confident or name == "thrust_drop", "mass taken up with its inertia looks much like it"
@@ -100,13 +100,13 @@ def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, flo
 
 def test_in_hover_mass_and_thrust_are_not_told_apart_with_confidence() -> None:
     drop = (("thrust_drop", "time", AT), ("thrust_drop", "fraction", 0.12))
-    reply = isolate_fault(explained("hover", drop, Change(40.0, "thrust", -0.12, 30.0)))
+    reply = explained("hover", drop, Change(40.0, "thrust", -0.12, 30.0)).answer()
     assert reply.finding is not None
     assert not reply.finding.confident
     assert {reply.finding.effect} | {a.effect for a in reply.finding.alternatives} >= {"mass_change", "thrust_drop"}
 
 
 def test_no_cause_is_invented() -> None:
-    reply = isolate_fault(explained("excited", (), Change(40.0, "pitch moment", 0.05, 8.0)))
+    reply = explained("excited", (), Change(40.0, "pitch moment", 0.05, 8.0)).answer()
     assert reply.finding is None
     assert "no known cause" in reply.problem

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.identify.fit import FitOptions, fit
-from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState, fit_window
+from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.fault_isolation import ChangeReply
 from quadid.online.gate import GateSettings
 from quadid.online.outbox import Action
@@ -65,7 +65,7 @@ def test_how_samples_are_pushed_and_polled_changes_nothing() -> None:
         jumpy += other.poll(most=int(rng.integers(0, 3)))
         if other.running is not None and rng.random() < 0.5:  # some replies come late
             assert isinstance(other.running, FitRequest)
-            other.deliver(fit_window(other.running))
+            other.deliver(other.running.run())
     jumpy += answer(other)
     assert outcome(plain) == outcome(jumpy)
     assert outcome(plain) == outcome(drive(third, stream, chunk=7))
@@ -150,7 +150,7 @@ def test_a_rollback_while_a_fit_runs_ignores_that_fit(happened: Happened) -> Non
     request = session.running
     assert isinstance(request, FitRequest)
     done = session.roll_back("bob").done
-    session.deliver(fit_window(request))
+    session.deliver(request.run())
     actions = session.poll()
     assert done == (force.sequence > 1)
     if done:
@@ -172,7 +172,7 @@ def test_a_rollback_drops_the_work_that_was_begun() -> None:
     request = session.running
     assert isinstance(request, FitRequest)
     assert pieces > 10
-    session.deliver(fit_window(request))
+    session.deliver(request.run())
     session.poll(1)  # the estimate is fused, the gate is not asked yet
     assert session.roll_back("bob").done
     afterwards = answer(session)
@@ -211,7 +211,7 @@ def test_a_failed_fit_is_told_and_the_session_goes_on() -> None:
                 session.poll()
                 assert session.status().phase is Phase.FAILED
             else:
-                session.deliver(fit_window(request))
+                session.deliver(request.run())
     assert session.status().fits > 3
 
 

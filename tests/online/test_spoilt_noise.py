@@ -9,7 +9,7 @@ from quadid.grid import to_windows
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
-from quadid.online.window_fit import FitReply, FitRequest, fit_window
+from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -27,7 +27,7 @@ def windows() -> tuple[Window, ...]:
 
 def fitted(windows: tuple[Window, ...], noise: NoiseModel | None, search: bool = False) -> FitReply:
     theta = Layout(PELICAN).initial(PELICAN)
-    return fit_window(FitRequest(1, PELICAN, windows, 0.0, 10.0, theta, noise, search, 0))
+    return FitRequest(1, PELICAN, windows, 0.0, 10.0, theta, noise, search, 0).answer()
 
 
 def spoilt(channels: int) -> NoiseModel:
@@ -59,7 +59,7 @@ def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, 
     asked = learner.request(2, windows, 0.0, 10.0)
     assert asked.noise is not None
     assert asked.noise.white[0] == 3.0
-    learner.take(fit_window(asked), trusted=True)
+    learner.take(asked.answer(), trusted=True)
     assert np.allclose(learner.noise.white, good.white, rtol=0.3)
 
 
