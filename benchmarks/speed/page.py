@@ -31,12 +31,11 @@ def _machine(m: Result) -> str:
     return f"{m['date']}; {m['processor']}, {m['cores']} cores, load {m['load']:.1f}; Python {m['python']}, {versions}"
 
 
-def _times(found: Result, extra: Callable[[str, Result], str] | None = None, head: str = "") -> list[str]:
-    rows = [f"| what | wall [s] | processor [s] |{head}", "|---|---|---|" + "---|" * head.count("|")]
+def _times(found: Result) -> list[str]:
+    rows = ["| what | wall [s] | processor [s] |", "|---|---|---|"]
     for name, t in found["times"].items():
         low, high = t["wall_quartiles"]
-        more = extra(name, t) if extra else ""
-        rows.append(f"| {name} | {t['wall']:.3g} ({low:.3g} … {high:.3g}) | {t['processor']:.3g} |{more}")
+        rows.append(f"| {name} | {t['wall']:.3g} ({low:.3g} … {high:.3g}) | {t['processor']:.3g} |")
     return rows
 
 
@@ -59,18 +58,6 @@ def _kernel(r: Result) -> list[str]:
         f"NumPy at its best takes {r['gain_over_numpy']:.0f} times as long; rotor drag takes "
         f"{r['extended_over_nominal']:.1f} times the nominal, every effect {r['every_over_nominal']:.1f} times. All in "
         "float64.",
-    ]  # fmt: skip
-
-
-def _peers(r: Result) -> list[str]:
-    return [
-        f"{r['particles']} particles, {r['evaluations']} evaluations over all {r['samples']} samples; the NumPy "
-        f"objective is the same simulation, weights and projection (costs agree to "
-        f"{max(abs(1.0 - c) for c in r['cost_ratio']):.1e}).", "",
-        *_times(r, lambda n, t: f" {t['ms_per_evaluation']:.3g} |", " ms per evaluation |"), "",
-        f"pyswarms takes {r['gain_particles']:.0f} times as long for the same number of evaluations where the NumPy "
-        f"objective is vectorised over particles (processor time: {r['gain_particles_processor']:.0f} times), "
-        f"{r['gain']:.0f} times where over segments too ({r['gain_processor']:.0f} times).",
     ]  # fmt: skip
 
 
@@ -106,7 +93,6 @@ def _scaling(r: Result) -> list[str]:
 
 PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
     "kernel": ("The kernel", _kernel),
-    "peers": ("Particle swarms", _peers),
     "optimum": ("Time to the optimum", _optimum),
     "commands": ("Commands", _times),
     "scaling": ("Length of the log", _scaling),

@@ -48,9 +48,9 @@ def _classes(groups: dict[str, list[Graded]]) -> str:
     for name, graded in groups.items():
         hides = name not in ("null", "outside")
         cells = [
-            str(summary.first_right(graded)) if hides else "–",
-            str(summary.all_found(graded)) if hides else "–",
-            str(summary.nothing_else(graded)),
+            _count(summary.first_right(graded)) if hides else "–",
+            _count(summary.all_found(graded)) if hides else "–",
+            _count(summary.nothing_else(graded)),
             str(summary.wholly_right(graded)),
             summary.verdicts(graded),
             f"{np.median([g.seconds for g in graded]):.1f}",
@@ -64,6 +64,10 @@ def _classes(groups: dict[str, list[Graded]]) -> str:
     return "## By class\n\n" + "\n".join(rows) + "\n" + note
 
 
+def _count(share: summary.Share) -> str:
+    return f"{share.k} of {share.n}"
+
+
 def _parameters(singles: Sequence[Graded]) -> str:
     errors, inside = summary.parameter_errors(singles), summary.coverage(singles)
     rows = [
@@ -72,7 +76,7 @@ def _parameters(singles: Sequence[Graded]) -> str:
     ]
     for effect, values in errors.items():
         held = inside.get(effect)
-        rows.append(f"| {effect} | {_sizes(values)} | {f'{held.k} of {held.n}' if held else '–'} |")
+        rows.append(f"| {effect} | {_sizes(values)} | {_count(held) if held else '–'} |")
     everything = [e for v in errors.values() for e in v]
     total = summary.Share(sum(s.k for s in inside.values()), sum(s.n for s in inside.values()))
     rows.append(f"| **all** | {_sizes(everything)} | {total} |")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,13 +14,13 @@ from studies.page import put_section
 from studies.peers import online, recipe, simulated
 
 PARTS = ("simulated", "recipe", "online")
-PACKAGES = ("mujoco", "filterpy", "numpy", "scipy", "numba")
+PACKAGES = ("mujoco", "filterpy")
 
 
 def machine() -> str:
-    """Versions and machine, for the foot of a section."""
+    """Peers' versions and machine, for the foot of a section."""
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    return f"_{packages}; Python {platform.python_version()}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}_"
+    return f"_{packages}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}_"
 
 
 def main() -> None:

@@ -250,20 +250,24 @@ def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
     return code, re.sub(r"/\S*/(?=[^/\s]*)", "", lines[0])
 
 
+def shown(line: str) -> str:
+    """What the line finds and the fix: without program, log, long lists of what is allowed, and the way to insist."""
+    short = re.sub(r"^quadid: (log\.\w+: )?|; allowed: [^;]{30,}(?=; fix)|, or insist with --unchecked", "", line)
+    return short.replace("|", "/").replace("`", "")
+
+
 def page() -> str:
     """The table of docs/mistakes.md."""
     head = [
         "# Mistakes, and the first line that each gives", "",
-        "`python -m tests.cli.mistakes > docs/mistakes.md`; a test makes every mistake and compares.", "",
-        "Where a line does not name the cause yet, the mistake is marked with *.", "",
+        "`python -m tests.cli.mistakes > docs/mistakes.md`; a test makes every mistake and compares. Each line begins "
+        "with `quadid:` and the log; long lists of what is allowed are left out here. Checks of units, frames and "
+        "motors can be overruled with `--unchecked`. *: the line does not name the cause yet.", "",
         "| mistake | first line |", "|---|---|",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         place = prepare(Path(folder))
-        rows = [
-            f"| {m.what}{' *' * m.vague} | `{first_line(m, place)[1].replace('|', '/').replace('`', '')}` |"
-            for m in MISTAKES
-        ]
+        rows = [f"| {m.what}{' *' * m.vague} | `{shown(first_line(m, place)[1])}` |" for m in MISTAKES]
     return "\n".join([*head, *rows]) + "\n"
 
 

@@ -98,7 +98,7 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
         "# Faults, what is promised, what happened",
         "",
         f"Written by `{command}`: tests with the real thing failing. A sentence stands here only when its test passed; "
-        "the first of a row is quoted. All sentences, with test and day: `faults.json` beside this page.",
+        "the shortest of a row is quoted. All sentences, with test and day: `faults.json` beside this page.",
         "",
         f"{green} of {len(FAULTS)} rows have evidence{_days(evidence)}.",
         "",
@@ -116,7 +116,7 @@ def _row(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> str
     left = f"| {number} | {_cell(fault)} | {_cell(promise)} |"
     if not said:
         return f"{left} **no test of this row passed** | |"
-    return f"{left} {_cell(min(said, key=lambda e: e.test).text)} | {len({e.test for e in said})} |"
+    return f"{left} {_cell(min(said, key=lambda e: len(e.text)).text)} | {len({e.test for e in said})} |"
 
 
 def _days(evidence: Sequence[Evidence]) -> str:
