@@ -82,6 +82,7 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
         parts = name.split("/")
         rooms["/".join(parts[:2]) if len(parts) > 2 else "quadid/*.py"].update(c)
     every = sum(files.values(), Counter())
+    least = sorted(files, key=lambda n: percent(files[n]))[:5]
     lines = [
         "# Coverage: what of `quadid/` the tests run", "",
         f"`make coverage`, {time.strftime('%Y-%m-%d')}, coverage {coverage.__version__} with branches, in all "
@@ -90,17 +91,15 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
         f"**{percent(every):.1f} % of statements and branches** (goal {GOAL:.0f} %): {every['run']:,} of "
         f"{every['statements']:,} statements, {every['taken']:,} of {every['branches']:,} branches. Left out: the "
         f"{machine_code:,} statements inside functions that numba compiles, where no line can be counted.", "",
-        "| room | statements | run | branches | taken | both |", "|---|---|---|---|---|---|",
+        "| room | statements run | branches taken | both |", "|---|---|---|---|",
         *(_row(name, c) for name, c in sorted(rooms.items())), "",
-        "Files of which least is run:", "",
-        "| file | statements | run | branches | taken | both |", "|---|---|---|---|---|---|",
-        *(_row(name, files[name]) for name in sorted(files, key=lambda n: percent(files[n]))[:5]),
+        "Files of which least is run: " + ", ".join(f"`{n}` {percent(files[n]):.0f} %" for n in least) + ".",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
 
 def _row(name: str, c: Counts) -> str:
-    return f"| `{name}` | {c['statements']} | {c['run']} | {c['branches']} | {c['taken']} | **{percent(c):.1f} %** |"
+    return f"| `{name}` | {c['run']}/{c['statements']} | {c['taken']}/{c['branches']} | **{percent(c):.1f} %** |"
 
 
 if __name__ == "__main__":

@@ -34,8 +34,10 @@ def main() -> None:
         "simulated": lambda: _simulated(chosen.each),
     }
     for part in chosen.parts:
-        put_section(page, TITLE, part, makers[part]())
-    print(page.read_text(encoding="utf-8"))
+        text = makers[part]()
+        print(text)
+        if part != "features":  # used nowhere: printed only
+            put_section(page, TITLE, part, text)
 
 
 def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:

@@ -21,8 +21,6 @@ from studies.health.recorded import CRAZYFLIE, LARGE, Judged, is_single, kind_ri
 AIRFRAMES = ("E8", "E9")
 CUT = 2
 """The rotor whose propeller was cut alone, from 0."""
-SHOWN = (1.0, 2.0, 2.5, 3.0, 4.0)
-MASSES = (0.01, 0.02, 0.03, 0.05, 0.08)
 
 
 class Power(NamedTuple):
@@ -93,17 +91,13 @@ def _expected(flown: Sequence[Judged], powers: dict[tuple[str, float], Power], c
     return f"{counts.mean():.1f} ({low:.0f} to {high:.0f})"
 
 
-def _percent(values: Sequence[BoolArray]) -> str:
-    return " | ".join(f"{100.0 * np.mean(v):.0f}" for v in values)
-
-
 def text(judged: Sequence[Judged], draws: int = 50) -> str:
     """The limits as Markdown."""
     light, large = (
         loss_per_mm([j for j in judged if is_single(j, low, high)]) for low, high in ((0.0, LARGE), (LARGE, 99.0))
     )
     single = [j for j in judged if is_single(j, 0.0, 99.0) and j.flown.rotors == {CUT + 1}]
-    sizes = sorted({j.flown.total for j in single} | set(SHOWN))
+    sizes = sorted({j.flown.total for j in single})
     powers = {
         (a, size): power(judged, a, partial(_cut, size * (light if size < LARGE else large)), draws)
         for a in AIRFRAMES
@@ -119,15 +113,6 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
         mine = [j for j in single if chosen(j)]
         got = f"{sum(right(j) for j in mine)} of {len(mine)}"
         lines.append(f"| {what} | {wanted} | {_expected(mine, powers, column)} | {got} |")
-    head = " | ".join(f"{airframe} {what}" for airframe in AIRFRAMES for what in ("found", "named first"))
-    lines += [f"\nIn % of {draws} draws a size:\n", f"| mm cut from M3 | {head} |", "|---|---|---|---|---|"]
-    for size in SHOWN:
-        lines.append(f"| {size:g} | " + _percent([f for a in AIRFRAMES for f in powers[a, size][:2]]) + " |")
-    head = head.replace("named first", "not called a rotor")
-    lines += [f"\n| weight on the arm of M3, of the vehicle's | {head} |", "|---|---|---|---|---|"]
-    for mass in MASSES:
-        both = [power(judged, a, partial(_loaded, mass), draws) for a in AIRFRAMES]
-        lines.append(f"| {100.0 * mass:.0f} % | " + _percent([f for p in both for f in (p.found, ~p.rotor)]) + " |")
     for airframe in AIRFRAMES:
         spread = healthy_spread(_baseline(judged, airframe)).deviation
         lines.append(f"\nSpread of {airframe} (roll, pitch, yaw, effort; %): between healthy flights {_shown(spread)}; "
@@ -137,12 +122,6 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
 
 def _cut(loss: float, healthy: Healthy) -> FloatArray:
     return loss * _effect(healthy, CUT)
-
-
-def _loaded(mass: float, healthy: Healthy) -> FloatArray:
-    """Change of trim by a mass (fraction of the vehicle's) at the cut rotor's hub, shape (4,)."""
-    x, y = CRAZYFLIE.rotors[CUT].position[:2]
-    return np.array([-y / CRAZYFLIE.arm * mass, x / CRAZYFLIE.arm * mass, 0.0, mass]) / (1.0 + mass)
 
 
 def _shown(values: FloatArray) -> str:

@@ -26,7 +26,7 @@ def page(results: Result) -> str:
         found = results.get(name)
         out += [f"## {title}", "", *(write(found["result"]) if found else ["Not measured."]), ""]
         if found:
-            out += [f"_{found['measured']}, {found['machine']}_", ""]
+            out += [f"_{found['measured']}, load {found['machine'].partition('load average ')[2]}_", ""]
     return "\n".join(out)
 
 
@@ -48,13 +48,12 @@ def _accelerated(r: Result) -> list[str]:
         f"**{last['sent'] - last['taken'] - last['dropped']} lost without a word**. Slopes over the last three "
         f"quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files {slope(points, 'files_mib'):+.3f} MiB/h, "
         f"processor time {slope(points, 'us_a_sample'):+.3f} us a sample per hour.", "",
-        "| flight h | memory MiB | history MiB | us a sample | ms a fit or diagnosis | dropped |",
-        "|---|---|---|---|---|---|",
+        "| flight h | memory MiB | history MiB | us a sample |",
+        "|---|---|---|---|",
     ]  # fmt: skip
-    chosen = points[:: -max(len(points) // 4, 1)][::-1]
+    chosen = points[:: -max(len(points) // 3, 1)][::-1]
     lines += [
-        f"| {p['hours']:.1f} | {p['memory_mib']:.1f} | {p['files_mib']:.1f} | {p['us_a_sample']:.1f} | "
-        f"{p['ms_a_fit']:.0f} | {p['dropped']} |" for p in chosen
+        f"| {p['hours']:.1f} | {p['memory_mib']:.1f} | {p['files_mib']:.1f} | {p['us_a_sample']:.1f} |" for p in chosen
     ]  # fmt: skip
     return lines
 
@@ -76,13 +75,13 @@ def _live(r: Result) -> list[str]:
         f"{slope(points, 'files_mib'):+.2f} MiB/h. IMU latency p99, median of the minutes: first third "
         f"{np.median(p99[:third]):.1f} ms, last third {np.median(p99[-third:]):.1f} ms (other programs share the "
         f"machine).", "",
-        "| min | memory MiB | fit process MiB | history and log MiB | handles | threads | load average |",
-        "|---|---|---|---|---|---|---|",
+        "| min | memory MiB | fit process MiB | history and log MiB | handles | load average |",
+        "|---|---|---|---|---|---|",
     ]  # fmt: skip
-    every = max(len(points) // 4, 1)
+    every = max(len(points) // 3, 1)
     lines += [
         f"| {60 * p['hours']:.0f} | {p['memory_mib']:.1f} | {p['worker_mib']:.1f} | {p['files_mib']:.2f} | "
-        f"{p['handles']:.0f} | {p['threads']:.0f} | {p['load']:.1f} |" for p in points[::-every][::-1]
+        f"{p['handles']:.0f} | {p['load']:.1f} |" for p in points[::-every][::-1]
     ]  # fmt: skip
     if r["problems"]:
         lines += ["", "Said: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]
