@@ -155,7 +155,9 @@ def march(
         left, end = now, now + dt
         push = pushes[min(n, pushes.shape[0] - 1)]
         while end - left > EPSILON:
-            boost = supply(left, events) ** events.supply_exponent if events.supply_exponent != 0.0 else 1.0
+            boost = 1.0
+            if events.supply_exponent != 0.0:
+                boost = supply(left, omega, hover, events) ** events.supply_exponent
             head, ramp_end = apply_due(
                 left, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive,
                 boost,

@@ -161,7 +161,9 @@ def _extras(flown: Flown, wanted: Sequence[str]) -> dict[str, FloatArray]:
     events, t = flown.setup.events, flown.plan.dt * flown.plan.log_every * np.arange(flown.plan.rows)
     volts = FULL_BATTERY * np.sqrt(np.maximum(0.1, 1.0 - events.sag_fraction * progress))
     if events.supply_exponent != 0.0:
-        volts = FULL_BATTERY * np.array([supply(float(x), events) for x in t])
+        hover = flown.setup.body.hover_speed
+        speeds = zip(t, flown.track.rotor, strict=True)
+        volts = FULL_BATTERY * np.array([supply(float(x), omega, hover, events) for x, omega in speeds])
     clean = {"velocity": flown.track.state[:, 3:6], "position": flown.track.state[:, 0:3], "battery": volts[:, None]}
     sigma = {"velocity": flown.sensor.velocity, "position": flown.sensor.position, "battery": flown.sensor.battery}
     return {name: clean[name] + flown.noise(name, sigma[name], clean[name].shape[1]) for name in wanted}

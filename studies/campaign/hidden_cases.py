@@ -16,12 +16,11 @@ from quadid.effects import EFFECTS
 from quadid.flight import OUTSIDE, draw_effect, draw_outside, draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle_parts import Command, ParameterPrior
 from quadid.window import Window
 
 GUESS = 0.2
 """Standard deviation of the logarithm of the initial guess against the truth."""
-NEEDS_MORE = {"wind": ("velocity",), "ground_effect": ("position", "velocity")}
 LATER = (
     "translational_lift", "supply_voltage", "rotor_telemetry_delay", "drag_torque_curve", "no_gyroscopic_coupling",
 )  # fmt: skip
@@ -124,14 +123,26 @@ def guessed_vehicle(case: Case, truth: dict[str, float]) -> Vehicle:
         n: ParameterPrior(initial=float(f"{truth[n] * np.exp(GUESS * rng.uniform(-1.7, 1.7)):.3e}"))
         for n in NOMINAL_NAMES
     }
-    return Vehicle.shipped(case.vehicle).model_copy(update={"parameters": priors})
+    return shipped(case).model_copy(update={"parameters": priors})
+
+
+def needs(case: Case) -> set[str]:
+    """What must be logged for the case's effects to be seen; who logs position logs velocity."""
+    found = {need for name in case.hidden for need in EFFECTS[name].needs}
+    return found | ({"velocity"} if "position" in found else set())
+
+
+def shipped(case: Case) -> Vehicle:
+    """The vehicle of a case, with rotor speeds read back where an effect needs readings."""
+    craft = Vehicle.shipped(case.vehicle)
+    return craft.model_copy(update={"command": Command(sampling="instant")}) if "readings" in needs(case) else craft
 
 
 def flown(case: Case) -> tuple[Window, Window, Vehicle]:
     """Flies the training and the validation flight of a case."""
-    craft = Vehicle.shipped(case.vehicle)
+    craft = shipped(case)
     truth = draw_truth(craft, case.seed)
-    extras = tuple({e for name in case.hidden for e in NEEDS_MORE.get(name, ())})
+    extras = tuple(sorted(needs(case) & {"velocity", "position", "battery"}))
     windows = []
     for k in range(2):
         flight = fly(

@@ -20,6 +20,7 @@ FLOWN: dict[str, tuple[Vehicle, tuple[str, ...], dict[str, dict[str, float]]]] =
     "lift": (PELICAN, ("velocity",), DRAG | {"translational_lift": {"k": 0.02}}),
     "drag alone": (PELICAN, ("velocity",), DRAG),
     "no gyroscopic coupling": (PELICAN, (), {"no_gyroscopic_coupling": {"share": 1.0}}),
+    "emptying battery": (PELICAN, ("battery",), {"supply_voltage": {"exponent": 1.0}}),
     "torque beyond the square": (PELICAN, (), {"drag_torque_curve": {"growth": 1.0}}),
     "slower down": (PELICAN, (), {"motor_lag": {"tau": 0.03, "tau_down": 0.05}}),
     "as slow down": (PELICAN, (), {"motor_lag": {"tau": 0.04}}),
