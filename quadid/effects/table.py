@@ -83,7 +83,7 @@ TABLE: tuple[Effect, ...] = (
         summary="Thrust rises in sideways flight.",
         sentence="thrust rises by {k:.3f} m/s^2 for each (m/s)^2 of sideways speed",
         advice="Usual at speed: the rotors meet fresh air; leaving it out makes a simulated vehicle sink.",
-        flexible="with_velocity", shows=("a_z: v_x", "a_z: v_y"),
+        needs=("velocity",), flexible="with_velocity", shows=("a_z: v_x", "a_z: v_y"),
     ),
     Effect(
         "rotor_drag_moment", "air", _axes("h_x h_y", "m", 0.3, 0.02, scale="arm", factor=1e3),

@@ -75,13 +75,11 @@ def _right(flight: Flight, verdict: str, listed: Sequence[str], named: Sequence[
         return None
     if flight.hidden == ("unknown",):
         return verdict == "unknown"
-    if flight.case is None or not flight.case.group.startswith(("null", "outside", "clutter")):
-        return Counter(named) == Counter(flight.hidden)
-    if flight.case.group == "null":
-        return verdict == "nothing_found"
-    if flight.case.group == "outside":
+    if flight.clutter:
+        return bool(listed) and listed[0] in flight.hidden and set(named) <= set(flight.clutter)
+    if flight.case is not None and flight.case.outside:
         return not named
-    return bool(listed) and listed[0] in flight.hidden and all(n in flight.case.hidden for n in named)
+    return Counter(named) == Counter(flight.hidden) and (bool(named) or verdict == "nothing_found")
 
 
 def run(

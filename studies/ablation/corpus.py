@@ -30,6 +30,7 @@ class Flight:
         case: of the campaign.
         train, held: logs below the data folder, each with `@from:to` where cut; vehicle: its file there.
         hidden: what a case hides; None where nobody knows.
+        clutter: what may be named beside it, after it.
     """
 
     name: str
@@ -39,9 +40,9 @@ class Flight:
     held: tuple[str, ...] = ()
     vehicle: str = ""
     hidden: tuple[str, ...] | None = None
+    clutter: tuple[str, ...] = ()
 
 
-_VEHICLES = str(Path(__file__).parents[1] / "vehicles")
 _RECORDED = (
     ("iris", "iris/vehicle.yaml", "pitch_yaw.csv", "sideways.csv"),
     ("sitl square", "ardupilot_sitl/quad_sq.yaml", "quad_sq.bin@20:100", "quad_sq.bin@100:160"),
@@ -52,15 +53,14 @@ _RECORDED = (
     ("nanobench", "nanobench/vehicle.yaml", "B2_circle_fast_rep1.csv", "B9_trefoil_fast_rep10.csv"),
     ("crazyflie", "crazyflie_rpm/vehicle.yaml", "figure8_22.csv figure8_34.csv", "figure8_30.csv"),
     ("nano-drone", "nanodrone/vehicle.yaml", "random_run1.csv square_run1.csv", "random_run3.csv"),
-    ("log171", f"{_VEHICLES}/log171.yaml", "log171.bin@76:146", "log171.bin@146:216"),
 )
-"""Name, vehicle file, logs to diagnose, logs to measure on, in the folder of the vehicle file or `ardupilot`."""
+"""Name, vehicle file, logs to diagnose, logs to measure on, in the folder of the vehicle file."""
 
 
 def _recorded() -> list[Flight]:
     out = []
     for name, vehicle, train, held in _RECORDED:
-        folder = "ardupilot" if vehicle.startswith("/") else vehicle.split("/")[0]
+        folder = vehicle.split("/")[0]
         logs = [tuple(f"{folder}/{log}" for log in names.split()) for names in (train, held)]
         out.append(Flight(name, "recorded", None, logs[0], logs[1], vehicle))
     return out
@@ -77,7 +77,10 @@ def flights(kinds: Sequence[str], classes: dict[str, int] | None = None, start: 
     out: list[Flight] = []
     if "campaign" in kinds:
         chosen = [c for group, n in (classes or CLASSES).items() for c in cases(group, n, start)]
-        out += [Flight(f"{c.group} {c.number}", "campaign", c, hidden=c.expected) for c in chosen]
+        out += [
+            Flight(f"{c.group} {c.number}", "campaign", c, hidden=c.expected,
+                   clutter=tuple(c.hidden) if c.group == "clutter" else ()) for c in chosen
+        ]  # fmt: skip
     if "cases" in kinds:
         out += [f for folder in ("cases", "cases_hub") for f in _independent(folder)]
     return out + (_recorded() if "recorded" in kinds else [])
@@ -90,6 +93,7 @@ def _independent(folder: str) -> list[Flight]:
         Flight(
             f"{folder} {a['case']}", "cases", None, (f"{folder}/{a['case']}/train.csv",),
             (f"{folder}/{a['case']}/validate.csv",), f"{folder}/{a['case']}/vehicle.yaml", tuple(a["effects"]),
+            tuple(a["truth"]) if a["kind"] == "clutter" else (),
         )
         for a in answers
     ]  # fmt: skip
