@@ -14,7 +14,7 @@ from quadid.sanitise import plain
 from quadid_cli.options import JsonTarget
 
 if TYPE_CHECKING:
-    from quadid_node.zenoh_link import Fleet
+    from quadid_node.zenoh_fleet import Fleet
     from rich.table import Table
 
 REFRESH = 0.5
@@ -41,7 +41,7 @@ def watch(
     json: JsonTarget = None,
 ) -> None:
     """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live."""
-    from quadid_node.zenoh_link import Fleet
+    from quadid_node.zenoh_fleet import Fleet
 
     from quadid_cli import output, terminal
 

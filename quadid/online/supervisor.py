@@ -185,7 +185,7 @@ class Supervisor:
 
 
 def _wrong_scale(finding: OnlineFinding) -> bool:
-    return finding.effect == "gyro_scale" and max(map(abs, finding.values.values())) > ALLOWED
+    return finding.effect == "gyro_scale" and max(map(abs, finding.values.values()), default=0.0) > ALLOWED
 
 
 def _unrevealed(reply: FitReply) -> str:

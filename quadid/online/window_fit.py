@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
+from quadid.online.answered import answers
 from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
@@ -81,6 +83,10 @@ class FitRequest(Job):
     def failed(self, problem: str) -> FitReply:
         """The reply of a fit that could not be run."""
         return FitReply(self.number, problem)
+
+    def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
+        """Whether a reply is to this job, and of its form."""
+        return super().is_answered_by(reply) and isinstance(reply, FitReply) and answers(self, reply)
 
 
 @dataclass(frozen=True)

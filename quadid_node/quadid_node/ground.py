@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from quadid.online.jobs import Job
-from quadid_node.parcel import ParcelError, content, pack, unpack
+from quadid_node.parcel import LARGEST, ParcelError, content, pack, unpack
 from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
 
 WORK = f"{ROOT}/*/work/fit"
 ALIVE = f"{ROOT}/worker/*/alive"
-MOST_WAITING = 64
+MOST_WAITING, MOST_BYTES = 64, 4 * LARGEST
+"""Requests that wait, and their bytes in all; a usual one has some ten thousand."""
 WAIT = 0.1
 RETRY = 3.0
 
@@ -50,7 +51,11 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
     waiting: queue.Queue[Any] = queue.Queue(MOST_WAITING)
 
     def take(query: Any) -> None:
+        with waiting.mutex:
+            held = sum(map(_size, waiting.queue)) + _size(query)
         try:
+            if _size(query) > LARGEST or held > MOST_BYTES:
+                raise queue.Full
             waiting.put_nowait(query)
         except queue.Full:
             with query:
@@ -76,6 +81,10 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
     return done
 
 
+def _size(query: Any) -> int:
+    return len(query.payload) if query.payload is not None else 0
+
+
 def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Any:
     said = ""
     while not stop():
@@ -99,5 +108,12 @@ def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
         told(f"refused: {error}")
         query.reply_err(str(error).encode())
         return
-    query.reply(query.key_expr, pack(request.run()))
-    done.answered += 1
+    try:
+        reply = request.run()
+    except Exception as error:  # noqa: BLE001 - a request that makes no sense ends, and the machine serves the next
+        done.refused += 1
+        told(f"refused: a request that cannot be worked on ({type(error).__name__})")
+        reply = request.failed("the request makes no sense")
+    else:
+        done.answered += 1
+    query.reply(query.key_expr, pack(reply))

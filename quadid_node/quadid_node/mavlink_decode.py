@@ -113,7 +113,7 @@ class MavlinkDecoder:
             self._row, self._row_time = [math.nan] * self._rotors, t
         if not self._row:
             return
-        for i, value in enumerate(reading.values[: self._rotors - reading.place]):
+        for i, value in enumerate(reading.values[: max(self._rotors - reading.place, 0)]):
             self._row[reading.place + i] = float(value)
         if all(math.isfinite(v) for v in self._row):
             row, self._row = tuple(self._row), []

@@ -30,6 +30,8 @@ REQUESTED = {
 """Messages asked for, with their rates [Hz]."""
 FRAMES_A_SECOND = 4000
 """More frames than this are a flood: the rest is dropped unread."""
+LIST_EVERY = 1.0
+"""All our parameters are told so often at most [s]: one short request asks for seventeen frames."""
 PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
 _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
@@ -89,7 +91,8 @@ class MavlinkLink:
         self._clock = clock
         self.vehicle_system = 0
         self._only, self._target = system, 0
-        self._beat, self._tell, self._measured = -1e9, -1e9, clock()
+        self._beat, self._tell, self._listed, self._measured = -1e9, -1e9, -1e9, clock()
+        self._list_due = False
         self._begin = clock()
         self._before: dict[str, int] = {}
         self._rates: dict[str, float] = {}
@@ -169,8 +172,7 @@ class MavlinkLink:
             return
         entries = self._entries()
         if kind == "PARAM_REQUEST_LIST":
-            for index in range(len(entries)):
-                self._send_parameter(index)
+            self._list_due = True
             return
         names = [name for name, _ in entries]
         wanted = str(message.param_id)
@@ -201,6 +203,10 @@ class MavlinkLink:
             ))  # fmt: skip
         if now - self._measured >= 2.0:
             self._measure(now)
+        if self._list_due and now - self._listed >= LIST_EVERY:
+            self._list_due, self._listed = False, now
+            for index in range(len(self._entries())):
+                self._send_parameter(index)
         if self.vehicle_system:
             self._ask(now)
         if self._set is not None and now - self._tell >= 5.0:

@@ -27,6 +27,8 @@ LARGEST = 1 << 24
 """Parcels beyond this are refused [bytes]; a minute of flight at 50 Hz has less than one mebibyte."""
 MOST_ITEMS, LONGEST_TEXT, MOST_AXES = 4096, 1 << 16, 3
 """Entries of one list or map, characters of one text, axes of one array: declared sizes beyond are refused unread."""
+MOST_IN_ALL = 1 << 16
+"""Lists, maps and their entries in one parcel: an empty map is one byte that takes 64 of memory."""
 KINDS: Mapping[str, type] = types.MappingProxyType({
     kind.__name__: kind
     for kind in (FitRequest, FitReply, ChangeRequest, ChangeReply, DiagnosisRequest, DiagnosisReply)
@@ -60,10 +62,19 @@ def unpack(data: bytes) -> Any:
     """
     if len(data) > LARGEST:
         raise ParcelError(f"a parcel of {len(data)} bytes", f"at most {LARGEST}")
+    left = MOST_IN_ALL
+
+    def counted(found: Any) -> Any:
+        nonlocal left
+        left -= 1 + len(found)
+        if left < 0:
+            raise ParcelError(f"a parcel of more than {MOST_IN_ALL} entries", "what the record declares")
+        return found
+
     try:
         kind, content = msgpack.unpackb(
             data, raw=False, strict_map_key=True, max_array_len=MOST_ITEMS, max_map_len=MOST_ITEMS,
-            max_str_len=LONGEST_TEXT, max_bin_len=LARGEST, max_ext_len=0,
+            max_str_len=LONGEST_TEXT, max_bin_len=LARGEST, max_ext_len=0, list_hook=counted, object_hook=counted,
         )  # fmt: skip
         if not isinstance(kind, str) or kind not in KINDS:
             raise ParcelError(f"a parcel of kind {str(kind)[:60]!r}", ", ".join(KINDS))

@@ -6,6 +6,7 @@ was worked out, as long as both machines have the same kind of processor and the
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -24,6 +25,8 @@ FAR_LIMIT = 5.0
 """A ground machine that does not answer a fit within this time [s] is given up for `REST`."""
 REST = 30.0
 RETRY = 3.0
+MOST_ANSWERS, MOST_GROUNDS = 8, 256
+"""Answers that wait to be looked at, and ground machines that are told apart; more is nobody's honest work."""
 
 
 class Ground:
@@ -60,7 +63,8 @@ class Ground:
         def take(reply: Any) -> None:
             ok = reply.ok
             small = ok is not None and len(ok.payload) <= LARGEST
-            answers.put((request.number, None if ok is None else ok.payload.to_bytes() if small else b""))
+            with contextlib.suppress(queue.Full):
+                answers.put_nowait((request.number, None if ok is None else ok.payload.to_bytes() if small else b""))
 
         self._session.get(
             self._key, take, payload=pack(request), timeout=seconds, target=zenoh.QueryTarget.BEST_MATCHING
@@ -95,10 +99,10 @@ class Ground:
 
     def _on_token(self, sample: Any) -> None:
         name = str(sample.key_expr)
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._alive.add(name)
-        else:
+        if sample.kind != zenoh.SampleKind.PUT:
             self._alive.discard(name)
+        elif len(self._alive) < MOST_GROUNDS:
+            self._alive.add(name)
 
 
 class RemoteWorker:
@@ -111,7 +115,7 @@ class RemoteWorker:
     def __init__(self, local: ProcessWorker, ground: Ground, clock: Callable[[], float] = time.monotonic) -> None:
         """Takes over `local`, which is closed with it."""
         self._local, self._ground, self._clock = local, ground, clock
-        self._answers: queue.Queue[tuple[int, Any]] = queue.Queue()
+        self._answers: queue.Queue[tuple[int, Any]] = queue.Queue(MOST_ANSWERS)
         self._asked: Job | None = None
         self._until = 0.0
         self._told: list[Trouble] = []

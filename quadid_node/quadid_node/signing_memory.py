@@ -43,7 +43,7 @@ class SigningMemory:
             newest = int(kept["newest"])
         except FileNotFoundError:
             return
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             self.problem = f"time stamps of signatures in {path} cannot be read ({error}): only this clock guards now"
             return
         unsaved = round(SAVED_EVERY * UNITS)

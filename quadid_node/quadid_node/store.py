@@ -19,15 +19,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import IO
 
-from quadid.errors import QuadidError
 from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.trims import FlightTrim
 from quadid.online.gate import GateSettings, implausible
 from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Diagnosed, Event, OnlineSet
+from quadid.parameters import NOMINAL_NAMES
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
-from quadid_node.store_file import StoreError, connect, is_damage, make_tables, set_aside
+from quadid_node.store_file import UNREADABLE, StoreError, connect, is_damage, make_tables, set_aside
 
 KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets and decisions never."""
@@ -130,7 +130,7 @@ class Store:
         row = db.execute(
             "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1", (self.vehicle,)
         ).fetchone()
-        decided = row[1] if row is not None and row[0] == gate.approval else ""
+        decided = row[1] if row is not None and row[0] == gate.approval and row[1] in ("auto", "manual") else ""
         return Restored(last, first_number(int(highest or 0)), approved or first, decided, self._healthy(db))
 
     def _healthy(self, db: sqlite3.Connection) -> tuple[FlightTrim, ...]:
@@ -142,7 +142,7 @@ class Store:
         for (data,) in reversed(rows):
             try:
                 out.append(flight_from_dict(json.loads(data)))
-            except (ValueError, KeyError, TypeError) as error:
+            except UNREADABLE as error:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
         return tuple(out)
 
@@ -153,9 +153,10 @@ class Store:
             return None
         try:
             found = set_from_dict(json.loads(row[0]))
-            why = implausible(found.parameters, gate)
-        except (ValueError, KeyError, TypeError, QuadidError) as error:
-            why = f"{type(error).__name__}: {error}"
+            missing = set(NOMINAL_NAMES) - set(found.parameters.names)
+            why = f"it lacks {', '.join(sorted(missing))}" if missing else implausible(found.parameters, gate)
+        except UNREADABLE as error:
+            why = f"{type(error).__name__}: {str(error)[:120]}"
         if why:
             self.notes.append(f"a set of the history is no set and is not taken up again ({why})")
             return None

@@ -7,10 +7,12 @@ import json
 import sqlite3
 import time
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from quadid.errors import QuadidError
+from quadid.sanitise import plain
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS sets (
@@ -38,6 +40,10 @@ BUSY_SECONDS = 5.0
 _NAMES = " UNION ".join(f"SELECT vehicle FROM {table}" for table in ("sets", "candidates", "events"))
 
 
+UNREADABLE = (ValueError, TypeError, LookupError, OverflowError, RecursionError, QuadidError)
+"""What rows raise that hold something else than this program has written."""
+
+
 class StoreError(QuadidError):
     """A history that another service writes, or that is not there."""
 
@@ -59,13 +65,14 @@ def read_history(
         raise StoreError(f"no history {path}", "a history that a service has written", "give --history")
     try:
         with contextlib.closing(connect(path, read_only=True)) as db:
+            check_tables(db)
             return {
                 "sets": _newest(db, "SELECT wall, data", "sets", vehicle, sets),
                 "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),
                 "events": _newest(db, "SELECT wall, t, level, kind, text", "events", vehicle, events),
                 "vehicles": [{"name": n} for (n,) in db.execute(_NAMES)],
             }
-    except (sqlite3.Error, ValueError) as error:
+    except (sqlite3.Error, *UNREADABLE) as error:
         raise StoreError(
             f"{path} cannot be read ({error})", "a history that a service has written", "give --history"
         ) from error
@@ -84,7 +91,7 @@ def _rows(db: sqlite3.Connection, statement: str, values: tuple[Any, ...]) -> li
         for row in cursor:
             entry = dict(zip(names, row, strict=True))
             if "data" in entry:
-                entry |= json.loads(entry.pop("data"))
+                entry |= dict(json.loads(entry.pop("data")))
             yield entry
 
     return list(entries())
@@ -93,8 +100,11 @@ def _rows(db: sqlite3.Connection, statement: str, values: tuple[Any, ...]) -> li
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Opens the file; for writing in WAL mode, every transaction on the disk before it counts."""
     if read_only:
-        return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
+        db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
+        db.execute("PRAGMA trusted_schema = OFF")
+        return db
     db = sqlite3.connect(path, timeout=BUSY_SECONDS)
+    db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA journal_mode = WAL")
     db.execute("PRAGMA synchronous = FULL")
     return db
@@ -103,11 +113,32 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
 def make_tables(path: Path) -> None:
     """Makes what tables are missing; raises sqlite3.Error for a file that is damaged or cannot be written now."""
     with contextlib.closing(connect(path)) as db:
+        check_tables(db)
         if db.execute("PRAGMA quick_check(1)").fetchone()[0] != "ok":
             raise sqlite3.DatabaseError("malformed: its pages do not add up")
         db.executescript(SCHEMA)
         db.execute(f"PRAGMA user_version = {VERSION}")
         db.commit()
+
+
+def check_tables(db: sqlite3.Connection) -> None:
+    """Raises DatabaseError where a file holds more than our tables: what a view or trigger computes may never end."""
+    for kind, name, page in db.execute("SELECT type, name, rootpage FROM sqlite_master"):
+        if kind not in ("table", "index") or not page:
+            raise sqlite3.DatabaseError(f"malformed: {plain(str(name), 40)} is no table that a history has")
+    for table, columns in _columns().items():
+        found = [(row[1], row[-1]) for row in db.execute(f"PRAGMA table_xinfo({table})")]
+        if found and found != columns:
+            raise sqlite3.DatabaseError(f"malformed: the table {table} has other columns")
+
+
+@lru_cache(maxsize=1)
+def _columns() -> dict[str, list[tuple[str, int]]]:
+    """Names of the columns by table, each with 0: none is computed."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as db:
+        db.executescript(SCHEMA)
+        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return {t: [(row[1], 0) for row in db.execute(f"PRAGMA table_xinfo({t})")] for t in tables}
 
 
 def begin_anew(path: Path, error: sqlite3.Error) -> str:

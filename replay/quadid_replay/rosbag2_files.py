@@ -20,6 +20,7 @@ from quadid_replay.mcap_records import McapFile
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 5000
+_SHORTEST = 1 << 12
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The second comes where SQLite's message quotes bytes that are no text."""
 
@@ -50,6 +51,8 @@ class Database:
         try:
             self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
             self._connection.execute("PRAGMA trusted_schema=OFF")
+            # No value is larger than the file that holds it; what an expression makes would be.
+            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, _SHORTEST))
             self.topics: dict[int, Topic] = self._read_topics()
         except _DAMAGE as error:
             raise self._damaged(error) from error
@@ -70,9 +73,13 @@ class Database:
         return []
 
     def _read_topics(self) -> dict[int, Topic]:
-        tables = {name for (name,) in self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        stored = "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
+        tables = {name for (name,) in self._connection.execute(stored)}
         if not {"topics", "messages"} <= tables:
             raise LogError(f"{self._path.name}: an SQLite database, but no rosbag2", "tables topics and messages")
+        for table in {"topics", "messages", "message_definitions"} & tables:
+            if any(hidden for *_, hidden in self._connection.execute(f"PRAGMA table_xinfo({table})")):
+                raise LogError(f"{self._path.name}: columns of {table} are computed", "what ros2 bag record writes")
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"

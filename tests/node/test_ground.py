@@ -14,6 +14,7 @@ import threading
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,15 @@ from quadid_node.ground import work
 from quadid_node.parcel import LARGEST, ParcelError, pack, unpack
 from quadid_node.remote_worker import Ground, RemoteWorker
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
-from quadid_node.zenoh_link import Fleet, ZenohLink
+from quadid_node.zenoh_fleet import Fleet
+from quadid_node.zenoh_link import ZenohLink
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply
 from quadid.online.fault_isolation import ChangeReply
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
-from quadid_node import remote_worker
+from quadid_node import ground, remote_worker
 from tests.cli.conftest import QUADID
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
@@ -298,6 +300,7 @@ def test_a_few_bytes_never_take_much_memory(request_: FitRequest, happened: Happ
     claims = [
         b"\xdd" + huge.to_bytes(4, "big"), b"\xdf" + huge.to_bytes(4, "big"), b"\xdb" + huge.to_bytes(4, "big"),
         b"\xc6" + huge.to_bytes(4, "big"), b"\xc9" + huge.to_bytes(4, "big") + b"\x01",
+        b"\x92\xa8FitReply" + (b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095)[: LARGEST - 10],
         b"\xdc\x0f\xff" * 5000, b"\xdd\x00\x0f\xff\xff" * (1 << 20), b"\x91" * 100_000,
         spoilt(request_, theta=[[1 << 20, 1 << 20, 8], b"", False]), spoilt(request_, theta=[[huge], bytes(8), True]),
         spoilt(request_, theta=[[0] * 30, b"", False]), spoilt(request_, theta=[[-1, -1], bytes(8), False]),
@@ -331,3 +334,84 @@ def test_a_spoilt_byte_gives_a_parcel_or_is_refused(request_: FitRequest, place:
 def test_an_endless_parcel_is_refused() -> None:
     with pytest.raises(ParcelError, match="bytes"):
         unpack(bytes(LARGEST + 1))
+
+
+class _Query:
+    """A query as the ground machine sees one."""
+
+    key_expr = "quadid/x/work/fit"
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload, self.answers, self.errors = _Payload(payload), list[bytes](), list[bytes]()
+
+    def __enter__(self) -> _Query:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def reply(self, key: str, payload: bytes) -> None:
+        self.answers.append(payload)
+
+    def reply_err(self, payload: bytes) -> None:
+        self.errors.append(payload)
+
+
+class _Payload(bytes):
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+class _Session:
+    """A Zenoh session that hears what is put into it."""
+
+    def __init__(self, queries: list[_Query]) -> None:
+        self._queries = queries
+
+    def declare_queryable(self, key: str, take: Callable[[_Query], None]) -> _Session:
+        for query in self._queries:
+            take(query)
+        return self
+
+    def liveliness(self) -> _Session:
+        return self
+
+    def declare_token(self, key: str) -> _Session:
+        return self
+
+    def undeclare(self) -> None:
+        return
+
+    def zid(self) -> str:
+        return "1"
+
+    def close(self) -> None:
+        return
+
+
+def served(monkeypatch: pytest.MonkeyPatch, payloads: list[bytes]) -> list[_Query]:
+    """What a ground machine answers to payloads that are there when it begins."""
+    queries = [_Query(payload) for payload in payloads]
+    monkeypatch.setattr(ground, "open_session", lambda where: _Session(queries))
+    work("local", lambda: all(q.answers or q.errors for q in queries), lambda text: None)
+    return queries
+
+
+def test_requests_that_make_no_sense_do_not_end_the_ground_machine(
+    request_: FitRequest, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    broken = [
+        replace(request_, theta=np.ones(3)), replace(request_, theta=np.full_like(request_.theta, np.nan)),
+        replace(request_, windows=()), replace(request_, theta=np.zeros((3, 3))),
+    ]  # fmt: skip
+    answers = [unpack(q.answers[0]) for q in served(monkeypatch, [pack(item) for item in [*broken, request_]])]
+    assert all(reply.problem for reply in answers[:-1])
+    assert answers[-1].theta is not None
+    happened(26, f"{len(broken)} requests that make no sense: told so, and the next one is worked on")
+
+
+def test_what_waits_at_a_ground_machine_is_limited(monkeypatch: pytest.MonkeyPatch, happened: Happened) -> None:
+    queries = served(monkeypatch, [bytes(LARGEST)] * 6 + [bytes(LARGEST + 1)])
+    refused = [q.errors == [b"too much to do"] for q in queries]
+    assert refused == [False] * 4 + [True] * 3
+    happened(26, "seven parcels of 16 MiB at once: four wait, the others are refused before they take memory")

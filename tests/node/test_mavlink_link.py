@@ -250,6 +250,35 @@ def test_parameters_nobody_needs_take_no_memory() -> None:
     assert decoder.parameters == {}
 
 
+@pytest.mark.parametrize("rotors", [4, 6, 8])
+def test_speeds_of_rotors_that_are_not_there_are_left_out(rotors: int, happened: Happened) -> None:
+    """ESC_STATUS says itself which rotor it begins with: 7 of 6 was an IndexError."""
+    for index in range(256):
+        decoder = MavlinkDecoder(rotors)
+        for first in (0, index, 0, 4):
+            message = dialect.MAVLink_esc_status_message(first, 10**6, [6000] * 4, [1.0] * 4, [1.0] * 4)
+            assert all(len(s.values) == rotors for s in decoder.samples(decoded(message), 1.0))
+    happened(15, f"ESC_STATUS from rotor 0 to 255 of a vehicle with {rotors}: nothing but its own rotors")
+
+
+def test_requests_for_all_parameters_are_answered_once_a_second(
+    link: MavlinkLink, port: int, happened: Happened
+) -> None:
+    vehicle = Sender(port)
+    for _ in range(2):
+        vehicle.heartbeat()
+        samples(link, 0.6)
+    link.publish(accepted())
+    vehicle.heard(0.3)
+    for _ in range(10):
+        for _ in range(100):
+            vehicle.send(dialect.MAVLink_param_request_list_message(0, 0))
+        samples(link, 0.01)
+    told = sum(m.get_type() == "PARAM_VALUE" for m in vehicle.heard(0.3))
+    assert 0 < told < 100, "before, seventeen frames each"
+    happened(15, f"1000 requests for all parameters in a moment: answered with {told} frames, no longer 17,000")
+
+
 def test_a_long_text_comes_in_pieces_and_whole(link: MavlinkLink, port: int) -> None:
     vehicle = Sender(port)
     vehicle.heartbeat()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sqlite3
 import subprocess
@@ -13,10 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from quadid_node.codec import set_to_dict
 from quadid_node.publication import Output
 from quadid_node.service import Service
 from quadid_node.store import Store
-from quadid_node.store_file import read_history
+from quadid_node.store_file import StoreError, read_history
 from quadid_node.worker import InlineWorker
 
 from quadid.online import SessionSettings, SetState
@@ -177,3 +179,84 @@ def _events(path: Path) -> list[object]:
             return db.execute("SELECT id FROM events").fetchall()
     except sqlite3.Error:
         return []
+
+
+def kept(path: Path) -> None:
+    """A history with one set."""
+    store = Store(path, "v")
+    store.numbered(online_set(TRUE))
+    assert store.flush(10.0)
+    store.close()
+
+
+def with_first(**fields: object) -> str:
+    """A set as JSON, with other fields in its first parameter."""
+    data = set_to_dict(online_set(TRUE))
+    data["parameters"][0].update(fields)
+    return json.dumps(data)
+
+
+HOSTILE_SETS = {
+    "100,000 brackets": "[" * 100_000, "a list": "[]", "nothing": "null", "a number": "7",
+    "a value of 400 digits": with_first(value=10**400),
+    "an infinite number": with_first().replace('"samples": ', '"samples": 1e999, "old": '),
+    "one bound": with_first(bounds=[1.0]), "no interval": with_first(ci95=[]), "no b": with_first(name="c"),
+    "a mass of 400 digits": json.dumps({**set_to_dict(online_set(TRUE)), "mass": 10**400}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE_SETS)
+def test_a_set_that_none_wrote_is_left_out_and_said(tmp_path: Path, what: str, happened: Happened) -> None:
+    path = tmp_path / "h.sqlite"
+    kept(path)
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE sets SET data = ?", (HOSTILE_SETS[what],))
+    with contextlib.suppress(StoreError):
+        read_history(path, "v")
+    store = Store(path, "v")
+    restored = store.restore()
+    assert restored.item is None
+    assert restored.baseline is None
+    assert "is no set and is not taken up again" in store.notes[0]
+    store.close()
+    happened(12, f"a row of the history that holds {what}: '{store.notes[0][:90]}'")
+
+
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+HOSTILE_FILES = {
+    "a trigger that deletes": "CREATE TRIGGER t AFTER INSERT ON sets BEGIN DELETE FROM sets; END",
+    "a trigger that never ends": "CREATE TRIGGER t AFTER INSERT ON sets BEGIN INSERT INTO events "
+    f"(vehicle, level, kind, text, wall) {ENDLESS} SELECT 'v', '', '', x, 1 FROM c; END",
+    "a view without end": "DROP TABLE sets; CREATE VIEW sets AS " + ENDLESS + " SELECT 'v' AS vehicle, x AS sequence, "
+    "'accepted' AS state, '' AS reason, '' AS approved_by, 1 AS stop, 1 AS wall, '{}' AS data FROM c",
+    "a computed column": "ALTER TABLE sets DROP COLUMN data; ALTER TABLE sets ADD COLUMN data TEXT GENERATED ALWAYS AS "
+    "(hex(zeroblob(400000000)))",
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE_FILES)
+def test_a_file_that_computes_is_set_aside(tmp_path: Path, what: str, happened: Happened) -> None:
+    """A trigger could take away what was said to be on the disk; a view need not end."""
+    path = tmp_path / "h.sqlite"
+    kept(path)
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.executescript(HOSTILE_FILES[what])
+    with pytest.raises(StoreError, match="malformed"):
+        read_history(path, "v")
+    store = Store(path, "v")
+    assert "set aside" in store.notes[0]
+    store.numbered(online_set(TRUE))
+    assert store.flush(10.0)
+    assert [entry["sequence"] for entry in read_history(path, "v")["sets"]] == [online_set(TRUE).sequence]
+    store.close()
+    happened(12, f"a history with {what}: '{store.notes[0][:90]}'")
+
+
+def test_an_approval_that_is_none_is_not_taken_up(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    kept(path)
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("INSERT INTO decisions (vehicle, configured, approval, wall) VALUES ('v', 'auto', 'yes', 1)")
+    store = Store(path, "v")
+    assert store.restore().approval == ""
+    store.close()

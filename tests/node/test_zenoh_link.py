@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 import zenoh
 from quadid_cli.watch import snapshot, table
-from quadid_node.zenoh_link import Fleet, ZenohError, ZenohLink, key_of
+from quadid_node.zenoh_fleet import Fleet
+from quadid_node.zenoh_link import KINDS, ZenohError, ZenohLink, key_of
 
 from quadid.online.records import Diagnosed, OnlineFinding
+from quadid_node import zenoh_fleet
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.test_gate import TRUE, online_set
@@ -215,3 +218,44 @@ def test_findings_cross_too(net: Net) -> None:
     finally:
         link.close()
         fleet.close()
+
+
+class _Listening:
+    """A session whose subscriber is called by hand."""
+
+    def declare_subscriber(self, key: str, take: Callable[..., None], history: bool = False) -> None:
+        self.take = getattr(self, "take", take)
+
+    def liveliness(self) -> _Listening:
+        return self
+
+    def get(self, key: str, take: Callable[..., None]) -> None:
+        return
+
+
+class _Heard(NamedTuple):
+    key_expr: str
+    payload: Any
+
+
+class _Bytes(bytes):
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.MonkeyPatch, happened: Happened) -> None:
+    session = _Listening()
+    monkeypatch.setattr(zenoh_fleet, "open_session", lambda where: session)
+    fleet = Fleet("local")
+    huge = b'{"parameters": [{"name": "b", "value": ' + b"9" * 4000 + b', "sigma": 1}], "feeds": 1, "sequence": -1}'
+    session.take(_Heard("quadid/odd/parameters", _Bytes(huge)))
+    table(snapshot(fleet))
+    large = _Bytes(b'{"a": "' + b"x" * (zenoh_fleet.LARGEST - 20) + b'"}')
+    for k in range(300):
+        session.take(_Heard(f"quadid/v{k}/{KINDS[k % 5]}", large))
+    held = sum(len(str(value)) for kinds in fleet.latest.values() for value in kinds.values())
+    assert held <= Fleet.MOST_BYTES
+    assert fleet.refused > 200
+    session.take(_Heard("quadid/v0/parameters", _Bytes(b'{"a": 1}')))
+    assert fleet.latest["v0"]["parameters"] == {"a": 1}, "who is known goes on"
+    happened(16, f"300 values of 256 KiB from strangers: {held >> 20} MiB kept; a number of 4000 digits is shown")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from quadid.errors import LogError
 from quadid.window import Recording
+from tests.faults.evidence import Happened
 from tests.replay.synthetic import full_recording
 
 
@@ -119,3 +121,34 @@ def test_a_definition_in_idl_is_replaced_or_named(tmp_path: Path, mcap: Path) ->
     np.testing.assert_array_equal(recording.channels["gyro"].values, open_log(mcap).channels["gyro"].values)
     assert any("rpm" in note and "IDL" in note for note in recording.warnings)
     assert schema_text("sensor_msgs/Imu")
+
+
+TOPICS = (
+    "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
+    "INSERT INTO topics VALUES (1, 'imu', 'sensor_msgs/msg/Imu', 'cdr');"
+)
+ROWS = "INSERT INTO messages (id, topic_id, timestamp) VALUES (1, 1, 1), (2, 1, 2), (3, 1, 3);"
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+        f"data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); {ROWS}",
+        "CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
+        "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) "
+        "SELECT x AS id, 1 AS topic_id, x AS timestamp, zeroblob(100) AS data FROM c",
+    ],
+    ids=["computed", "virtual", "view"],
+)
+def test_a_database_whose_messages_are_computed_is_refused(tmp_path: Path, messages: str, happened: Happened) -> None:
+    """Twelve kilobytes took 7 GB and two minutes: three messages of 900 MB that no file holds."""
+    path = tmp_path / "log.db3"
+    connection = sqlite3.connect(path)
+    connection.executescript(f"{TOPICS}{messages}")
+    connection.close()
+    began = time.process_time()
+    with pytest.raises(LogError, match="computed|no rosbag2") as told:
+        open_log(path)
+    assert time.process_time() - began < 5.0
+    happened(25, f"rosbag2 of {path.stat().st_size >> 10} kB with '{messages[:40]}...': {str(told.value)[:80]}")
