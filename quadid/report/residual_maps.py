@@ -96,7 +96,8 @@ def residual_map(
         noise: sensor noise.
 
     Returns:
-        The map, or None where the flight lacks the channels.
+        The map, against time only where nothing else of the equation is known; None where the flight lacks the
+        channels.
     """
     shooting = Shooting.cut(_first(windows), vehicle, SCORE_SECONDS)
     if not shooting.rollouts or effect not in PAIRS:
@@ -107,11 +108,13 @@ def residual_map(
     signals = _signals(shooting, after, settled)
     before = _residuals(settle_states(shooting, switched_off(shooting.layout, theta, effect, names)))
     drawn = [
-        _binned(shooting, before, after, mode, channel, quantity, signals[quantity])
+        (quantity == "time", _binned(shooting, before, after, mode, channel, quantity, signals[quantity]))
         for mode, channel, quantity in PAIRS[effect]
         if quantity in signals
     ]
-    return max((m for m in drawn if m is not None), key=lambda m: m.seen, default=None)
+    # Against time everything shows; what the equation depends on says more.
+    found = [(late, m) for late, m in drawn if m is not None]
+    return max(found, key=lambda f: (not f[0], f[1].seen), default=(True, None))[1]
 
 
 def switched_off(layout: Layout, theta: FloatArray, effect: str, names: Sequence[str]) -> FloatArray:

@@ -100,3 +100,12 @@ def test_a_flight_too_short_has_no_map(pelican: Vehicle) -> None:
     windows = to_windows(fly(pelican, seconds=3.0, seed=1).recording, pelican)
     layout = Layout(pelican)
     assert residual_map(windows, pelican, layout.initial(pelican), "motor_lag", ("motor_lag.tau",)) is None
+
+
+@pytest.mark.parametrize("extras", [(), ("velocity", "position")])
+def test_rotor_drag_is_drawn_against_speed_whether_measured_or_not(pelican: Vehicle, extras: tuple[str, ...]) -> None:
+    """In a slow drift time tells as much as speed does, and explains nothing."""
+    names = ("rotor_drag.k_x", "rotor_drag.k_y")
+    found = drawn(pelican, "rotor_drag", {"k_x": 0.3, "k_y": 0.3}, names, extras)
+    assert found.against in ("forward speed", "speed to the right")
+    assert slope(found) == pytest.approx(-0.3, rel=0.25)
