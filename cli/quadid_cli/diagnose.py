@@ -14,6 +14,7 @@ from quadid_cli.options import (
     Rate,
     ReportFile,
     Seed,
+    SeriesKinds,
     Start,
     Stop,
     Unchecked,
@@ -28,6 +29,7 @@ def diagnose(
     validate: Validate = None,
     seed: Seed = 1,
     report: ReportFile = None,
+    series: SeriesKinds = None,
     rate: Rate = None,
     start: Start = None,
     stop: Stop = None,
@@ -40,9 +42,11 @@ def diagnose(
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
     from quadid.workflow import diagnose as work
     from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.series import check_kinds
     from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
 
+    check_kinds(series or ())
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
@@ -60,6 +64,8 @@ def diagnose(
         done.result["prediction_file"] = str(output.write_text(predicts, done.prediction.to_yaml()))
     if report is not None:
         done.result["report"] = str(done.report(report, output.command_line()))
+    if series:
+        done.result["series"] = [str(path) for path in done.save_series(folder, series)]
     output.write_json(done.result, json)
     tables.print_outcome(terminal.console(quiet=json == "-"), done)
 

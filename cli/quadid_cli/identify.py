@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from quadid_cli.options import (
     Rate,
     ReportFile,
     Seed,
+    SeriesKinds,
     Start,
     Stop,
     Unchecked,
@@ -39,6 +41,7 @@ def identify(
     ] = OPTIMIZERS[0],
     seed: Seed = 1,
     report: ReportFile = None,
+    series: SeriesKinds = None,
     rate: Rate = None,
     start: Start = None,
     stop: Stop = None,
@@ -52,10 +55,12 @@ def identify(
     from quadid.workflow import identify as work
     from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid.workflow.searching import check_optimizer
+    from quadid.workflow.series import check_kinds
     from quadid_cli import output, terminal
     from quadid_cli.explaining import explained
 
     check_optimizer(optimizer)
+    check_kinds(series or ())
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
@@ -68,9 +73,9 @@ def identify(
             with terminal.progress() as advance:
                 done = work.identify(train, held, optimizer=optimizer, seed=seed, advance=advance)
         except work.UnansweredError as error:
-            conclude(error.outcome, target, report, json)
+            conclude(error.outcome, target, report, series or (), json)
             raise
-    conclude(done, target, report, json)
+    conclude(done, target, report, series or (), json)
 
 
 def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
@@ -83,13 +88,15 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
     return path
 
 
-def conclude(done: Identified, target: Path, report: Path | None, json: str | None) -> None:
-    """Writes the vehicle file, the report and JSON, and prints the result."""
+def conclude(done: Identified, target: Path, report: Path | None, series: Sequence[str], json: str | None) -> None:
+    """Writes the vehicle file, the report, series and JSON, and prints the result."""
     from quadid_cli import output, tables, terminal
 
     done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))
     if report is not None:
         done.result["report"] = str(report.absolute())
         done.report(report, output.command_line())
+    if series:
+        done.result["series"] = [str(path) for path in done.save_series(target.parent, series)]
     output.write_json(done.result, json)
     tables.print_outcome(terminal.console(quiet=json == "-"), done)

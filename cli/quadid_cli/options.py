@@ -65,6 +65,14 @@ Columns = Annotated[
     typer.Option("--columns", metavar="NAME=C", help="What a CSV calls a column, as gyro_x=p,gyro_y=q; repeatable."),
 ]
 Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
+SeriesKinds = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--series",
+        metavar="mcap|csv",
+        help="Write simulated against measured of every log into --out, for PlotJuggler and Foxglove; repeatable.",
+    ),
+]
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
 ]

@@ -55,4 +55,6 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
         if outcome.result.get(key):
             console.print(f"{label}: {outcome.result[key]}", soft_wrap=True)
+    for path in outcome.result.get("series", ()):
+        console.print(f"Simulated against measured: {path}", soft_wrap=True)
     warn(outcome.warnings)

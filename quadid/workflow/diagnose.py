@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -122,6 +122,12 @@ class Diagnosed(Outcome):
         from quadid.report.plotly_figure import channel_plot
 
         return channel_plot(self.sets[log], group, MODELS)
+
+    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
+        """Writes measured outputs of every log, and simulated ones without and with the findings, as mcap or csv."""
+        from quadid.workflow.series import save_series
+
+        return save_series(self.sets, self.logs, folder, kinds)
 
     def report(self, path: str | Path, command: str | None = None) -> Path:
         """Writes the HTML report; `command` is the command line that led to it, if one did."""

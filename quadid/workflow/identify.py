@@ -95,6 +95,12 @@ class Identified(Outcome):
 
         return channel_plot(self.sets[log], group)
 
+    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
+        """Writes measured outputs of every log, and simulated ones before and after the fit, as mcap or csv."""
+        from quadid.workflow.series import save_series
+
+        return save_series(self.sets, self.logs, folder, kinds)
+
     def report(self, path: str | Path, command: str | None = None) -> Path:
         """Writes the HTML report; `command` is the command line that led to it, if one did."""
         from quadid.workflow.reporting import LIBRARY, identify_html

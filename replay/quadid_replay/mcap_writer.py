@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,11 +40,24 @@ def write_mcap(file: str | Path | BinaryIO, source: Source, epoch_ns: int = 0) -
 
 def write_recording(writer: TopicWriter, recording: Recording, epoch_ns: int = 0) -> None:
     """Writes all channels of a recording to an open writer, in time order; see `write_mcap`."""
+    write_recordings(writer, {"": recording}, epoch_ns)
+
+
+def write_recordings(writer: TopicWriter, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
+    """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`."""
+    each = [(name, s) for name, recording in recordings.items() for s in _all_series(writer, recording, epoch_ns)]
+    for which, row in in_time_order([t for _, (t, _) in each]):
+        name, (t, message) = each[which]
+        topic, kind, data = message(row)
+        writer.write_cdr(f"{name}/{topic}" if name else topic, kind, data, _stamp(t[row], epoch_ns))
+
+
+def _all_series(writer: TopicWriter, recording: Recording, epoch_ns: int) -> list[_Series]:
     channels = recording.channels
     first = min((float(c.t[0]) for c in channels.values()), default=0.0)
     if epoch_ns + round(first * 1e9) < 0:
         raise LogError(f"times begin at {first:.3f} s", "times from 0 s on", "give an epoch that makes stamps positive")
-    series = [
+    return [
         *_imu(writer, channels.get("gyro"), channels.get("accel"), epoch_ns),
         *_attitude(writer, channels.get("attitude"), epoch_ns),
         *_rotor_speeds(writer, channels.get("rotor_speed"), epoch_ns),
@@ -53,10 +66,6 @@ def write_recording(writer: TopicWriter, recording: Recording, epoch_ns: int = 0
         *_odometry(writer, recording, epoch_ns),
         *_battery(writer, channels.get("battery"), epoch_ns),
     ]
-    for which, row in in_time_order([t for t, _ in series]):
-        t, message = series[which]
-        topic, kind, data = message(row)
-        writer.write_cdr(topic, kind, data, _stamp(t[row], epoch_ns))
 
 
 def _stamp(t: float, epoch_ns: int) -> int:

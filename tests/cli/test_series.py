@@ -1,0 +1,63 @@
+"""`--series`: simulated against measured as files that public readers open, with the errors that the result states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from tests.cli.conftest import Cli, Flights, one_line, table
+
+RATES = "pqr"
+
+
+@pytest.fixture(scope="module")
+def result(quadid: Cli, flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("series")
+    run = quadid(
+        "identify", flights.train, "--validate", flights.unseen, "--vehicle", "pelican", "--out", folder,
+        "--series", "csv", "--series", "mcap", "--json", "-",
+    )  # fmt: skip
+    assert run.code == 0, run.err
+    return dict(run.data)
+
+
+def test_one_file_a_log_and_form(result: dict[str, Any]) -> None:
+    names = [f"{log}.simulated.{kind}" for log in ("train.mcap", "unseen.csv") for kind in ("csv", "mcap")]
+    assert [Path(path).name for path in result["series"]] == names
+
+
+def test_the_csv_holds_the_stated_errors(result: dict[str, Any]) -> None:
+    names, rows = table(Path(result["series"][0]))
+    assert names[:4] == ["t", "measured/p", "measured/q", "measured/r"]
+    assert {"simulated/phi", "before/az"} <= set(names)
+    for rate in RATES:
+        measured, simulated = (rows[:, names.index(f"{which}/{rate}")] for which in ("measured", "simulated"))
+        stated = result["sets"][0]["rmse"][rate]["value"]
+        assert np.sqrt(np.nanmean((simulated - measured) ** 2)) == pytest.approx(stated, rel=1e-6)
+
+
+def test_the_mcap_holds_the_same_in_the_frames_of_ros(result: dict[str, Any]) -> None:
+    names, rows = table(Path(result["series"][0]))
+    pitch: dict[str, list[float]] = {which: [] for which in ("measured", "simulated", "before")}
+    with Path(result["series"][1]).open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        stamps = []
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            stamps.append(message.log_time)
+            which, _, topic = channel.topic.partition("/")
+            if topic == "imu":
+                pitch[which].append(decoded.angular_velocity.y)
+    assert stamps == sorted(stamps)
+    for which, values in pitch.items():
+        np.testing.assert_allclose(values, -rows[:, names.index(f"{which}/q")], rtol=1e-12)
+
+
+def test_another_form_is_refused_before_anything_is_read(inside: Cli) -> None:
+    line = one_line(inside("diagnose", "none.mcap", "--vehicle", "pelican", "--series", "mcp"), 2)
+    assert "--series mcp" in line
+    assert "mcap" in line.partition("fix")[2]
