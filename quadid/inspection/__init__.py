@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from quadid.inspection.airborne import Spans, flying_spans
+from quadid.inspection.airborne import Spans, flying_spans, proposed_cuts
 from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
 from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
@@ -18,7 +18,18 @@ from quadid.mounting import in_body_axes
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 
-__all__ = ["FATAL", "ChannelFacts", "Check", "Inspection", "Missing", "Outlook", "Verdict", "inspect"]
+__all__ = [
+    "FATAL",
+    "ChannelFacts",
+    "Check",
+    "Inspection",
+    "Missing",
+    "Outlook",
+    "Verdict",
+    "flying_spans",
+    "inspect",
+    "proposed_cuts",
+]
 
 
 def inspect(

@@ -16,6 +16,12 @@ _LEAST = 0.5
 """Flying means at least this fraction of hover thrust."""
 _IDLE = 0.15
 """Commands that never exceed this fraction of full are idling motors."""
+_GROUND = 3.0
+"""Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
+_MARGIN = 1.0
+"""Left out after take-off and before landing [s]: feet and ground push, too."""
+_FLIGHT = 5.0
+"""Shortest flight worth proposing [s]."""
 _SHORTEST, _BRIDGE = 1.0, 0.5
 """Spans shorter than the first [s] are none; interruptions up to the second [s] do not end one."""
 
@@ -40,6 +46,29 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))
     return ()
+
+
+def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
+    """Flights without take-off and landing [s after `first`, to a tenth]; none where the log holds little else.
+
+    Args:
+        spans: when it flies [s].
+        first: sample that is used when nothing is cut [s].
+        last: sample, likewise [s].
+    """
+    flights: list[tuple[float, float]] = []
+    for a, b in spans:
+        if flights and a - flights[-1][1] < _GROUND:
+            flights[-1] = (flights[-1][0], b)
+        else:
+            flights.append((a, b))
+    if last - first - sum(b - a for a, b in flights) < _GROUND:
+        return ()
+    cuts = [
+        (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
+        for a, b in flights
+    ]
+    return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= _FLIGHT)
 
 
 def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, float]:

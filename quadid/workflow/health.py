@@ -134,7 +134,7 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
     else:
         cut = parse_cut(str(given))
         recording = open_recording(cut.path, preset, vehicle.columns)
-    doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle)
+    doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut)
     warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]
     return _part(recording, cut)
 

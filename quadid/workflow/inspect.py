@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, QuadidError
-from quadid.workflow.loading import LONGEST, Log, as_vehicle, beginning, first_imu_time, open_recording, parse_cut
+from quadid.workflow.loading import (
+    LONGEST,
+    Log,
+    as_vehicle,
+    beginning,
+    first_imu_time,
+    flown_parts,
+    open_recording,
+    parse_cut,
+    trimming,
+)
 from quadid.workflow.outcome import Outcome
 
 if TYPE_CHECKING:
@@ -27,8 +37,9 @@ class Inspected(Outcome):
 
     @property
     def warnings(self) -> list[str]:
-        """What the reader had to say."""
-        return list(self.found.warnings)
+        """What the reader had to say, and what to leave out of the log."""
+        trim = trimming(self.result["use"])
+        return [*self.found.warnings, *([trim] if trim else [])]
 
     def tables(self) -> list[TextTable]:
         """Channels, checks, parameters, and what is missing."""
@@ -73,7 +84,8 @@ def inspect(
     recording = _part(whole, cut.start, cut.stop)
     rows = () if described is None else _excitation(recording, described)
     found = inspect_recording(recording, described, rows)
-    return Inspected({**found.to_dict(), "log": str(cut.path.resolve()), "files": []}, found)
+    use = flown_parts(whole, described, cut)
+    return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
 
 
 def _part(recording: Recording, start: float | None, stop: float | None) -> Recording:

@@ -77,7 +77,7 @@ class Log:
         described = as_vehicle(vehicle)
         if described == self.vehicle:
             return self
-        doubts = check_conventions(self.recording, described) if self.cut.checked else ()
+        doubts = _doubts(self.recording, described, self.cut) if self.cut.checked else ()
         windows, grid = _gridded(self.recording, described, self.grid.rate, self.cut)
         return replace(self, vehicle=described, windows=windows, grid=grid, doubts=doubts)
 
@@ -170,7 +170,7 @@ def load(
             f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
             "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
         )  # fmt: skip
-    doubts = () if unchecked else check_conventions(recording, described)
+    doubts = () if unchecked else _doubts(recording, described, cut)
     windows, report = _gridded(recording, described, rate, cut)
     return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
 
@@ -234,8 +234,13 @@ def parse_columns(texts: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]:
+def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple[str, ...]:
     """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
+
+    Args:
+        recording: the whole log.
+        vehicle: whose log it is.
+        cut: the part that is asked for; an error about a whole log proposes what is in the air.
 
     Returns:
         What looks wrong but need not be.
@@ -250,10 +255,37 @@ def check_conventions(recording: Recording, vehicle: Vehicle) -> tuple[str, ...]
         # A check without numbers could not be made; what comes next says why, and better.
         if check.verdict is Verdict.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
+            trim = trimming(flown_parts(recording, vehicle, cut))
+            fix = f"{fix}; {trim}" if trim else fix
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
         if check.verdict in (Verdict.ERROR, Verdict.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
     return tuple(doubts)
+
+
+def _doubts(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple[str, ...]:
+    """What looks wrong with a log, and what to leave out of it; raises as `check_conventions`."""
+    doubts, trim = check_conventions(recording, vehicle, cut), trimming(flown_parts(recording, vehicle, cut))
+    return (*doubts, trim) if trim else doubts
+
+
+def flown_parts(recording: Recording, vehicle: Vehicle | None, cut: Cut) -> list[str]:
+    """What to use of a log that also stands on the ground, as ``flight.bin@73.2:227.3``; none where it hardly does."""
+    from quadid.inspection import flying_spans, proposed_cuts
+    from quadid.mounting import in_body_axes
+
+    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
+    if cut.start is not None or cut.stop is not None or not imu:
+        return []
+    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
+    first, last = first_imu_time(recording), max(float(t[-1]) for t in imu)
+    cuts = proposed_cuts(flying_spans(turned, vehicle), first, last)
+    return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in cuts]
+
+
+def trimming(parts: Sequence[str]) -> str:
+    """The proposal of `flown_parts` as a sentence; empty without one."""
+    return f"the log stands on the ground, too, which counts as flight: use {' '.join(parts)}" if parts else ""
 
 
 def first_imu_time(recording: Recording) -> float:

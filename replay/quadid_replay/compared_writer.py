@@ -18,7 +18,7 @@ from quadid_replay.writing import union_rows
 
 
 def write_compared(path: str | Path, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
-    """Writes recordings to one file under their names: topics ``simulated/imu`` in MCAP, columns ``simulated/p`` in CSV.
+    """Writes recordings under their names: topics ``simulated/imu`` in MCAP, columns ``simulated/p`` in CSV.
 
     Args:
         path: ends in .mcap (ENU, FLU) or .csv (NED, FRD).

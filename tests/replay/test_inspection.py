@@ -12,7 +12,8 @@ import pytest
 from quadid_replay import open_log
 from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
-from quadid.inspection import Check, Inspection, Verdict, inspect
+from quadid.inspection import Check, Inspection, Verdict, inspect, proposed_cuts
+from quadid.inspection.airborne import Spans
 from quadid.inspection.conventions import fit_axes
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -335,3 +336,22 @@ def test_a_flight_that_hardly_turns_is_not_called_wrong(profile: str, verdict: s
         found = inspect(fly(pelican, seconds=40.0, seed=seed, profile=profile).recording, pelican)
         (check,) = (c for c in found.checks if c.name == "gyro_attitude")
         assert check.verdict.value == verdict, check.message
+
+
+@pytest.mark.parametrize(
+    ("spans", "cuts"),
+    [
+        (((0.0, 60.0),), ()),
+        (((1.0, 59.5),), ()),
+        (((12.0, 50.0),), ((13.0, 49.0),)),
+        (((0.2, 40.0),), ((0.0, 39.0),)),
+        (((12.0, 20.0), (20.6, 50.0)), ((13.0, 49.0),)),
+        (((5.0, 20.0), (30.0, 60.0)), ((6.0, 19.0), (31.0, 60.0))),
+        (((5.0, 8.0), (30.0, 60.0)), ((31.0, 60.0),)),
+        ((), ()),
+    ],
+)
+def test_what_is_in_the_air_is_proposed(spans: Spans, cuts: Spans) -> None:
+    """Take-off and landing are left out, a short unloading of the rotors is not, nor is a flight cut for a second."""
+    later = tuple((a + 100.0, b + 100.0) for a, b in spans)
+    assert proposed_cuts(later, 100.0, 160.0) == cuts

@@ -1,0 +1,66 @@
+"""A log that also stands on the ground: what is in the air is proposed as LOG@from:to when it is inspected or used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadid
+from quadid.errors import LogError
+from tests.cli.conftest import Cli, Flights, table, write_table
+
+
+@pytest.fixture(scope="module")
+def standing(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight that begins with ten seconds on its legs, rotors idling."""
+    names, rows = table(flights.unseen)
+    early = rows[:, 0] < rows[0, 0] + 10.0
+    still = {
+        "p": 0.0,
+        "q": 0.0,
+        "r": 0.0,
+        "ax": 0.0,
+        "ay": 0.0,
+        "az": -9.81,
+        "qw": 1.0,
+        "qx": 0.0,
+        "qy": 0.0,
+        "qz": 0.0,
+    }
+    for name, value in {**still, **{n: 80.0 for n in names if n.startswith("w")}}.items():
+        rows[early, names.index(name)] = value
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (len(rows), 6))
+    rows[:, [names.index(n) for n in ("p", "q", "r", "ax", "ay", "az")]] += noise
+    return write_table(tmp_path_factory.mktemp("standing") / "standing.csv", names, rows)
+
+
+def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> None:
+    run = inside("inspect", standing, "--vehicle", "pelican", "--json", "-")
+    assert run.data["use"] == ["standing.csv@11:30"]
+    assert "use standing.csv@11:30" in inside("inspect", standing, "--vehicle", "pelican").out
+    assert inside("inspect", f"{standing}@11:30", "--json", "-").data["use"] == []
+
+
+def test_a_log_in_use_says_so_once(standing: Path) -> None:
+    whole = [w for w in quadid.load(standing, vehicle="pelican").warnings if "ground" in w]
+    assert whole == ["standing.csv: the log stands on the ground, too, which counts as flight: use standing.csv@11:30"]
+    assert not [w for w in quadid.load(f"{standing}@11:30", vehicle="pelican").warnings if "ground" in w]
+
+
+def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> None:
+    names, rows = table(standing)
+    rows[:, names.index("az")] *= -1.0
+    wrong = write_table(tmp_path / "wrong.csv", names, rows)
+    with pytest.raises(LogError) as refused:
+        quadid.load(wrong, vehicle="pelican")
+    assert "use wrong.csv@11:30" in str(refused.value.fix)
+
+
+def test_a_recorded_flight(inside: Cli, data_dir: Path) -> None:
+    """Armed at 72 s, crashed at about 220 s: see the data's README."""
+    (use,) = inside("inspect", data_dir / "ardupilot" / "log171.bin", "--json", "-").data["use"]
+    start, stop = (float(v) for v in use.rpartition("@")[2].split(":"))
+    assert 72.0 < start < 78.0
+    assert 210.0 < stop < 230.0
