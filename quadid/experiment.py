@@ -36,6 +36,8 @@ MIXES = (
 )  # fmt: skip
 START = {"roll": 0.1, "pitch": 0.1, "yaw": 0.3, "throttle": 0.07}
 """Amplitudes that a search for the largest allowed ones begins with: rad rms, fraction of hover thrust."""
+SWEEP = (0.5, 3.5)
+"""Frequencies of sweeps of one axis at a time [Hz], lowest and highest."""
 LARGEST = {"roll": 0.35, "pitch": 0.35, "yaw": 1.5, "throttle": 0.15}
 ROUNDS = 3
 
@@ -62,12 +64,13 @@ class Proposal:
     """A manoeuvre and what it would give.
 
     Attributes:
-        movements: chosen blocks in the order flown.
+        movements: chosen blocks in the order flown, alike ones together, the most frequent first.
         segments: of the whole manoeuvre.
         seconds: its length.
         peak: largest tilt [rad] and rate [rad/s] in simulation.
         now, pilot, after: relative 95 % half-widths now, after as long a gentle flight, after the manoeuvre, (P,).
         flight: the manoeuvre flown in simulation.
+        sweeps: one axis at a time in as long, for autopilots that can do no more; swept: half-widths after them.
     """
 
     movements: tuple[Movement, ...]
@@ -78,6 +81,14 @@ class Proposal:
     pilot: FloatArray
     after: FloatArray
     flight: Flight
+    sweeps: tuple[Segment, ...]
+    swept: FloatArray
+
+    @property
+    def room(self) -> FloatArray:
+        """Largest distance to the side, and upwards and downwards, from where it began [m], shape (3,)."""
+        moved = self.flight.truth.position - self.flight.truth.position[0]
+        return np.array([np.hypot(moved[:, 0], moved[:, 1]).max(), max(-moved[:, 2].min(), 0.0), moved[:, 2].max()])
 
 
 class Simulator:
@@ -175,7 +186,7 @@ def propose(simulator: Simulator, known: FloatArray, limits: Limits, seconds: fl
         )  # fmt: skip
     blocks = max(round(seconds / (BLOCK + PAUSE)), 1)
     chosen = d_optimal(np.array([m.information for m in candidates]), known, blocks)
-    picked = tuple(candidates[i] for i in chosen)
+    picked = tuple(candidates[i] for i in sorted(chosen, key=lambda i: (-chosen.count(i), i)))
     length = blocks * (BLOCK + PAUSE)
     row = in_a_row(picked)
     for _ in range(ROUNDS):
@@ -189,9 +200,38 @@ def propose(simulator: Simulator, known: FloatArray, limits: Limits, seconds: fl
     advance("movements", 1.0)
     gentle = simulator.information(simulator.fly((), length, "gentle"))
     gained = simulator.information(flight)
+    sweeps = one_axis_at_a_time(simulator, limits, length)
+    swept = simulator.information(simulator.fly(sweeps, length)) if sweeps else 0.0 * known
     return Proposal(
-        picked, row, length, peak, halfwidths(known), halfwidths(known + gentle), halfwidths(known + gained), flight
-    )
+        picked, row, length, peak, halfwidths(known), halfwidths(known + gentle), halfwidths(known + gained), flight,
+        sweeps, halfwidths(known + swept),
+    )  # fmt: skip
+
+
+def one_axis_at_a_time(simulator: Simulator, limits: Limits, seconds: float) -> tuple[Segment, ...]:
+    """Sweeps of roll, pitch, yaw and throttle one after the other, as large as the limits allow.
+
+    Args:
+        simulator: what is believed of the vehicle.
+        limits: largest tilt and rate.
+        seconds: of all together.
+
+    Returns:
+        None where there is too little time for two swings of the lowest frequency.
+    """
+    each = seconds / len(START)
+    span = each - PAUSE
+    if span <= 4.0 / SWEEP[0]:
+        return ()
+    out: list[Segment] = []
+    for axis, size in START.items():
+        first = Segment(axis, "sweep", 0.0, span, size, *SWEEP)
+        try:
+            (largest,), _ = simulator.within((first,), each, limits)
+        except FlightError:
+            continue
+        out.append(replace(largest, start=len(out) * each))
+    return tuple(out)
 
 
 def in_a_row(picked: Sequence[Movement]) -> tuple[Segment, ...]:

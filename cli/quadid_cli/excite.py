@@ -20,6 +20,18 @@ def excite(
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the manoeuvre.")] = 60.0,
     tilt: Annotated[float, typer.Option("--tilt", metavar="DEG", help="Largest tilt.")] = 25.0,
     rate_limit: Annotated[float, typer.Option("--rate-limit", metavar="DEG/S", help="Largest body rate.")] = 150.0,
+    height: Annotated[
+        str, typer.Option("--height", metavar="M:M", help="Lowest and highest height above take-off.")
+    ] = "10:40",
+    battery: Annotated[float, typer.Option("--battery", metavar="%", help="What must remain of the battery.")] = 40.0,
+    forms: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="Also write what flies it: ardupilot-lua, ardupilot-sid, px4, sticks; repeatable.",
+        ),
+    ] = None,
     seed: Seed = 1,
     rate: Rate = None,
     preset: Preset = "auto",
@@ -29,12 +41,14 @@ def excite(
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
-    """Propose the manoeuvre that shrinks the intervals most, within tilt and rate limits; write it to a file."""
-    from quadid.workflow.excite import check_limits, propose
+    """Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it."""
+    from quadid.workflow.excite import check_forms, check_limits, parse_height, propose
     from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
     from quadid_cli import output, terminal
 
-    check_limits(seconds, tilt, rate_limit)
+    check_limits(seconds, tilt, rate_limit, battery)
+    check_forms(forms or ())
+    heights = parse_height(height)
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
@@ -43,11 +57,12 @@ def excite(
     opened = load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked, named)
     with terminal.progress() as advance:
         done = propose(
-            opened, vehicle=described, seconds=seconds, tilt=tilt, rate_limit=rate_limit, seed=seed, advance=advance
-        )
+            opened, vehicle=described, seconds=seconds, tilt=tilt, rate_limit=rate_limit, height=heights,
+            battery=battery, seed=seed, advance=advance,
+        )  # fmt: skip
     result = done.result
-    target = folder / f"{output.file_name(described.name)}.manoeuvre.yaml"
-    result["manoeuvre_file"] = str(output.write_text(target, done.text))
+    first, *others = done.save(folder, forms or ())
+    result["manoeuvre_file"], result["files"] = str(first), [str(path) for path in others]
     if report is not None:
         from quadid.report.excite_page import excite_html
 
@@ -61,26 +76,37 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
     from rich.table import Table
 
+    from quadid.experiment import BLOCK
     from quadid_cli import terminal
 
     console = terminal.console(quiet)
     table = Table(title=f"Relative 95 % half-width (±) before and after {result['seconds']:g} s")
-    for name in ("parameter", "now", "after a gentle flight", "after the manoeuvre"):
+    for name in ("parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"):
         table.add_column(name, justify="left" if name == "parameter" else "right")
     for p in result["parameters"]:
-        table.add_row(p["name"], *(percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre")))
+        table.add_row(p["name"], *(percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")))
     console.print(table)
-    moves = Table(title="Manoeuvre")
+    moves = Table(title=f"Manoeuvre: movements of {BLOCK:g} s")
+    moves.add_column("times", justify="right")
     for name in ("movement", "amplitude (rms)"):
         moves.add_column(name)
-    moves.add_column("times", justify="right")
     for name, amplitudes, times in grouped(result["movements"]):
-        moves.add_row(name, amplitudes, str(times))
+        moves.add_row(str(times), name, amplitudes)
     console.print(moves)
     peak = result["peak"]
-    console.print(f"In simulation it reaches {peak['tilt_deg']:.0f} degrees and {peak['rate_deg_s']:.0f} deg/s.")
+    room, e = result["room"], result["envelope"]
+    console.print(
+        f"In simulation it reaches {peak['tilt_deg']:.0f} degrees and {peak['rate_deg_s']:.0f} deg/s, and needs "
+        f"{room['sideways_m']:.0f} m to each side, {room['up_m']:.1f} m upwards and {room['down_m']:.1f} m downwards."
+    )
+    console.print(
+        f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the start, "
+        f"{e['abort_tilt_deg']:.0f} degrees of tilt, {e['battery_percent']:g} % of the battery left."
+    )
     console.print(f"{result['worst']}, the least certain after a gentle flight: {result['gain']:.1f} times narrower.")
     console.print(f"Manoeuvre: {result['manoeuvre_file']}", soft_wrap=True)
+    for path in result["files"]:
+        console.print(f"To fly it: {path}", soft_wrap=True)
     if "report" in result:
         console.print(f"Report: {result['report']}", soft_wrap=True)
 

@@ -15,7 +15,11 @@ from quadid.types import FloatArray
 
 AXES = ("roll", "pitch", "yaw", "throttle")
 """Columns of a stick profile: roll, pitch [rad], yaw [rad], collective [fraction of hover thrust]."""
-KINDS = ("step", "pulse", "doublet", "3211", "sine", "chirp", "multisine", "noise")
+KINDS = ("step", "pulse", "doublet", "3211", "sine", "chirp", "sweep", "multisine", "noise")
+
+
+SWEEP_FADE = 1.0
+"""Time over which a sweep grows at its beginning, and fades at its end [s]."""
 
 
 @cache
@@ -117,12 +121,14 @@ class Segment:
 
     Attributes:
         axis: roll, pitch, yaw or throttle.
-        kind: step, pulse, doublet, 3211, sine, chirp, multisine, noise.
+        kind: step, pulse, doublet, 3211, sine, chirp, sweep, multisine, noise.  A sweep is that of ArduCopter's
+            SystemID mode: two swings of the lowest frequency, then exponentially to the highest; on yaw it is a rate.
         start: when it begins [s].
         duration: how long it lasts [s]; a step stays until then.
-        amplitude: roll, pitch, yaw angle [rad] or fraction of hover thrust; rms for noise and multisine.
-        frequency: of a sine, lowest of chirp, multisine and noise [Hz].
-        frequency_end: highest of chirp, multisine and noise [Hz].
+        amplitude: roll, pitch, yaw angle [rad] (sweep of yaw: rate [rad/s]) or fraction of hover thrust; rms for noise
+            and multisine.
+        frequency: of a sine, lowest of chirp, sweep, multisine and noise [Hz].
+        frequency_end: highest of chirp, sweep, multisine and noise [Hz].
     """
 
     axis: str
@@ -180,6 +186,9 @@ def _shape(segment: Segment, rng: np.random.Generator, t: FloatArray) -> FloatAr
         return np.asarray(np.sin(2.0 * np.pi * f0 * t))
     if segment.kind == "chirp":
         return np.asarray(np.sin(2.0 * np.pi * (f0 * t + 0.5 * (f1 - f0) * t * phase)))
+    if segment.kind == "sweep":
+        swing = _sweep(t, span, f0, f1)
+        return np.asarray(np.cumsum(swing) * PILOT_STEP) if segment.axis == "yaw" else swing
     if segment.kind == "noise":
         return band_noise(rng, len(t), f0, max(f1, 1.2 * f0), 1.0)
     lines = np.arange(np.ceil(f0 * span), np.floor(f1 * span) + 1) / span
@@ -189,6 +198,15 @@ def _shape(segment: Segment, rng: np.random.Generator, t: FloatArray) -> FloatAr
     k = np.arange(len(lines))
     angles = 2.0 * np.pi * np.outer(t, lines) - np.pi * k * (k + 1) / len(lines)
     return np.asarray(np.sin(angles).sum(axis=1) * np.sqrt(2.0 / len(lines)))
+
+
+def _sweep(t: FloatArray, span: float, low: float, high: float) -> FloatArray:
+    """An exponential sweep from `low` to `high` [Hz] over `span` [s], after two swings of the lowest frequency."""
+    steady = min(2.0 / low, 0.5 * span)
+    grown = np.log(high / low) * np.maximum(t - steady, 0.0) / (span - steady)
+    turns = low * np.where(grown > 0.0, (span - steady) * np.expm1(grown) / max(np.log(high / low), 1e-9), t - steady)
+    fade = np.clip(np.minimum(t, span - t) / SWEEP_FADE, 0.0, 1.0)
+    return np.asarray(np.sin(0.5 * np.pi * fade) ** 2 * np.sin(2.0 * np.pi * turns))
 
 
 def scripted(segments: Sequence[Segment], seed: int, n: int) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,14 @@ def excite_html(result: JsonDict, window: Window) -> str:
         window: the manoeuvre as flown in simulation.
     """
     gained = [
-        [p["name"], *(_percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre"))] for p in result["parameters"]
+        [p["name"], *(_percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time"))]
+        for p in result["parameters"]
     ]
-    moves = [
-        [m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items())]
+    each = [
+        (m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items()))
         for m in result["movements"]
     ]
+    moves = [[name, str(len(list(same))), size] for (name, size), same in groupby(each)]
     peak = result["peak"]
     return render({
         "title": f"What to fly next: {result['vehicle']}",
@@ -39,17 +42,40 @@ def excite_html(result: JsonDict, window: Window) -> str:
                 "title": "What it would gain",
                 "intro": "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
                 "figures": [_bars(result)],
-                "tables": [{"head": ["parameter", "now", "after a gentle flight", "after this one"], "rows": gained}],
+                "tables": [{
+                    "head": ["parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"], "rows": gained,
+                }],
             },
             {
                 "id": "manoeuvre",
                 "title": "The manoeuvre",
                 "intro": "Stick movements one after the other, and the attitude that the simulation flies.",
                 "figures": [_attitude(window)],
-                "tables": [{"head": ["movement", "amplitude, rms"], "rows": moves}],
+                "tables": [{"head": ["movement", "times", "amplitude, rms"], "rows": moves}],
+            },
+            {
+                "id": "envelope",
+                "title": "Where it may be flown",
+                "intro": "Scripts begin only inside the envelope, and end when they leave it.",
+                "figures": [],
+                "tables": [{"head": ["", "needed in simulation", "envelope"], "rows": _limits(result)}],
             },
         ],
     })  # fmt: skip
+
+
+def _limits(result: JsonDict) -> list[list[str]]:
+    room, e, peak = result["room"], result["envelope"], result["peak"]
+    return [
+        [
+            "height above take-off",
+            f"{room['up_m'] + room['down_m']:.1f} m",
+            f"{e['lowest_m']:g} to {e['highest_m']:g} m",
+        ],
+        ["distance from the start", f"{room['sideways_m']:.0f} m", f"{e['radius_m']:g} m"],
+        ["tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"],
+        ["battery", "–", f"{e['battery_percent']:g} % left"],
+    ]
 
 
 def _percent(half: float) -> str:

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.errors import ParameterError
+from quadid.errors import ParameterError, nearest
+from quadid.workflow.files import file_name, write_text
 from quadid.workflow.loading import as_vehicle
 from quadid.workflow.logs import Given, listed
 from quadid.workflow.progress import Advance, silent
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from quadid.experiment import Proposal
     from quadid.identify.noise_model import NoiseModel
+    from quadid.report.manoeuvres.plan import Plan
     from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
     from quadid.window import Window
 
 MOST_SECONDS = 600.0
+ABORT = 1.4
+"""Tilt beyond that of the simulation by which a script gives up: the vehicle is not the one that was simulated."""
+ROOM = 2.0
+"""Room around the start that a script allows, in that of the simulation, and at least `LEAST_ROOM`: wind blows."""
+LEAST_ROOM = 10.0
+HOVER_THROTTLE = 0.35
+"""Share of full throttle at hover where the vehicle file does not know: what ArduPilot begins with (MOT_THST_HOVER)."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +42,53 @@ class Proposed:
         result: of the form ``quadid.excite/1``; ``manoeuvre_file`` is None until it is written.
         proposal: the manoeuvre itself.
         text: of its file.
+        plan: what scripts and instructions are made from.
+        hover_throttle: share of full throttle at hover.
     """
 
     result: dict[str, Any]
     proposal: Proposal
     text: str
+    plan: Plan
+    hover_throttle: float
+
+    def save(self, folder: str | Path = ".", forms: Sequence[str] = ()) -> list[Path]:
+        """Writes the manoeuvre, and what flies it in each of `forms` (`quadid.report.manoeuvres.FORMS`).
+
+        Raises:
+            ParameterError: an unknown form.
+        """
+        from quadid.report.manoeuvres import written_as
+
+        texts = {".manoeuvre.yaml": self.text}
+        for form in forms:
+            texts |= written_as(self.plan, form, self.hover_throttle)
+        name = file_name(self.plan.vehicle)
+        return [write_text(Path(folder) / f"{name}{end}", text) for end, text in texts.items()]
 
 
-def check_limits(seconds: float, tilt: float, rate_limit: float) -> None:
+def check_forms(forms: Sequence[str]) -> None:
+    """Raises ParameterError for a form that is not written."""
+    from quadid.report.manoeuvres import FORMS
+
+    for form in forms:
+        if form not in FORMS:
+            raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
+
+
+def parse_height(text: str) -> tuple[float, float]:
+    """Reads ``10:40``, the lowest and highest height above take-off [m]; raises ParameterError for anything else."""
+    low, _, high = text.partition(":")
+    try:
+        heights = float(low), float(high)
+    except ValueError:
+        heights = (math.nan, math.nan)
+    if not 2.0 <= heights[0] < heights[1] <= 500.0:
+        raise ParameterError(f"--height {text}", "LOWEST:HIGHEST in m above take-off, 2 to 500", "for example 10:40")
+    return heights
+
+
+def check_limits(seconds: float, tilt: float, rate_limit: float, battery: float) -> None:
     """Raises ParameterError for a manoeuvre that nobody can fly."""
     if not 6.5 <= seconds <= MOST_SECONDS:
         raise ParameterError(f"--seconds {seconds:g}", f"6.5 to {MOST_SECONDS:g} s")
@@ -49,6 +96,8 @@ def check_limits(seconds: float, tilt: float, rate_limit: float) -> None:
         raise ParameterError(f"--tilt {tilt:g} degrees", "2 to 60 degrees")
     if not 10.0 <= rate_limit <= 1000.0:
         raise ParameterError(f"--rate-limit {rate_limit:g} deg/s", "10 to 1000 deg/s")
+    if not 0.0 <= battery < 100.0:
+        raise ParameterError(f"--battery {battery:g} %", "0 to 99 per cent")
 
 
 def knowledge(
@@ -71,7 +120,8 @@ def knowledge(
 
 def propose(
     logs: Given = (), *, vehicle: str | Path | Vehicle = "pelican", seconds: float = 60.0, tilt: float = 25.0,
-    rate_limit: float = 150.0, seed: int = 1, advance: Advance = silent,
+    rate_limit: float = 150.0, height: tuple[float, float] = (10.0, 40.0), battery: float = 40.0, seed: int = 1,
+    advance: Advance = silent,
 ) -> Proposed:  # fmt: skip
     """Proposes the manoeuvre that shrinks the intervals most, within tilt and rate limits.
 
@@ -81,6 +131,8 @@ def propose(
         seconds: length of the manoeuvre [s].
         tilt: largest tilt [degrees].
         rate_limit: largest body rate [degrees/s].
+        height: lowest and highest above take-off [m].
+        battery: what must remain [per cent].
         seed: of all random numbers.
         advance: told how far it is.
 
@@ -91,24 +143,58 @@ def propose(
     from quadid.experiment import Limits, Simulator, manoeuvre_file
     from quadid.experiment import propose as chosen
 
-    check_limits(seconds, tilt, rate_limit)
+    check_limits(seconds, tilt, rate_limit, battery)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
     given = [log.of(vehicle) for log in listed(logs)]
     windows = [w for log in given for w in log.windows]
     believed, known, noise = knowledge(as_vehicle(vehicle), windows, seed, advance)
     proposal = chosen(Simulator(believed, noise, seed), known, limits, seconds, advance)
+    plan = _plan(believed.name, proposal, tilt, height, battery)
     result = {
         **_result(believed.name, proposal, tilt, rate_limit),
+        "envelope": dict(plan.envelope),
         "manoeuvre_file": None,
+        "files": [],
         "logs": [str(log.path) for log in given],
     }
-    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal))
+    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, _hover_throttle(believed))
+
+
+def _plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
+    """The manoeuvre with its envelope; raises ParameterError where it needs more height than there is."""
+    from quadid.parameters import NOMINAL_NAMES
+    from quadid.report.manoeuvres.plan import Plan
+
+    sideways, up, down = proposal.room.tolist()
+    if up + down > height[1] - height[0]:
+        raise ParameterError(
+            f"--height {height[0]:g}:{height[1]:g}", f"at least {up + down:.0f} m, which the manoeuvre needs",
+            "a wider --height, or a smaller --tilt",
+        )  # fmt: skip
+    envelope = {
+        "lowest_m": height[0], "highest_m": height[1], "radius_m": float(math.ceil(max(ROOM * sideways, LEAST_ROOM))),
+        "tilt_deg": tilt, "abort_tilt_deg": round(ABORT * math.degrees(proposal.peak.tilt), 1),
+        "battery_percent": battery,
+    }  # fmt: skip
+    promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
+    segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
+    return Plan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
+
+
+def _hover_throttle(vehicle: Vehicle) -> float:
+    """Share of full thrust that hovers."""
+    from quadid.vehicle import GRAVITY
+
+    full = vehicle.command.max_speed
+    if full is None:
+        return HOVER_THROTTLE
+    return vehicle.mass * GRAVITY / (len(vehicle.rotors) * vehicle.parameters["b"].initial * full**2)
 
 
 def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) -> dict[str, Any]:
     from quadid.parameters import NOMINAL_NAMES
 
-    rows = zip(NOMINAL_NAMES, proposal.now, proposal.pilot, proposal.after, strict=True)
+    rows = zip(NOMINAL_NAMES, proposal.now, proposal.pilot, proposal.after, proposal.swept, strict=True)
     worst = int(np.argmax(proposal.pilot))
     return {
         "schema": "quadid.excite/1",
@@ -119,8 +205,16 @@ def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) ->
         "movements": [
             {"name": m.name, "amplitudes": {s.axis: s.amplitude for s in m.segments}} for m in proposal.movements
         ],
+        "room": dict(zip(("sideways_m", "up_m", "down_m"), proposal.room.tolist(), strict=True)),
         "parameters": [
-            {"name": n, "now": float(a), "gentle_flight": float(b), "manoeuvre": float(c)} for n, a, b, c in rows
+            {
+                "name": n,
+                "now": float(a),
+                "gentle_flight": float(b),
+                "manoeuvre": float(c),
+                "one_axis_at_a_time": float(d),
+            }
+            for n, a, b, c, d in rows
         ],
         "worst": NOMINAL_NAMES[worst],
         "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),

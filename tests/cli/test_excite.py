@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +45,7 @@ def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path
     run = inside("excite", "--vehicle", "hexacopter", "--seconds", "13", "--out", tmp_path, "--json", "-")
     assert run.code == 0, run.err
     assert len(run.data["movements"]) == 2
+    assert run.data["room"]["up_m"] + run.data["room"]["down_m"] < 30.0
     axes = {axis for m in run.data["movements"] for axis in m["amplitudes"]}
     assert {"roll", "pitch", "yaw"} <= axes
     assert np.isfinite(run.data["gain"])
@@ -50,8 +53,48 @@ def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--seconds", "1"), ("--seconds", "nan"), ("--tilt", "0"), ("--tilt", "90"), ("--rate-limit", "5")]
-)
+    "arguments",
+    [
+        ("--seconds", "1"), ("--seconds", "nan"), ("--tilt", "0"), ("--tilt", "90"), ("--rate-limit", "5"),
+        ("--height", "40:10"), ("--height", "low"), ("--battery", "120"), ("--format", "lua"),
+    ],
+)  # fmt: skip
 def test_limits_that_nobody_can_fly(inside: Cli, tmp_path: Path, arguments: tuple[str, str]) -> None:
     line = one_line(inside("excite", "--vehicle", "pelican", "--out", tmp_path, *arguments), 2)
     assert arguments[0] in line
+
+
+def test_alike_movements_stand_together_and_every_form_is_written(inside: Cli, tmp_path: Path) -> None:
+    forms = ("ardupilot-lua", "ardupilot-sid", "px4", "sticks")
+    run = inside(
+        "excite", "--vehicle", "pelican", "--seconds", "45", "--height", "15:35", "--battery", "55",
+        "--out", tmp_path, *(part for form in forms for part in ("--format", form)), "--json", tmp_path / "r.json",
+    )  # fmt: skip
+    assert run.code == 0, run.err
+    result = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    names = [m["name"] for m in result["movements"]]
+    assert sum(a != b for a, b in pairwise(names)) == len(set(names)) - 1
+    counts = [names.count(name) for name in dict.fromkeys(names)]
+    assert counts == sorted(counts, reverse=True)
+    assert run.out.count(names[0]) == 1
+    envelope = result["envelope"]
+    assert (envelope["lowest_m"], envelope["highest_m"], envelope["battery_percent"]) == (15.0, 35.0, 55.0)
+    assert envelope["radius_m"] >= 2.0 * result["room"]["sideways_m"]
+    assert envelope["abort_tilt_deg"] == pytest.approx(1.4 * result["peak"]["tilt_deg"], abs=0.1)
+    # All axes together tell more than one at a time, and only together what needs two.
+    for p in result["parameters"]:
+        assert p["manoeuvre"] <= 1.05 * p["one_axis_at_a_time"], p["name"]
+    axes = ("roll", "pitch", "yaw", "throttle")
+    ends = [".lua", *(f"sid_{i}_{axis}.param" for i, axis in enumerate(axes, 1)), ".py", ".txt"]
+    assert len(result["files"]) == len(ends)
+    for path, end in zip(result["files"], ends, strict=True):
+        assert path.endswith(end)
+        assert "15 to 35 m" in Path(path).read_text(encoding="utf-8")
+    compile(Path(result["files"][5]).read_text(encoding="utf-8"), "fly.py", "exec")
+
+
+def test_too_little_height_or_time_is_refused(inside: Cli, tmp_path: Path) -> None:
+    short = ("excite", "--vehicle", "pelican", "--seconds", "13", "--out", tmp_path)
+    assert "which the manoeuvre needs" in one_line(inside(*short, "--height", "10:10.05"), 2)
+    # Four sweeps do not fit into so short a time.
+    assert "--seconds" in one_line(inside(*short, "--format", "ardupilot-sid"), 2)
