@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.model.thrust import ThrustModel
 from quadid.resample import moving_mean, sample_period
 from quadid.rotor_signal import rotor_channel
 from quadid.types import BoolArray, FloatArray
@@ -29,8 +30,8 @@ _SHORTEST, _BRIDGE = 1.0, 0.5
 def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
     """Returns the spans [s] in which the vehicle flies; empty when nothing tells.
 
-    Thrust is taken to grow with the square of rotor speed (or command); hover is the vehicle's weight where rotor
-    speeds and a vehicle are known, else the median of the powered part of the log.  A flying vehicle also feels its
+    Thrust and weight are those of the vehicle file where rotor speeds and a vehicle are known; else thrust grows with
+    the square of the command, and hover is the median of the powered part of the log.  A flying vehicle also feels its
     thrust: where the accelerometer does not point along its usual direction for half a second, it lies somewhere.
     """
     channels = recording.channels
@@ -80,13 +81,12 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
     thrust = np.asarray(np.sum(values**2, axis=1))
     if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
         return thrust, 0.0
-    if channel.name == "rotor_speed" and vehicle is not None:
-        b = vehicle.parameters["b"].initial
+    if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
         low, high = vehicle.parameters["b"].limits
-        hover = float(vehicle.mass * GRAVITY / b)
-        typical = float(np.median(thrust[thrust > 0.25 * np.max(thrust)]))
+        modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
+        typical = float(np.median(modelled[modelled >= 0.25 * np.max(modelled)]))
         if low / high < typical / hover < high / low:
-            return thrust, hover
+            return modelled, hover
     powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
     return thrust, float(np.median(powered)) if len(powered) else 0.0
 

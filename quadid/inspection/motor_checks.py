@@ -10,6 +10,7 @@ from quadid.errors import QuadidError
 from quadid.grid import to_windows
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
+from quadid.model.thrust import ThrustModel
 from quadid.resample import moving_mean
 from quadid.rotor_signal import rotor_signal
 from quadid.types import FloatArray
@@ -30,7 +31,7 @@ _MOST_ROTORS = 6
 
 
 def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
-    """Thrust of the initial guess against weight in flight; tells rpm and rev/s from rad/s."""
+    """Thrust by the vehicle file, its effects included, against weight in flight; tells rpm and rev/s from rad/s."""
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
@@ -38,10 +39,11 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     inside = np.any([(signal.t >= a) & (signal.t <= b) for a, b in spans], axis=0) if spans else None
     if inside is None or not inside.any():
         return Check("hover", Verdict.UNKNOWN, "the vehicle does not fly in this log, as far as the rotors tell")
-    square = float(np.mean(np.sum(signal.values[inside] ** 2, axis=1)))
-    needed = vehicle.mass * GRAVITY / square
-    low, high = vehicle.parameters["b"].limits
-    speed = float(np.sqrt(square / len(vehicle.rotors)))
+    speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
+    guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))
+    needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
+    low, high = guess.limits
+    speed = float(np.sqrt(np.mean(speeds**2)))
     numbers = {"b_from_hover": needed, "speed_rad_s": speed}
     message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
     if low <= needed <= high:
@@ -56,8 +58,18 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     return Check("hover", Verdict.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
 
 
+def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
+    """Factor on the speeds at times `t` [s] by the supply voltage, shape (n, 1) or (1,); 1 where none is known."""
+    exponent = vehicle.effects.get("supply_voltage", {}).get("exponent", 0.0)
+    battery = recording.channels.get("battery")
+    if not exponent or battery is None:
+        return np.ones(1)
+    volts = np.interp(t, battery.t, battery.values[:, 0])
+    return np.asarray((volts / (vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
+
+
 Lagged = list[tuple[FloatArray, FloatArray]]
-"""Squared rotor speeds (n, rotors) and angular acceleration (n, 3), for each lag of the motors."""
+"""Thrust over b (n, rotors) and angular acceleration (n, 3), for each lag of the motors."""
 
 
 def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
@@ -66,7 +78,7 @@ def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
-    """Squared rotor speeds (n, rotors) and angular acceleration (n, 3) in flight, slow parts left out.
+    """Thrust over b by the vehicle file (n, rotors) and angular acceleration (n, 3) in flight, slow parts left out.
 
     One pair for each lag of 0, 1, 2 … rows by which the motors may answer late; or why there is none.
     """
@@ -80,19 +92,20 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
     rate = 1.0 / float(np.median(np.diff(signal.t)))
     if rate < _LEAST_RATE:
         return f"rotor signal at {rate:.3g} Hz is too slow to tell the motor order"
-    lagged = [_quick_motion(windows, lag) for lag in range(_LAGS)]
+    thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
+    acted = [thrust.single(w.rotor_speed) / b for w in windows]
+    lagged = [_quick_motion(windows, acted, lag) for lag in range(_LAGS)]
     return lagged if len(lagged[0][0]) >= 100 else "too little flight to tell the motor order"
 
 
-def _quick_motion(windows: list[Window], lag: int) -> tuple[FloatArray, FloatArray]:
-    """Returns squared rotor speeds `lag` rows earlier (n, rotors) and angular acceleration (n, 3), no slow parts."""
+def _quick_motion(windows: list[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
+    """Returns thrust over b `lag` rows earlier (n, rotors) and angular acceleration (n, 3), no slow parts."""
     width = max(3, round(_SLOW_MOTION * _RATE))
     squares, gains = [], []
-    for w in windows:
+    for w, acted in zip(windows, thrust, strict=True):
         if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
             continue
         # The change over two steps against what acted in between: the row itself and its neighbours' halves.
-        acted = w.rotor_speed**2
         acted = (
             0.5 * (acted[:-2] + acted[1:-1])
             if w.sampling == "held"

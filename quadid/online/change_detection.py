@@ -4,6 +4,10 @@ Every half second gives three numbers that need no fit: the specific force per s
 b / m), and the roll and pitch acceleration that the rotors do not explain.  A step in one of them is found by comparing
 means before and after every moment of the last seconds (generalised likelihood ratio for a step in a mean of unknown
 time: Basseville and Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 2.4).
+
+All three also change with how the vehicle flies: thrust with rotor speed (thrust curve), climb (inflow, drag) and
+sideways speed, moments with what is commanded (b / J is not known exactly), rate and sideways speed.  A step is what
+these do not explain (`quadid.online.flight_state`).
 """
 
 from __future__ import annotations
@@ -13,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quadid.online.flight_state import FlightState, Velocity, step_beside
 from quadid.online.resampler import Rows
-from quadid.resample import median
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 
@@ -28,9 +32,10 @@ AFTER = 3
 """Chunks after a change before it is believed."""
 SIGNIFICANT = 7.0
 """Standard errors by which the means must differ."""
-LEAST = np.array([0.03, 0.03, 0.03])
+LEAST = 0.03
 """Smallest step worth a word: share of thrust; roll and pitch moment over what losing half the thrust would give."""
 CHANNELS = ("thrust", "roll moment", "pitch moment")
+_Series = tuple[FloatArray, FloatArray, FloatArray]  # values, regressors, typical sizes of their coefficients
 
 
 @dataclass(frozen=True)
@@ -52,13 +57,16 @@ class Change:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Sums over one chunk: time of its middle [s], log thrust per weight, change of rates, moments of omega^2."""
+    """Means over one chunk: time [s], log thrust per squared speed, its regressors; by roll and pitch the rest."""
 
     t: float
     thrust: float
+    state: FloatArray
     acceleration: FloatArray
     moment: FloatArray
     gyroscopic: FloatArray
+    rate: FloatArray
+    across: FloatArray
 
 
 class ChangeDetector:
@@ -69,11 +77,14 @@ class ChangeDetector:
         self._vehicle = vehicle
         position = vehicle.rotor_positions
         self._arms = np.column_stack([-position[:, 1], position[:, 0]])
+        self._state = FlightState(vehicle)
+        self._velocity = Velocity()
         self._chunks: deque[_Chunk] = deque(maxlen=round((BASELINE + LOOK_BACK) / CHUNK))
 
     def restart(self) -> None:
         """Forgets the past: a change was dealt with, or the flight was interrupted."""
         self._chunks.clear()
+        self._velocity = Velocity()
 
     def add(self, rows: Rows | None) -> None:
         """Takes the rows of one chunk; an incomplete one restarts the watch."""
@@ -87,7 +98,8 @@ class ChangeDetector:
         gyro, accel = rows.columns.get("gyro"), rows.columns.get("accel")
         if gyro is None or accel is None or rows.fresh:
             return None
-        square = rows.columns["rotor_speed"] ** 2
+        speed = rows.columns["rotor_speed"]
+        square, velocity = speed**2, self._velocity.body(rows)
         step = float(rows.t[1] - rows.t[0]) if len(rows.t) > 1 else 0.0
         if len(rows.t) < 4 or abs(step * len(rows.t) - CHUNK) > 1.5 * step:
             return None
@@ -106,55 +118,47 @@ class ChangeDetector:
         weight /= weight.sum()
         moment = weight @ np.where(good[:, None], square @ self._arms, 0.0)
         p, q, r = gyro[rate].T
+        state = self._state.thrust(speed[good], velocity[good], lift)
         return _Chunk(
-            float(rows.t.mean()), float(np.log(lift / total)), np.asarray(slope), np.asarray(moment),
-            np.array([np.mean(q * r), np.mean(p * r)]),
+            float(rows.t.mean()), float(np.log(lift / total)), state, np.asarray(slope), np.asarray(moment),
+            np.array([np.mean(q * r), np.mean(p * r)]), gyro[rate, :2].mean(axis=0), velocity[:, 1::-1].mean(axis=0),
         )  # fmt: skip
 
-    def look(self, b: float, inertia: FloatArray) -> Change | None:
+    def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> Change | None:
         """The strongest significant step of the last seconds, or None.
 
         Args:
             b: thrust coefficient [N s^2/rad^2].
             inertia: J_xx, J_yy, J_zz [kg m^2].
+            doubt: standard deviations of log(b / J_xx) and log(b / J_yy); None: nothing is known of them, and moments
+                are not judged.
         """
         if len(self._chunks) < BASELINE / 5.0 / CHUNK + AFTER:
             return None
         t = np.array([c.t for c in self._chunks])
-        series = self._series(b, inertia)
+        seen = [self._thrust()]
+        if doubt is not None:
+            seen += [self._moment(axis, b, inertia, float(doubt[axis])) for axis in (0, 1)]
         first = max(len(t) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
         best: Change | None = None
         for split in range(first, len(t) - AFTER + 1):
-            for c, name in enumerate(CHANNELS):
-                errors, size = _step(series[:split, c], series[split:, c], LEAST[c])
+            for name, (y, x, typical) in zip(CHANNELS, seen, strict=False):
+                errors, size = step_beside(y, x, typical, split, LEAST)
                 if errors > SIGNIFICANT and (best is None or errors > best.errors):
                     best = Change(float(t[split]) - 0.5 * CHUNK, name, size, errors)
         return best
 
-    def _series(self, b: float, inertia: FloatArray) -> FloatArray:
-        """Thrust per weight (log), and roll and pitch moments that the rotors do not explain, shape (chunks, 3)."""
-        j = np.asarray(inertia)
-        couple = np.array([(j[2] - j[1]) / j[0], (j[0] - j[2]) / j[1]])
-        hover = b * self._vehicle.hover_speed(b) ** 2
-        half = np.abs(self._arms).sum(axis=0) * 0.25 * hover / j[:2]
-        rows = []
-        for c in self._chunks:
-            left = c.acceleration + couple * c.gyroscopic - b * c.moment / j[:2]
-            rows.append([c.thrust, *(left / half)])
-        return np.array(rows)
+    def _thrust(self) -> _Series:
+        y, x = np.array([c.thrust for c in self._chunks]), np.array([c.state for c in self._chunks])
+        return y, x, self._state.typical
 
-
-def _step(before: FloatArray, after: FloatArray, least: float) -> tuple[float, float]:
-    """Size of a step in standard errors, and the step; every value after it must lie on the same side.
-
-    A step smaller than `least` counts as none.
-    """
-    level = median(before)
-    size = median(after) - level
-    if abs(size) < least:
-        return 0.0, size
-    spread = max(1.4826 * median(np.abs(before - level)), 1e-6)
-    if not np.all(np.sign(size) * (after - level) > 2.0 * spread):
-        return 0.0, size
-    error = 1.25 * spread * np.sqrt(1.0 / len(after) + 1.0 / len(before))
-    return abs(size) / float(error), size
+    def _moment(self, axis: int, b: float, inertia: FloatArray, doubt: float) -> _Series:
+        """Roll (0) or pitch (1) acceleration that the rotors do not explain, over half the hover moment of one side."""
+        j = inertia[axis]
+        couple = (inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j
+        half = float(np.abs(self._arms[:, axis]).sum()) * 0.25 * b * self._vehicle.hover_speed(b) ** 2 / j
+        chunks = self._chunks
+        moment = b / j * np.array([c.moment[axis] for c in chunks])
+        y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
+        x = np.column_stack([moment, [c.rate[axis] for c in chunks], [c.across[axis] / j for c in chunks]])
+        return y / half, x / half, np.array([doubt, *self._state.typical_moment])

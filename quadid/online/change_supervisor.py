@@ -11,6 +11,7 @@ import numpy as np
 from quadid.online.change_detection import CHUNK, Change, ChangeDetector
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.fusion import DRIFT
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.quality import Quality, judge
 from quadid.online.records import OnlineFinding
@@ -63,7 +64,8 @@ class ChangeSupervisor:
             return None
         yield
         inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
-        change = self._detector.look(estimator.value("b"), inertia)
+        doubt = np.hypot(DRIFT, estimator.torque_sigma) if estimator.learned else None
+        change = self._detector.look(estimator.value("b"), inertia, doubt)
         if change is None:
             return None
         self.seen = Seen(change, self._store.onset(change.time) if change.channel == "thrust" else change.time)

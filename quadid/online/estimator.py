@@ -12,9 +12,9 @@ from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.layout import B, Layout
+from quadid.model.thrust import ThrustModel
 from quadid.online.fusion import DRIFT, Fused, Fusion, WindowEstimate
 from quadid.online.gate import Case
-from quadid.online.model_vehicle import ThrustModel
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
@@ -109,6 +109,11 @@ class Estimator:
         """Standard deviations of the nominal six, log scale; the prior's before anything was learned."""
         fused = self.fusion.estimate()
         return self._prior_sigma if fused is None else fused.sigma
+
+    @property
+    def torque_sigma(self) -> FloatArray:
+        """Standard deviations of log(b / J_xx) and log(b / J_yy)."""
+        return np.asarray(np.hypot(self.z_sigma[0], self.z_sigma[2:4]))
 
     @property
     def mass(self) -> float:

@@ -24,8 +24,8 @@ from quadid.identify.priors import Prior, prior_terms
 from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import B, Layout
+from quadid.model.thrust import ThrustModel
 from quadid.online.fusion import WindowEstimate
-from quadid.online.model_vehicle import ThrustModel
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

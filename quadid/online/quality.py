@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.online.model_vehicle import ThrustModel
+from quadid.model.thrust import ThrustModel
 from quadid.resample import median
 from quadid.saturation import at_limit
 from quadid.turning import turn

@@ -24,9 +24,9 @@ def watched(seconds: float, seed: int, profile: str, effects: Effects = ()) -> l
     window, truth, monitor, seen = made.window, made.truth.parameters, ChangeDetector(PELICAN), []
     inertia = 1.1 * np.array([truth.J_xx, truth.J_yy, truth.J_zz])  # known to 10 % only
     for k in range(0, len(window) - 25, 25):
-        columns = {n: getattr(window, n)[k : k + 25] for n in ("rotor_speed", "gyro", "accel")}
+        columns = {n: getattr(window, n)[k : k + 25] for n in ("rotor_speed", "gyro", "accel", "attitude")}
         monitor.add(Rows(window.t[k : k + 25], columns, "held", ""))
-        change = monitor.look(0.95 * truth.b, inertia)
+        change = monitor.look(0.95 * truth.b, inertia, np.full(2, 0.1))
         if change is not None:
             seen.append((float(window.t[k + 24]), change))
             monitor.restart()

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from quadid.model.layout import Layout
+from quadid.model.thrust import ThrustModel
 from quadid.online import Session, SessionSettings
-from quadid.online.model_vehicle import ThrustModel, moved
+from quadid.online.model_vehicle import moved
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.online.driving import drive, events, flight, published, samples
 from tests.online.test_gate import TRUE

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.model.layout import Layout
-from quadid.online.model_vehicle import ThrustModel
+from quadid.model.thrust import ThrustModel
 from quadid.online.quality import Quality, judge
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window

@@ -148,6 +148,26 @@ def known(vehicle: Vehicle, mass: float = 1.0, arm: float = 1.0, turn: float = 0
     return Vehicle.model_validate(data)
 
 
+@pytest.mark.parametrize("effect", ["thrust_curve", "supply_voltage"])
+def test_the_vehicle_is_weighed_by_its_whole_model(clean: Recording, effect: str) -> None:
+    """Speeds that thrust is no square of: its own curve, or commands on a battery that empties."""
+    t = clean.channels["rotor_speed"].t
+    volts = np.linspace(12.6, 9.0, len(t))[:, None]
+    if effect == "thrust_curve":
+        flown = changed(clean, "rotor_speed", lambda v: v - 60.0)
+        numbers = {"dead_speed": -60.0}
+    else:
+        flown = changed(clean, "rotor_speed", lambda v: v * (12.6 / volts) ** 0.8)
+        flown = replace(flown, channels={**flown.channels, "battery": Channel("battery", t, volts)})
+        numbers = {"exponent": 0.8}
+    vehicle = known(PELICAN).model_copy(update={"reference_voltage": 12.6})
+    whole = vehicle.model_copy(update={"effects": {effect: numbers}})
+    found = check(inspect(flown, whole), "mass")
+    assert found.verdict is Verdict.OK
+    assert found.numbers["mass_kg"] == pytest.approx(PELICAN.mass, rel=0.03)
+    assert check(inspect(flown, vehicle), "mass").verdict is Verdict.WARNING, "by b omega^2 alone it would weigh less"
+
+
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_wrong_mass_is_named_with_the_factor_where_thrust_is_known(
     clean: Recording, factor: float, happened: Happened

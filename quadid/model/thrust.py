@@ -1,0 +1,52 @@
+"""Thrust of the rotors by a full parameter vector."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quadid.model.layout import LOSS, Layout
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+
+class ThrustModel:
+    """Thrust of the rotors by a full parameter vector: thrust curve and weak rotors included, inflow left out."""
+
+    def __init__(self, layout: Layout, theta: FloatArray) -> None:
+        """Thrust by `theta`, shape (layout.size,)."""
+        curve = layout.read_effect(theta, "thrust_curve")
+        self._b, self._dead_speed = float(theta[0]), curve["dead_speed"]
+        self._offset = curve.get("offset", 0.0)
+        self._share = 1.0 - theta[LOSS : LOSS + layout.rotors]
+
+    @classmethod
+    def stated(cls, vehicle: Vehicle) -> ThrustModel:
+        """Thrust by the vehicle file's guess and known effects."""
+        layout = Layout(vehicle)
+        return cls(layout, layout.initial(vehicle))
+
+    def single(self, rotor_speed: FloatArray) -> FloatArray:
+        """Thrust of each rotor [N], shape (n, rotors), of speeds [rad/s], shape (n, rotors)."""
+        thrust = self._b * np.maximum(rotor_speed - self._dead_speed, 0.0) ** 2 + self._offset
+        return np.asarray(np.where(rotor_speed > 0.0, thrust, 0.0) * self._share)
+
+    def total(self, rotor_speed: FloatArray) -> FloatArray:
+        """Sum over the rotors [N], shape (n,), of speeds [rad/s], shape (n, rotors)."""
+        return np.asarray(self.single(rotor_speed).sum(axis=1))
+
+    def secant(self, weight: float) -> float:
+        """Share of `b` that a model without the curve has: exact where the rotors carry `weight` [N]."""
+        each = self._each(weight)
+        hover = self._dead_speed + math.sqrt(max(each - self._offset, 1e-9) / self._b)
+        return each / (self._b * hover**2)
+
+    def tangent(self, secant: float, weight: float) -> float:
+        """The `b` of this curve whose b at hover is `secant` [N s^2/rad^2]."""
+        each = self._each(weight)
+        beyond = max(math.sqrt(each / secant) - self._dead_speed, 1e-9)
+        return max(each - self._offset, 1e-9) / beyond**2
+
+    def _each(self, weight: float) -> float:
+        return weight / max(float(self._share.sum()), 1e-9)

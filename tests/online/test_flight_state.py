@@ -1,0 +1,135 @@
+"""A change of flight state is no change of the vehicle: regressors, velocity, and flights of a real autopilot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from quadid_node.playback import stream
+from quadid_replay import open_log
+
+from quadid.online.change_supervisor import ChangeSupervisor, Seen
+from quadid.online.estimator import Estimator
+from quadid.online.flight_state import Velocity, step_beside
+from quadid.online.grid_buffer import GridBuffer
+from quadid.online.resampler import Resampler, Rows
+from quadid.turning import conjugate, rotated
+from quadid.vehicle import GRAVITY, Vehicle
+
+FloatArray = NDArray[np.float64]
+RATE = 50.0
+
+
+def rows_of(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
+    """Rows of the grid of the session, with a known attitude all along."""
+    resampler = Resampler(vehicle, RATE)
+    for count, sample in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
+        resampler.push(sample)
+        while count % 200 == 0 and resampler.busy:
+            if (rows := resampler.work()) is not None:
+                yield rows
+
+
+def steps(log: Path, vehicle: Vehicle, scale: float = 1.0, at: float = np.inf) -> list[tuple[float, str, float]]:
+    """What is seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
+    store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
+    supervisor, seen, first, tick = ChangeSupervisor(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
+    for rows in rows_of(log, vehicle):
+        if rows.fresh:
+            first, tick = float(rows.t[0]), np.floor(rows.t[0] + 1.0)
+        rows.columns["rotor_speed"][rows.t - first > at] /= np.sqrt(scale)
+        store.add(rows)
+        while rows.t[-1] >= tick:
+            found = _last(supervisor.look(tick, 1.0, estimator))
+            if found is not None:
+                seen.append((tick - first, found.change.channel, found.change.size))
+                supervisor.restart()
+            tick += 1.0
+    return seen
+
+
+def _last(work: Iterator[None]) -> Seen | None:
+    try:
+        while True:
+            next(work)
+    except StopIteration as done:
+        return done.value  # type: ignore[no-any-return]
+
+
+FLIGHTS = [
+    ("x.bin", "sitl_x.yaml"),
+    ("x.tlog", "sitl_x.yaml"),
+    ("quad_sq.bin", "quad_sq.yaml"),
+    ("quad_sq.tlog", "quad_sq.yaml"),
+    ("quad_sq_pwm.tlog", "quad_sq_pwm.yaml"),
+    ("x_zero_rpm.tlog", "sitl_x_pwm.yaml"),
+]
+
+
+@pytest.mark.parametrize(("log", "file"), FLIGHTS)
+def test_take_off_climbs_manoeuvres_descents_and_landing_are_no_change(log: str, file: str, data_dir: Path) -> None:
+    folder = data_dir / "ardupilot_sitl"
+    assert steps(folder / log, Vehicle.from_yaml((folder / file).read_text())) == []
+
+
+@pytest.mark.parametrize("scale", [1.0 / 1.15, 1.0 / 0.85, 0.9])
+def test_in_the_same_flight_a_real_step_is_seen(scale: float, data_dir: Path) -> None:
+    folder = data_dir / "ardupilot_sitl"
+    seen = steps(folder / "x.bin", Vehicle.from_yaml((folder / "sitl_x.yaml").read_text()), scale, 120.0)
+    (when, channel, size), *others = seen
+    assert not others
+    assert channel == "thrust"
+    assert 120.0 < when < 123.5
+    assert size == pytest.approx(np.log(scale), abs=0.05)
+
+
+def moving(seconds: float, velocity: bool) -> tuple[Rows, FloatArray]:
+    """A tilted, turning vehicle that gathers speed: rows, and its velocity in body axes."""
+    t = np.arange(0.0, seconds, 1.0 / RATE)
+    q = np.column_stack([np.cos(0.1 * t), 0.2 * np.sin(0.1 * t), 0.1 * np.sin(0.1 * t), np.sin(0.1 * t)])
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    world = np.column_stack([np.sin(t), 0.5 * t, -1.0 + np.cos(t)])
+    gained = np.column_stack([np.cos(t), np.full_like(t, 0.5), -np.sin(t)])
+    columns = {"attitude": q, "accel": rotated(conjugate(q), gained - [0.0, 0.0, GRAVITY])}
+    if velocity:
+        columns["velocity"] = np.where(np.arange(len(t))[:, None] % 10 == 0, world, np.nan)
+    return Rows(t, columns, "held", ""), rotated(conjugate(q), world)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_velocity_is_measured_or_integrated(measured: bool) -> None:
+    rows, truth = moving(3.0, measured)
+    np.testing.assert_allclose(Velocity().body(rows), truth, atol=0.02)
+
+
+def test_without_attitude_velocity_is_not_known() -> None:
+    rows, _ = moving(1.0, False)
+    blind = Rows(rows.t, {"accel": rows.columns["accel"]}, "held", "")
+    assert not Velocity().body(blind).any()
+
+
+def test_a_step_that_a_regressor_explains_is_none_and_its_doubt_counts() -> None:
+    rng = np.random.default_rng(1)
+    x = np.concatenate([rng.normal(0.0, 0.02, 60), rng.normal(0.4, 0.02, 8)])[:, None]
+    y = 0.25 * x[:, 0] + rng.normal(0.0, 0.002, 68)
+    sized = np.array([0.3])
+    assert step_beside(y, x, sized, 60, 0.03)[0] < 3.0
+    assert step_beside(y, np.zeros_like(x), sized, 60, 0.03)[0] > 7.0, "without the regressor it is a step"
+    errors, size = step_beside(y - 0.2 * (np.arange(68) >= 60), x, sized, 60, 0.03)
+    assert errors < 7.0, "the coefficient may be that much off"
+    assert size == pytest.approx(-0.2, abs=0.1)
+
+
+def test_what_lasts_in_the_past_is_no_step_now() -> None:
+    rng = np.random.default_rng(2)
+    walk = np.convolve(rng.normal(0.0, 0.03, 91), np.ones(8) / 2.0, "valid")
+    white = rng.permutation(walk)
+    nothing = np.zeros((84, 0))
+    for y in (walk, white):
+        y[80:] = np.median(y[:80]) + 2.2 * 1.4826 * np.median(np.abs(y[:80] - np.median(y[:80])))
+    lasting, _ = step_beside(walk, nothing, np.zeros(0), 80, 0.03)
+    fresh, _ = step_beside(white, nothing, np.zeros(0), 80, 0.03)
+    assert lasting < 0.8 * fresh
