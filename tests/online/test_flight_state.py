@@ -113,7 +113,7 @@ def test_without_attitude_velocity_is_not_known() -> None:
 
 def test_a_step_that_a_regressor_explains_is_none_and_its_doubt_counts() -> None:
     rng = np.random.default_rng(1)
-    x = np.concatenate([rng.normal(0.0, 0.02, 60), rng.normal(0.4, 0.02, 8)])[:, None]
+    x = np.concatenate([rng.normal(0.0, 0.004, 60), rng.normal(0.4, 0.02, 8)])[:, None]
     y = 0.25 * x[:, 0] + rng.normal(0.0, 0.002, 68)
     sized = np.array([0.3])
     assert step_beside(y, x, sized, 60, 0.03)[0] < 3.0
