@@ -125,6 +125,7 @@ class Recording:
         grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
         epoch: UNIX time of its time 0 [s]; None where its clock has no date.
+        modes: when the autopilot entered a flight mode [s], and its name; empty where the log does not say.
     """
 
     name: str
@@ -136,6 +137,7 @@ class Recording:
     grid: float | None = None
     autopilot: Mapping[str, float] = field(default_factory=dict)
     epoch: float | None = None
+    modes: tuple[tuple[float, str], ...] = ()
 
 
 @dataclass(frozen=True)

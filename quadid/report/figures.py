@@ -256,7 +256,7 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
     edge = {"type": "line", "x0": floor, "x1": floor, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
     layout = {
         "xaxis": {
-            "title": {"text": f"error of {finding['gain']['seconds']:g} s runs on unseen data (noise = 1)"},
+            "title": {"text": f"error, {finding['gain']['seconds']:g} s runs (noise = 1)"},
             "range": [0.0, 1.05 * highest],
         },
         "yaxis": {"type": "category"},

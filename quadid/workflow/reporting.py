@@ -28,6 +28,8 @@ _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 def identify_html(done: Identified, command: str = LIBRARY) -> str:
     """The HTML report of an identification."""
+    from quadid.report.figures import MOST_LOGS
+    from quadid.report.flight_part import flight_section
     from quadid.report.identify_page import correlation_section, identify_page
     from quadid.report.page import render
 
@@ -42,7 +44,8 @@ def identify_html(done: Identified, command: str = LIBRARY) -> str:
         {"name": "taken as known", "value": known(fit.vehicle)},
     ]
     page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows)
-    page["sections"] = [correlation_section(fit.parameters)]
+    flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(done.logs[:MOST_LOGS])]
+    page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
     page["excitation"] = told(fit, [log for log, s in zip(done.logs, done.sets, strict=True) if s.role == "train"])
     return render(page)
 

@@ -6,6 +6,7 @@ since boot.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
+from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
 
@@ -29,6 +31,7 @@ _VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
 
 _STAMPED = (
     "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", "RCOU", "ESC", "CTUN",
+    "MODE",
     *_QUATERNIONS,
 )  # fmt: skip
 
@@ -62,7 +65,15 @@ def read_dataflash(path: Path) -> Recording:
         *_outputs(index, times, parameters),
         *_esc(index, times, parameters),
     ]
-    return assemble(_name(path), "dataflash", raw, clock, _damage(index), parameters)
+    recording = assemble(_name(path), "dataflash", raw, clock, _damage(index), parameters)
+    return replace(recording, modes=_modes(index, times))
+
+
+def _modes(index: DataflashIndex, times: dict[str, FloatArray]) -> tuple[tuple[float, str], ...]:
+    column = next((c for c in ("ModeNum", "Mode") if index.has("MODE", c)), None)
+    if column is None or "MODE" not in times:
+        return ()
+    return mode_changes(times["MODE"], index.column("MODE", column), ARDUCOPTER)
 
 
 def _name(path: Path) -> str:

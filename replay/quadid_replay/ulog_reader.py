@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from quadid.types import FloatArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
+from quadid_replay.flight_modes import PX4, mode_changes
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
@@ -29,7 +31,7 @@ from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
 _TOPICS = frozenset((
     "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",
     "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
-    "esc_status",
+    "esc_status", "vehicle_status",
 ))  # fmt: skip
 _XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
 
@@ -61,7 +63,16 @@ def read_ulog(path: Path) -> Recording:
         *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
         *_esc(log),
     ]
-    return assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), log.parameters)
+    recording = assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), log.parameters)
+    return replace(recording, modes=_modes(log))
+
+
+def _modes(log: _Log) -> tuple[tuple[float, str], ...]:
+    key = ("vehicle_status", 0)
+    if not _has(log, key, "nav_state"):
+        return ()
+    t, accepted = LogClock().times(log.topics[key]["timestamp"].astype(np.float64) * 1e-6)
+    return mode_changes(np.where(accepted, t, np.nan), log.topics[key]["nav_state"].astype(np.float64), PX4)
 
 
 def _notes(records: UlogRecords, size: int) -> list[str]:

@@ -1,0 +1,121 @@
+"""What a log tells of its flight beside the outputs: flight modes, and the spectrum of its vibration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quadid.inspection import flying_spans
+from quadid.report.figures import trace
+from quadid.resample import sample_period
+from quadid.rotor_signal import rotor_channel
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+
+SECONDS = 2.0
+"""Length of the stretches whose spectra are averaged: lines half a hertz apart are told apart."""
+MOST_POINTS = 400
+_AXES = ("forward", "to the right", "downwards")
+_ROLES = ("measured", "before", "after")
+
+
+def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[str, Any] | None:
+    """Modes and vibration of one log as a section of a page; None where it tells neither.
+
+    Args:
+        recording: as read, each channel at its own rate.
+        vehicle: whose log it is.
+        place: of the log among those of the page.
+    """
+    spans = flying_spans(recording, vehicle)
+    figure, said = vibration(recording, vehicle, f"log{place}-vibration") if spans else (None, "")
+    modes = mode_rows(recording)
+    if figure is None and not modes:
+        return None
+    return {
+        "id": f"flight-{place}",
+        "title": f"Flight of {recording.name}",
+        "intro": said,
+        "figures": [] if figure is None else [figure],
+        "tables": [{"head": ["flight mode", "from (s)", "to (s)"], "rows": modes}] if modes else [],
+    }
+
+
+def mode_rows(recording: Recording) -> list[list[str]]:
+    """Flight modes with the times between which they held [s after the first IMU sample]."""
+    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel")]
+    if not recording.modes or not imu:
+        return []
+    zero, end = min(float(t[0]) for t in imu), max(float(t[-1]) for t in imu)
+    starts = [t for t, _ in recording.modes]
+    held = zip(recording.modes, [*starts[1:], end], strict=True)
+    return [
+        [name, f"{max(begin - zero, 0.0):.1f}", f"{stop - zero:.1f}"] for (begin, name), stop in held if stop > zero
+    ]
+
+
+def vibration(recording: Recording, vehicle: Vehicle, identifier: str) -> tuple[dict[str, Any] | None, str]:
+    """Amplitude spectrum of the accelerometer in the air, and a sentence about where the rotors are in it."""
+    accel = recording.channels.get("accel")
+    found = None if accel is None else spectrum(accel, flying_spans(recording, vehicle))
+    if found is None:
+        return None, ""
+    frequency, density = found
+    data = [
+        trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(zip(_ROLES, _AXES, strict=True))
+    ]
+    turning, said = _turning(recording, vehicle, float(frequency[-1]))
+    lines = [] if turning is None else [
+        {"type": "line", "x0": turning, "x1": turning, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
+    ]  # fmt: skip
+    layout = {
+        "xaxis": {"title": {"text": "frequency (Hz)"}},
+        "yaxis": {"type": "log", "title": {"text": "(m/s²)/√Hz"}},
+        "shapes": lines,
+    }
+    views = [{"label": "", "data": data, "layout": layout}]
+    return {"id": identifier, "title": "Vibration in the air", "height": 300, "views": views}, said
+
+
+def spectrum(accel: Channel, spans: tuple[tuple[float, float], ...]) -> tuple[FloatArray, FloatArray] | None:
+    """Amplitude spectral density of the specific force, averaged over the flight (Welch).
+
+    Args:
+        accel: at its own rate.
+        spans: when it flies [s].
+
+    Returns:
+        Frequencies [Hz], shape (n,), and densities [(m/s^2)/sqrt(Hz)], shape (n, 3); None where no stretch is long
+        enough.
+    """
+    from scipy.signal import welch
+
+    rate = 1.0 / sample_period(accel.t)
+    rows = round(SECONDS * rate)
+    parts = [accel.values[(accel.t >= a) & (accel.t <= b)] for a, b in spans]
+    parts = [p for p in parts if len(p) >= rows]
+    if rows < 8 or not parts:
+        return None
+    each = [welch(p, rate, nperseg=rows, axis=0) for p in parts]
+    power = np.average([p for _, p in each], axis=0, weights=[len(p) for p in parts])
+    keep = np.unique(np.linspace(1, len(power) - 1, MOST_POINTS).astype(int))
+    return each[0][0][keep], np.sqrt(power[keep])
+
+
+def _turning(recording: Recording, vehicle: Vehicle, highest: float) -> tuple[float | None, str]:
+    """Where the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
+    rotors, _ = rotor_channel(recording, vehicle)
+    spans = flying_spans(recording, vehicle)
+    if rotors is None or rotors.name != "rotor_speed" or not spans:
+        return None, "The rotor speed is not logged; peaks are most often rotors out of balance."
+    inside = np.any([(rotors.t >= a) & (rotors.t <= b) for a, b in spans], axis=0)
+    turns = float(np.mean(rotors.values[inside])) / (2.0 * np.pi)
+    if turns <= highest:
+        return turns, f"The rotors turn {turns:.0f} times a second (dashed): a peak there is imbalance."
+    folded = abs(turns - 2.0 * highest * round(turns / (2.0 * highest)))
+    return None, (
+        f"The rotors turn {turns:.0f} times a second, faster than this log can show ({highest:.0f} Hz): without a "
+        f"filter before sampling their imbalance appears at {folded:.0f} Hz."
+    )
