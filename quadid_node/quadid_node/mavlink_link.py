@@ -126,7 +126,7 @@ class MavlinkLink:
         """Without a key every frame of the vehicle's ids is looked at: two senders have two rows of numbers."""
         number, system, component = sender(frame)
         if (system, component) == (self.vehicle_system, self._target):
-            self._source.count(self._wire.source, number, self._clock())
+            self._source.count(self._wire.source, number, self._clock(), frame)
 
     def _is_vehicle(self, message: Any) -> bool:
         return bool(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Hashable
 
 Address = Hashable
@@ -13,6 +14,11 @@ JUDGED = 40
 """Frames after which the steps are judged."""
 CALM = 2.0
 """Frame numbers must follow for so long [s] before a stream that two had mixed is believed again."""
+REPEATS, REPEAT_SECONDS = 3, 10.0
+"""A number that comes again with something else in it, so often within this time [s], comes from a second sender: one
+that follows the first one's numbers, whose steps look like those of one."""
+PAUSE = 0.1
+"""After so long without a frame [s] numbers may have run on unheard: none is known then."""
 HELLOS, HELLO_SECONDS = 2, 0.5
 """A peer is answered after so many believable heartbeats that span this time [s],"""
 FORGOTTEN = 15.0
@@ -35,6 +41,9 @@ class Source:
         self._heard, self._mixed_until, self._refused_at = -1e9, -1e9, -1e9
         self._last: int | None = None
         self._steps = self._frames = 0
+        self._contents: dict[int, int] = {}
+        self._newest, self._counted = 0, -1e9
+        self._repeated: deque[float] = deque(maxlen=REPEATS)
 
     def take(self, address: Address | None, now: float) -> bool:
         """Whether a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
@@ -47,16 +56,21 @@ class Source:
         self._heard = now
         if now < self._mixed_until:
             self.refused += 1
-            self.problem = "two sources are mixed in one stream (their frame numbers alternate): nothing is believed"
+            self.problem = "two sources are mixed in one stream (by their frame numbers): nothing is believed"
             return False
         if now - self._refused_at > SILENT:
             self.problem = ""
         return True
 
-    def count(self, address: Address | None, sequence: int, now: float) -> None:
-        """Looks at the number of every frame: those of one sender follow each other, those of two alternate."""
+    def count(self, address: Address | None, sequence: int, now: float, frame: bytes = b"") -> None:
+        """Looks at the number of every frame: those of one sender follow each other, those of two alternate or repeat.
+
+        Bits turn over on a serial line, so that there, without an address, repeated numbers are not looked at.
+        """
         if address != self._address:
             return
+        if address is not None and self._repeats(sequence, now, hash(frame)):
+            self._mixed_until = now + REPEAT_SECONDS
         if self._last is not None:
             self._steps += (sequence - self._last) % 256
             self._frames += 1
@@ -65,6 +79,23 @@ class Source:
             if self._steps > GAPS * self._frames:
                 self._mixed_until = now + CALM
             self._steps = self._frames = 0
+
+    def _repeats(self, sequence: int, now: float, content: int) -> bool:
+        """Whether numbers used a moment ago have come with something else in them again and again."""
+        if now - self._counted > PAUSE:
+            self._contents.clear()
+        self._counted = now
+        behind = (self._newest - sequence) % 256
+        if not self._contents or behind >= 128:
+            for number in range(1, 257 - behind if self._contents else 1):
+                self._contents.pop((self._newest + number) % 256, None)
+            self._newest, self._contents[sequence] = sequence, content
+            return False
+        if self._contents.setdefault(sequence, content) == content:
+            return False
+        self._contents.clear()
+        self._repeated.append(now)
+        return len(self._repeated) == REPEATS and now - self._repeated[0] <= REPEAT_SECONDS
 
 
 class Peers:

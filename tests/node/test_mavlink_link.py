@@ -230,6 +230,41 @@ def test_two_senders_mixed_into_one_stream_are_told_by_their_frame_numbers(happe
     happened(27, f"two senders merged into one stream: {took} of 800 frames taken until seen; half lost: no alarm")
 
 
+@pytest.mark.parametrize("ahead", [0, 1, -5, 40, 129])
+def test_a_second_sender_that_follows_the_numbers_of_the_first_is_seen(ahead: int, happened: Happened) -> None:
+    """From the vehicle's own address, one frame in ten: the steps of the numbers look like those of one sender."""
+    source, address, taken = Source(), ("10.0.0.1", 14550), 0
+    source.take(address, 0.0)
+    for k in range(2000):
+        now = 0.005 * k
+        source.count(address, k % 256, now, b"true %d" % k)
+        source.take(address, now)
+        if k % 10 == 5:
+            source.count(address, (k + ahead) % 256, now, b"false %d" % k)
+            taken += source.take(address, now)
+    assert taken <= 15
+    assert "two sources" in source.problem
+    happened(27, f"a second sender {ahead} numbers ahead from the same address: {taken} of 200 frames taken")
+
+
+def test_frames_that_come_twice_late_or_not_at_all_are_those_of_one_sender() -> None:
+    rng, address = random.Random(1), ("10.0.0.1", 14550)
+    for lost in (0.0, 0.3, 0.7):
+        source, late = Source(), -1
+        source.take(address, 0.0)
+        for k in range(4000):
+            if rng.random() < lost:
+                continue
+            if late < 0 and rng.random() < 0.02:
+                late = k  # comes after the next one
+                continue
+            for n in (k, late) if late >= 0 else (k,):
+                for _ in range(rng.choice((1, 2))):
+                    source.count(address, n % 256, 0.0025 * k + 5.0 * (k >= 2000), b"%d" % n)
+            late = -1
+        assert source.take(address, 15.0), (lost, source.problem)
+
+
 def test_who_said_hello_once_is_not_answered(link: MavlinkLink, port: int, happened: Happened) -> None:
     vehicle = Sender(port)
     vehicle.heartbeat()
