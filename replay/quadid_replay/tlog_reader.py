@@ -91,6 +91,8 @@ class _VehicleLog:
 
     def _note_escs(self, t: float | None, reading: Reading, columns: Columns) -> None:
         """Joins the messages of one round (four ESCs each, rising index) to one row at the time of the first."""
+        if reading.place >= columns.width:
+            return  # ESCs that no vehicle has
         key = reading.source
         started, last, row = self._esc_rows.get(key, (None, columns.width, []))
         if reading.place <= last:

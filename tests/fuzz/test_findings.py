@@ -26,6 +26,7 @@ from tests.fuzz import rosbag2_format
 from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import header
+from tests.replay.test_tlog import MAV, Tlog, heartbeat
 from tests.replay.test_ulog import Ulog
 from tests.replay.test_usd import Usd, controller_log
 
@@ -198,3 +199,15 @@ def test_a_small_file_never_takes_much_memory(tmp_path: Path, compression: str, 
     happened(
         1, f"two {compression} chunks of 32 MiB in {path.stat().st_size >> 10} kB: refused within {most >> 20} MiB"
     )
+
+
+@pytest.mark.parametrize("index", [12, 13, 255])
+def test_speeds_of_escs_that_no_vehicle_has_are_left_out(tmp_path: Path, index: int, happened: Happened) -> None:
+    log, zeros = Tlog(), [0.0] * 4
+    log.add(0.0, heartbeat())
+    for k in range(6):
+        for place in (0, index):
+            speeds = MAV.MAVLink_esc_status_message(place, 1_000_000 + 20_000 * k, [6000] * 4, zeros, zeros)
+            log.add(0.02 * k, speeds)
+    assert open_log(opened(tmp_path, bytes(log.data))).channels["rotor_speed"].values.shape == (6, 4)
+    happened(3, f"telemetry log with ESC_STATUS from rotor {index}: the first four are read, no others")
