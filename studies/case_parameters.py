@@ -2,9 +2,11 @@
 
     QUADID_DATA=../shared/data python -m studies.case_parameters --out docs/results
 
-Errors in stated standard deviations, of the flight that trains and of the one that validates, each by itself.  The last
-column is the inner loop of the flight controller that acted within the samples of the log (`quadid.intersample`), in
-1/s^2 on the angle and 1/s on the rate; the rotor speeds run on within each sample as it says.
+Nominal parameters of each flight by itself, with the hidden effects known.  `quadid.intersample` finds the inner loop
+of the flight controller that acted within the log's samples; the rotor speeds then run on as it says.
+
+The table that is printed has errors in stated standard deviations; its last column is that inner loop, in 1/s^2 on the
+angle and 1/s on the rate.
 """
 
 from __future__ import annotations
@@ -92,14 +94,12 @@ def main() -> None:
     data = Path(os.environ.get("QUADID_DATA", "../shared/data")) / "cases"
     answers = json.loads((data / "answers.json").read_text(encoding="utf-8"))
     known = [a for a in answers if "unknown" not in a["effects"]]
-    text = ["`python -m studies.case_parameters --out docs/results`", "", (__doc__ or "").split("\n\n")[2], ""]
-    text.append(f"| flight | hidden, known here | {' | '.join(NOMINAL_NAMES)} | feedback |")
-    text.append("|---" * (3 + len(NOMINAL_NAMES)) + "|")
+    text = ["`python -m studies.case_parameters --out docs/results`", "", (__doc__ or "").split("\n\n")[2].rstrip()]
+    print(f"| flight | hidden, known here | {' | '.join(NOMINAL_NAMES)} | feedback |")
     errors = []
     for answer in known:
         for flight in ("train", "validate"):
             line, found = row(data / answer["case"], flight, answer)
-            text.append(line)
             errors.append(found)
             print(line, flush=True)
     fed = [(e.sloped, e.flat) for e in errors if e.sloped is not None]

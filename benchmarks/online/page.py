@@ -120,28 +120,8 @@ def _load(r: Result) -> list[str]:
     return lines
 
 
-def _costs(r: Result) -> list[str]:
-    own = r["own"]
-    return [
-        "A node of the same executor that takes the same messages and does nothing with them: "
-        f"{100 * r['woken']['share']:.1f} % of a core when it is woken for each, {100 * r['polled']['share']:.1f} % "
-        f"when it takes them every {1e3 * ROUND_SECONDS:g} ms. Our own code without ROS: "
-        f"{own['us_per_message']:.0f} us a message, {100 * own['share']:.1f} % of a core at these rates.",
-    ]  # fmt: skip
-
-
 def _pair(x: Result) -> str:
     return f"{x['p50']:.2f} / {x['p99']:.2f}" if x["count"] else "–"
-
-
-def _memory(r: Result) -> list[str]:
-    return [
-        f"{r['hours']:.1f} h of flight data as fast as they could be taken in ({r['wall_seconds'] / 60:.0f} min), a "
-        f"refit every {r['refit']:.0f} s, {r['fits']} fits, in one process with the history on disk: "
-        f"{r['memory_after_an_hour']:.0f} MiB after an hour, {r['memory_at_end']:.0f} MiB at the end, slope over the "
-        f"last three quarters {r['slope_per_hour']:+.3f} MiB/h; history {r['history_mib']:.1f} MiB. Goal: flat over "
-        "24 h (`--hours 24`).",
-    ]  # fmt: skip
 
 
 def _rms(x: np.ndarray[Any, np.dtype[np.float64]]) -> float:
@@ -159,7 +139,5 @@ PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
     "repeat": ("Live and replayed", _repeat),
     "refit": ("Refit of a 10 s window", _refit),
     "load": ("Load", _load),
-    "costs": ("Where the load comes from", _costs),
-    "memory": ("Memory over many hours, accelerated", _memory),
 }
-"""Parts in the order of the page."""
+"""Parts in the order of the page; memory over many hours is what the soak shows."""

@@ -8,10 +8,12 @@ from typing import Any
 from benchmarks.speed.goals import goals
 
 Result = Mapping[str, Any]
+SHOWN = ("nominal, cost", "motor lag, one a particle, cost", "rotor drag, cost", "every effect, cost")
+"""Cases of the kernel in the table."""
 INTRODUCTION = (
-    "Cases of a table run in turn, round by round; medians, quartiles in brackets. Ratios within a table mean more "
-    "than its seconds, for other programs share the machine. Processor time, in the first table in brackets, is that "
-    "of all threads and child processes. Every number, also of parts not shown here, is in `speed.json`."
+    "Medians of cases that run in turn, round by round. Ratios within a table mean more than its seconds, for other "
+    "programs share the machine. Processor time, in the first table in brackets, is that of all threads and child "
+    "processes. Every number, also of parts not shown here, is in `speed.json`."
 )
 
 
@@ -34,8 +36,7 @@ def _machine(m: Result) -> str:
 def _times(found: Result) -> list[str]:
     rows = ["| what | wall [s] | processor [s] |", "|---|---|---|"]
     for name, t in found["times"].items():
-        low, high = t["wall_quartiles"]
-        rows.append(f"| {name} | {t['wall']:.3g} ({low:.3g} … {high:.3g}) | {t['processor']:.3g} |")
+        rows.append(f"| {name} | {t['wall']:.3g} | {t['processor']:.3g} |")
     return rows
 
 
@@ -46,12 +47,11 @@ def _kernel(r: Result) -> list[str]:
     ]
     for t in r["timings"]:
         one, both = t["one_core"], t["all_cores"]
-        if t["name"].endswith("cost"):
+        if t["name"] in SHOWN:
             rows.append(f"| {t['name']} | {one['least']:.1f} | {both['least']:.1f} |")
     rows += [f"| {name} | {t['least']:.0f} | |" for name, t in r["numpy"].items()]
     return [
-        "Processor time on one core, time by the clock on both. Other programs only ever add to a run, so the best is "
-        "what the kernel takes.", "",
+        "Best runs: processor time on one core, time by the clock on both.", "",
         *rows, "",
         f"Measured peak of one core: {r['fma_per_ns']:.1f} fused multiply-adds of float64 per ns. The nominal rollout "
         f"does {r['operations']} operations a step, which is {r['share_of_peak']:.0%} of that peak. The same step in "
@@ -69,8 +69,7 @@ def _optimum(r: Result) -> list[str]:
     ]  # fmt: skip
     for name, m in r["methods"].items():
         if m["reached"]:
-            low, high = m["quartiles"]
-            told = f"{m['seconds']:.2f} ({low:.2f} … {high:.2f}) | {m['evaluations']:.0f}"
+            told = f"{m['seconds']:.2f} | {m['evaluations']:.0f}"
         else:
             told = "– | –"
         rows.append(f"| {name} | {m['reached']}/{r['seeds']} | {told} |")

@@ -13,6 +13,8 @@ from studies.campaign import summary
 from studies.campaign.grading import Graded, right
 
 COMMAND = "python -m studies.campaign --out docs/results"
+NEAR = 0.05
+"""Relative error below which an effect has no row of its own."""
 
 
 def write(graded: Sequence[Graded], folder: Path, command: str = COMMAND) -> Path:
@@ -71,21 +73,24 @@ def _count(share: summary.Share) -> str:
 def _parameters(singles: Sequence[Graded]) -> str:
     errors, inside = summary.parameter_errors(singles), summary.coverage(singles)
     rows = [
-        "| effect | found | median error | largest error | 95 % interval holds the truth |",
+        "| effect | found | median error % | largest error % | 95 % interval holds the truth |",
         "|---|---|---|---|---|",
     ]
     for effect, values in errors.items():
         held = inside.get(effect)
+        if max(values) < NEAR and held and held.k == held.n:
+            continue
         rows.append(f"| {effect} | {_sizes(values)} | {_count(held) if held else '–'} |")
     everything = [e for v in errors.values() for e in v]
     total = summary.Share(sum(s.k for s in inside.values()), sum(s.n for s in inside.values()))
     rows.append(f"| **all** | {_sizes(everything)} | {total} |")
-    return "## The effect's own parameters\n\n" + "\n".join(rows) + "\n"
+    head = f"The rows of effects that were always found within {NEAR:.0%} and inside their intervals are left out."
+    return f"## The effect's own parameters\n\n{head}\n\n" + "\n".join(rows) + "\n"
 
 
 def _sizes(errors: Sequence[float]) -> str:
     """Cells of a table: how many relative errors, the middle one, the largest."""
-    return f"{len(errors)} | {100 * np.median(errors):.1f} % | {100 * max(errors):.1f} %"
+    return f"{len(errors)} | {100 * np.median(errors):.1f} | {100 * max(errors):.1f}"
 
 
 def _oracle(groups: dict[str, list[Graded]]) -> str:

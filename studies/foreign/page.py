@@ -97,19 +97,22 @@ def _share(value: float) -> str:
 
 def _kept(rows: Mapping[str, Row]) -> str:
     """How many numbers called identified hold their known truth."""
-    lines = ["| data | by | identified, truth known | inside 95 % | outside |", "|---|---|---|---|---|"]
-    total = inside = 0
+    total, outside = 0, []
     for name, row in rows.items():
         for by, answer in (("identify", row.identified), ("diagnose", row.diagnosed)):
             named = [p for p in (answer or {}).get("parameters", []) if p["status"] == "identified"]
             known = [p for p in named if p["name"] in SETS[name].truth]
-            out = [p["name"] for p in known if not _holds(p["ci95"], SETS[name].truth[p["name"]])]
-            total, inside = total + len(known), inside + len(known) - len(out)
-            if known:
-                lines.append(f"| {name} | {by} | {len(known)} | {len(known) - len(out)} | {', '.join(out)} |")
+            total += len(known)
+            outside += [
+                f"{p['name']} of {name} by {by}" for p in known if not _holds(p["ci95"], SETS[name].truth[p["name"]])
+            ]
     if not total:
         return ""
-    return "\n".join([*lines, "", f"In all {inside} of {total} ({inside / total:.0%}; wanted 90 %)."])
+    which = f" Outside: {', '.join(outside)}." if outside else ""
+    return (
+        f"Of {total} numbers called identified whose truth is known {total - len(outside)} hold it inside 95 % "
+        f"({1 - len(outside) / total:.0%}; wanted 90 %).{which}"
+    )
 
 
 def _holds(interval: list[float], truth: tuple[float, float]) -> bool:

@@ -113,10 +113,11 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
         mine = [j for j in single if chosen(j)]
         got = f"{sum(right(j) for j in mine)} of {len(mine)}"
         lines.append(f"| {what} | {wanted} | {_expected(mine, powers, column)} | {got} |")
+    lines += ["\n| spread of roll, pitch, yaw, effort in % | of healthy flights | of two flights of one propeller |",
+              "|---|---|---|"]  # fmt: skip
     for airframe in AIRFRAMES:
         spread = healthy_spread(_baseline(judged, airframe)).deviation
-        lines.append(f"\nSpread of {airframe} (roll, pitch, yaw, effort; %): between healthy flights {_shown(spread)}; "
-                     f"between two flights of one propeller {_shown(_again(judged, airframe))}.")  # fmt: skip
+        lines.append(f"| {airframe} | {_shown(spread)} | {_shown(_again(judged, airframe))} |")
     return "\n".join([*lines, "", _doubles(judged)])
 
 

@@ -92,9 +92,8 @@ def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivo
             f"| `online/{module}.py` | {c.total()} | {noticed} | {c['timeout']} | {unnoticed} | {waiting} "
             f"| {share:.1f} % |"
         )
-    counted = Counter((module, _kind(s)) for module, found in left.items() for s in found)
-    lines += ["", "| module | unnoticed | of them |", "|---|---|---|"]
-    lines += [f"| `online/{module}.py` | {what} | {count} |" for (module, what), count in sorted(counted.items())]
+    counted = Counter(_kind(s) for found in left.values() for s in found)
+    lines += ["", "Of the unnoticed: " + "; ".join(f"{count} {what}" for what, count in counted.most_common()) + "."]
     return "\n".join(lines) + "\n"
 
 

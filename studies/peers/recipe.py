@@ -126,12 +126,11 @@ def section(data: Path) -> list[str]:
         f"{n} {ours[n]['value']:.2e} [{ours[n]['ci95'][0]:.2e}, {ours[n]['ci95'][1]:.2e}] ({ours[n]['status']})"
         for n in ("J_xx", "J_yy")
     )
-    curve = " + ".join(f"{c:.3g} u^{k}" if k else f"{c:.3g}" for k, c in enumerate(found.thrust))
     return [
         "## The least squares of sysid.tools on its authors' logs", "",
         f"`python -m studies.peers recipe`: fitted to {LOG} up to {CUT:g} s and predicted from there; their second "
         "log is not among the shared data. Errors of the rate are shares of predicting no change.", "", *rows, "",
-        f"Recipe: lag {1e3 * found.lag:.0f} ms, thrust of a rotor {curve} N, J_xx {j[0]:.2e}, J_yy {j[1]:.2e} kg m^2 "
+        f"Recipe: J_xx {j[0]:.2e}, J_yy {j[1]:.2e} kg m^2 "
         f"without intervals, R² of its accelerations {', '.join(f'{v:.2f}' for v in found.r2)}. "
         f"`quadid diagnose` (verdict {diagnosed.result['verdict']}): {told}. The authors' notebook has 1.03e-5 and "
         "1.11e-5.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections import Counter
 from typing import Any
@@ -32,7 +33,7 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
     }
     for when, title in titles.items():
         lines += [f"## {title}", "", *_table([c for c in cells if c["when"] == when], done), ""]
-    said = Counter(d["says"].split(":")[0] for d in done)
+    said = Counter(re.sub(r"\d+", "…", d["says"].split(":")[0]) for d in done)
     lines += ["## What the sessions said in the end", "", "| check or phase | cells |", "|---|---|"]
     lines += [f"| {name} | {count} |" for name, count in said.most_common()]
     return "\n".join(lines) + "\n"
@@ -48,7 +49,8 @@ def _table(cells: list[Cell], done: list[Cell]) -> list[str]:
     rows = dict.fromkeys((c["channel"], c["ramp"]) for c in sorted(cells, key=lambda c: c["channel"]))
     for channel, ramp in rows:
         entries = [_entry(found.get((cells[0]["when"], channel, f, ramp))) for f in factors]
-        lines.append(f"| {channel} | {ramp:g} | " + " | ".join(entries) + " |")
+        if any(entries):  # rows of which nothing was flown yet are left out
+            lines.append(f"| {channel} | {ramp:g} | " + " | ".join(entries) + " |")
     return lines
 
 

@@ -100,10 +100,10 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
         f"Written by `{command}`: tests with the real thing failing. A sentence stands here only when its test passed; "
         "the shortest of a row is quoted. All sentences, with test and day: `faults.json` beside this page.",
         "",
-        f"{green} of {len(FAULTS)} rows have evidence{_days(evidence)}.",
+        f"{green} of {len(FAULTS)} rows have evidence, from {len({e.test for e in evidence})} tests{_days(evidence)}.",
         "",
-        "| # | fault | promise | what happened | tests |",
-        "|---|---|---|---|---|",
+        "| # | fault | promise | what happened |",
+        "|---|---|---|---|",
         *(_row(number, *FAULTS[number], rows[number]) for number in FAULTS),
     ]
     for title, names in (("Failed", failed), ("Skipped", skipped)):
@@ -115,8 +115,8 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
 def _row(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> str:
     left = f"| {number} | {_cell(fault)} | {_cell(promise)} |"
     if not said:
-        return f"{left} **no test of this row passed** | |"
-    return f"{left} {_cell(min(said, key=lambda e: len(e.text)).text)} | {len({e.test for e in said})} |"
+        return f"{left} **no test of this row passed** |"
+    return f"{left} {_cell(min(said, key=lambda e: len(e.text)).text)} |"
 
 
 def _days(evidence: Sequence[Evidence]) -> str:

