@@ -236,7 +236,8 @@ def _refits(
 
 
 def _removable(model: Model) -> list[Candidate]:
-    return [c for c in model.causes if not any(c.carries(x) for x in model.causes)]
+    """Causes that no other stands on; their own refinements leave with them."""
+    return [c for c in model.causes if not any(c.carries(x) and not x.refines for x in model.causes)]
 
 
 def _draft(shooting: Shooting, model: Model, score: Score) -> tuple[Score, FloatArray | Sketch]:
