@@ -34,11 +34,11 @@ MIXES = (
     ("roll",), ("pitch",), ("yaw",), ("throttle",), ("roll", "pitch"), ("roll", "yaw"), ("pitch", "yaw"),
     ("roll", "pitch", "yaw"), ("roll", "pitch", "yaw", "throttle"),
 )  # fmt: skip
-START = {"roll": 0.1, "pitch": 0.1, "yaw": 0.3, "throttle": 0.07}
-"""Amplitudes that a search for the largest allowed ones begins with: rad rms, fraction of hover thrust."""
+AMPLITUDES = {"roll": (0.1, 0.35), "pitch": (0.1, 0.35), "yaw": (0.3, 1.5), "throttle": (0.07, 0.15)}
+"""Where the search for the largest amplitude within limits begins, and ends at the latest: rad rms, fraction of hover
+thrust."""
 SWEEP = (0.5, 3.5)
 """Frequencies of sweeps of one axis at a time [Hz], lowest and highest."""
-LARGEST = {"roll": 0.35, "pitch": 0.35, "yaw": 1.5, "throttle": 0.15}
 ROUNDS = 3
 
 
@@ -146,7 +146,7 @@ def peaks(flight: Flight) -> Limits:
 
 def scaled(segments: Sequence[Segment], factor: float) -> tuple[Segment, ...]:
     """Segments with their amplitudes scaled, each up to the largest of its axis."""
-    return tuple(replace(s, amplitude=min(s.amplitude * factor, LARGEST[s.axis])) for s in segments)
+    return tuple(replace(s, amplitude=min(s.amplitude * factor, AMPLITUDES[s.axis][1])) for s in segments)
 
 
 def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Movement]:
@@ -155,7 +155,7 @@ def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Mo
     todo = [(mix, band) for mix in MIXES for band in BANDS]
     for i, (mix, (low, high)) in enumerate(todo):
         advance("movements", i / len(todo))
-        start = tuple(Segment(axis, "multisine", 0.0, BLOCK, START[axis], low, high) for axis in mix)
+        start = tuple(Segment(axis, "multisine", 0.0, BLOCK, AMPLITUDES[axis][0], low, high) for axis in mix)
         try:
             segments, flight = simulator.within(start, BLOCK + PAUSE, limits)
         except FlightError:
@@ -219,12 +219,12 @@ def one_axis_at_a_time(simulator: Simulator, limits: Limits, seconds: float) -> 
     Returns:
         None where there is too little time for two swings of the lowest frequency.
     """
-    each = seconds / len(START)
+    each = seconds / len(AMPLITUDES)
     span = each - PAUSE
     if span <= 4.0 / SWEEP[0]:
         return ()
     out: list[Segment] = []
-    for axis, size in START.items():
+    for axis, (size, _) in AMPLITUDES.items():
         first = Segment(axis, "sweep", 0.0, span, size, *SWEEP)
         try:
             (largest,), _ = simulator.within((first,), each, limits)

@@ -70,25 +70,17 @@ class Gridded(NamedTuple):
 
 
 def to_windows(
-    recording: Recording,
-    vehicle: Vehicle,
-    rate: float | None = 50.0,
-    start: float | None = None,
+    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
     stop: float | None = None,
-    shortest: float | None = None,
-) -> list[Window]:
+) -> list[Window]:  # fmt: skip
     """Merges the channels of a recording onto uniform grids; see `grid_recording` for arguments and errors."""
-    return grid_recording(recording, vehicle, rate, start, stop, shortest).windows
+    return grid_recording(recording, vehicle, rate, start, stop).windows
 
 
 def grid_recording(
-    recording: Recording,
-    vehicle: Vehicle,
-    rate: float | None = 50.0,
-    start: float | None = None,
+    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
     stop: float | None = None,
-    shortest: float | None = None,
-) -> Gridded:
+) -> Gridded:  # fmt: skip
     """Merges the channels of a recording onto uniform grids, one per stretch without gaps.
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
@@ -101,7 +93,6 @@ def grid_recording(
         rate: grid rate [Hz]; None for the log's own (that of its gyro, else of its rotor signal).
         start: first time to use [s], in the recording's time.
         stop: last time to use [s].
-        shortest: shorter windows are dropped [s]; default 1 s where a rate is given, else only single rows.
 
     Raises:
         LogError: no rotor signal, rotor columns that do not fit the vehicle, or no usable stretch.
@@ -114,8 +105,7 @@ def grid_recording(
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
     spans = _spans(plan)
     low, high = -math.inf if start is None else start, math.inf if stop is None else stop
-    if shortest is None:
-        shortest = SHORTEST if rate is not None else 0.0
+    shortest = SHORTEST if rate is not None else 0.0
     log_span = _log_span(recording)
     windows: list[Window] = []
     dropped: list[float] = []

@@ -5,7 +5,7 @@ Inside the core all data are SI, world NED, body FRD, quaternions body to world,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -229,3 +229,16 @@ class Window:
         values = {name: getattr(self, name) for name in ("rotor_speed", "rotor_slope", *_MEASURED)}
         cut: dict[str, Any] = {name: rows[start:stop] for name, rows in values.items() if rows is not None}
         return replace(self, t0=self.t0 + self.dt * start, **cut)
+
+
+def beginning(windows: Iterable[Window], longest: float, least: float = 1.0) -> tuple[list[Window], float]:
+    """The first `longest` seconds of windows, and how long they are [s]; rests shorter than `least` are left out."""
+    taken: list[Window] = []
+    seconds = 0.0
+    for window in windows:
+        rows = int((longest - seconds) / window.dt)
+        if rows < least / window.dt:
+            break
+        taken.append(window if len(window) <= rows else window.slice(0, rows))
+        seconds += len(taken[-1]) * window.dt
+    return taken, seconds

@@ -8,28 +8,15 @@ from typing import Annotated, Any
 import typer
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import (
-    Columns,
-    JsonTarget,
-    Logs,
-    OutFolder,
-    Preset,
-    Rate,
-    Seed,
-    Start,
-    Stop,
-    Unchecked,
-    Validate,
-    VehicleName,
-)
+from quadid_cli import options
 
 JsonDict = dict[str, Any]
 
 
 def compare(
-    logs: Logs,
-    vehicle: VehicleName,
-    validate: Validate = None,
+    logs: options.Logs,
+    vehicle: options.VehicleName,
+    validate: options.Validate = None,
     method: Annotated[
         list[str] | None,
         typer.Option("--method", metavar="NAME", help="Only this method; may be given again. Default: all ten."),
@@ -47,28 +34,26 @@ def compare(
             "paper's: the whole set under its stabiliser, from references and throttle).",
         ),
     ] = "shooting",
-    seed: Seed = 1,
-    rate: Rate = None,
-    start: Start = None,
-    stop: Stop = None,
-    preset: Preset = "auto",
-    unchecked: Unchecked = False,
-    columns: Columns = None,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
+    seed: options.Seed = 1,
+    rate: options.Rate = GRID,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    preset: options.Preset = "auto",
+    unchecked: options.Unchecked = False,
+    columns: options.Columns = None,
+    json: options.JsonTarget = None,
+    out: options.OutFolder = Path(),
 ) -> None:
     """Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side."""
     from quadid.workflow import compare as work
-    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
     output.out_folder(out)
     names = work.check_names(method, objective)
-    described = load_vehicle(vehicle)
-    hertz = GRID if rate is None else rate
-    train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
-    held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+    read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
+    train, held = read(logs), read(validate or [])
     with terminal.progress() as advance:
         result = work.compare(
             train, held, methods=names, seeds=range(seed, seed + seeds), budget=budget, objective=objective,

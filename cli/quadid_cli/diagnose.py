@@ -5,43 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import (
-    Columns,
-    JsonTarget,
-    Logs,
-    OutFolder,
-    Preset,
-    Rate,
-    ReportFile,
-    Seed,
-    SeriesKinds,
-    Start,
-    Stop,
-    Unchecked,
-    Validate,
-    VehicleName,
-)
+from quadid_cli import options
 
 
 def diagnose(
-    logs: Logs,
-    vehicle: VehicleName,
-    validate: Validate = None,
-    seed: Seed = 1,
-    report: ReportFile = None,
-    series: SeriesKinds = None,
-    rate: Rate = None,
-    start: Start = None,
-    stop: Stop = None,
-    preset: Preset = "auto",
-    unchecked: Unchecked = False,
-    columns: Columns = None,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
+    logs: options.Logs,
+    vehicle: options.VehicleName,
+    validate: options.Validate = None,
+    seed: options.Seed = 1,
+    report: options.ReportFile = None,
+    series: options.SeriesKinds = None,
+    rate: options.Rate = GRID,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    preset: options.Preset = "auto",
+    unchecked: options.Unchecked = False,
+    columns: options.Columns = None,
+    json: options.JsonTarget = None,
+    out: options.OutFolder = Path(),
 ) -> None:
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
     from quadid.workflow import diagnose as work
-    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.loading import load_vehicle
     from quadid.workflow.series import check_kinds
     from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
@@ -50,11 +35,10 @@ def diagnose(
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
+    read = options.reader(described, rate, start, stop, preset, unchecked, columns)
     folder = output.out_folder(out)
-    hertz = GRID if rate is None else rate
     with explained(report, f"Diagnosis of {described.name}", [*logs, *(validate or [])], described, preset):
-        train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
-        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+        train, held = read(logs), read(validate or [])
         with terminal.progress() as advance:
             done = work.diagnose(train, held, seed=seed, advance=advance)
     target = free_path(folder / done.file_name, vehicle)

@@ -11,7 +11,18 @@ from typing import Annotated, Any
 import typer
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import Columns, JsonTarget, OutFolder, Preset, Rate, ReportFile, Seed, Unchecked, VehicleName
+from quadid_cli.options import (
+    Columns,
+    JsonTarget,
+    OutFolder,
+    Preset,
+    Rate,
+    ReportFile,
+    Seed,
+    Unchecked,
+    VehicleName,
+    reader,
+)  # fmt: skip
 
 
 def excite(
@@ -33,7 +44,7 @@ def excite(
         ),
     ] = None,
     seed: Seed = 1,
-    rate: Rate = None,
+    rate: Rate = GRID,
     preset: Preset = "auto",
     columns: Columns = None,
     unchecked: Unchecked = False,
@@ -43,7 +54,7 @@ def excite(
 ) -> None:
     """Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it."""
     from quadid.workflow.excite import check_forms, check_limits, parse_height, propose
-    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
 
     check_limits(seconds, tilt, rate_limit, battery)
@@ -53,8 +64,7 @@ def excite(
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
     folder = output.out_folder(out)
-    named = parse_columns(columns or [])
-    opened = load_logs(logs or [], described, GRID if rate is None else rate, None, None, preset, unchecked, named)
+    opened = reader(described, rate, None, None, preset, unchecked, columns)(logs or [])
     with terminal.progress() as advance:
         done = propose(
             opened, vehicle=described, seconds=seconds, tilt=tilt, rate_limit=rate_limit, height=heights,

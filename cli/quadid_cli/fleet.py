@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.workflow.loading import GRID
-from quadid_cli.options import Columns, JsonTarget, OutFolder, Seed
+from quadid_cli.options import Columns, JsonTarget, OutFolder, Rate, Seed
 
 if TYPE_CHECKING:
     from quadid.workflow.fleet import Job
@@ -45,7 +45,7 @@ def fleet(
     again: Annotated[
         bool, typer.Option("--again", help="Identify all logs anew, also those that an earlier run has done.")
     ] = False,
-    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = GRID,
+    rate: Rate = GRID,
     seed: Seed = 1,
     columns: Columns = None,
     json: JsonTarget = None,

@@ -10,22 +10,7 @@ import typer
 
 from quadid.workflow.loading import GRID
 from quadid.workflow.searching import OPTIMIZERS
-from quadid_cli.options import (
-    Columns,
-    JsonTarget,
-    Logs,
-    OutFolder,
-    Preset,
-    Rate,
-    ReportFile,
-    Seed,
-    SeriesKinds,
-    Start,
-    Stop,
-    Unchecked,
-    Validate,
-    VehicleName,
-)
+from quadid_cli import options
 
 if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
@@ -33,27 +18,27 @@ if TYPE_CHECKING:
 
 
 def identify(
-    logs: Logs,
-    vehicle: VehicleName,
-    validate: Validate = None,
+    logs: options.Logs,
+    vehicle: options.VehicleName,
+    validate: options.Validate = None,
     optimizer: Annotated[
         str, typer.Option("--optimizer", metavar="NAME", help="How to search: " + ", ".join(OPTIMIZERS) + ".")
     ] = OPTIMIZERS[0],
-    seed: Seed = 1,
-    report: ReportFile = None,
-    series: SeriesKinds = None,
-    rate: Rate = None,
-    start: Start = None,
-    stop: Stop = None,
-    preset: Preset = "auto",
-    unchecked: Unchecked = False,
-    columns: Columns = None,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
+    seed: options.Seed = 1,
+    report: options.ReportFile = None,
+    series: options.SeriesKinds = None,
+    rate: options.Rate = GRID,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    preset: options.Preset = "auto",
+    unchecked: options.Unchecked = False,
+    columns: options.Columns = None,
+    json: options.JsonTarget = None,
+    out: options.OutFolder = Path(),
 ) -> None:
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid.workflow import identify as work
-    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.loading import load_vehicle
     from quadid.workflow.searching import check_optimizer
     from quadid.workflow.series import check_kinds
     from quadid_cli import output, terminal
@@ -64,11 +49,10 @@ def identify(
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)
+    read = options.reader(described, rate, start, stop, preset, unchecked, columns)
     target = fitted_path(output.out_folder(out), described, vehicle)
-    hertz = GRID if rate is None else rate
     with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
-        train = load_logs(logs, described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
-        held = load_logs(validate or [], described, hertz, start, stop, preset, unchecked, parse_columns(columns or []))
+        train, held = read(logs), read(validate or [])
         try:
             with terminal.progress() as advance:
                 done = work.identify(train, held, optimizer=optimizer, seed=seed, advance=advance)

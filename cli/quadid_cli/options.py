@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
+    from quadid.workflow.loading import Log
 
 Logs = Annotated[
     list[str],
@@ -41,7 +46,9 @@ JsonTarget = Annotated[
     ),
 ]
 OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for written files.")]
-Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default 50 Hz.")]
+Rate = Annotated[
+    float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default 50 Hz.", show_default=False)
+]
 OwnRate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default the log's own.")
 ]
@@ -76,3 +83,14 @@ SeriesKinds = Annotated[
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
 ]
+
+
+def reader(
+    vehicle: Vehicle, rate: float | None, start: float | None, stop: float | None, preset: str, unchecked: bool,
+    columns: Sequence[str] | None,
+) -> Callable[[Sequence[str]], list[Log]]:  # fmt: skip
+    """What reads the logs of a command whose options these are; see `quadid.workflow.loading.load`."""
+    from quadid.workflow.loading import load_logs, parse_columns
+
+    named = parse_columns(columns or [])
+    return lambda logs: load_logs(logs, vehicle, rate, start, stop, preset, unchecked, named)

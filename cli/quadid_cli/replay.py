@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.errors import QuadidError
-from quadid_cli.options import Columns, JsonTarget, Preset, Seed, VehicleName
+from quadid_cli.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleName
 
 if TYPE_CHECKING:
     from quadid_node.publication import Output
@@ -37,7 +37,7 @@ def replay(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
     ] = None,
-    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid.")] = 50.0,
+    rate: Rate = 50.0,
     window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
     refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
     diagnose: Annotated[

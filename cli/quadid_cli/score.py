@@ -7,44 +7,33 @@ from typing import Annotated
 
 import typer
 
-from quadid_cli.options import (
-    Columns,
-    JsonTarget,
-    Logs,
-    OutFolder,
-    OwnRate,
-    Preset,
-    Start,
-    Stop,
-    Unchecked,
-    VehicleName,
-)
+from quadid_cli import options
 
 
 def score(
-    logs: Logs,
-    vehicle: VehicleName,
+    logs: options.Logs,
+    vehicle: options.VehicleName,
     horizons: Annotated[
         str, typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run.")
     ] = "1,10,50",
-    rate: OwnRate = None,
-    start: Start = None,
-    stop: Stop = None,
-    preset: Preset = "auto",
-    unchecked: Unchecked = False,
-    columns: Columns = None,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
+    rate: options.OwnRate = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    preset: options.Preset = "auto",
+    unchecked: options.Unchecked = False,
+    columns: options.Columns = None,
+    json: options.JsonTarget = None,
+    out: options.OutFolder = Path(),
 ) -> None:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
     from quadid.workflow import score as work
-    from quadid.workflow.loading import load_logs, load_vehicle, parse_columns
+    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, tables, terminal
 
     output.check_file(json, "--json")
     wanted = parse_horizons(horizons)
-    opened = load_logs(logs, load_vehicle(vehicle), rate, start, stop, preset, unchecked, parse_columns(columns or []))
-    done = work.score(opened, horizons=wanted, rate=rate)
+    read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
+    done = work.score(read(logs), horizons=wanted, rate=rate)
     output.write_json(done.result, json)
     tables.print_outcome(terminal.console(quiet=json == "-"), done)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from quadid.report.figures import trace
 from quadid.report.page import render
+from quadid.report.parts import axis, figure, rows_of, section, trace
 from quadid.window import Window
 
 JsonDict = Mapping[str, Any]
@@ -37,29 +37,22 @@ def excite_html(result: JsonDict, window: Window) -> str:
         "title": f"What to fly next: {result['vehicle']}",
         "subtitle": f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s",
         "sections": [
-            {
-                "id": "gain",
-                "title": "What it would gain",
-                "intro": "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
-                "figures": [_bars(result)],
-                "tables": [{
-                    "head": ["parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"], "rows": gained,
-                }],
-            },
-            {
-                "id": "manoeuvre",
-                "title": "The manoeuvre",
-                "intro": "Stick movements one after the other, and the attitude that the simulation flies.",
-                "figures": [_attitude(window)],
-                "tables": [{"head": ["movement", "times", "amplitude, rms"], "rows": moves}],
-            },
-            {
-                "id": "envelope",
-                "title": "Where it may be flown",
-                "intro": "Scripts begin only inside the envelope, and end when they leave it.",
-                "figures": [],
-                "tables": [{"head": ["", "needed in simulation", "envelope"], "rows": _limits(result)}],
-            },
+            section(
+                "gain", "What it would gain",
+                "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
+                [_bars(result)],
+                [rows_of(("parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"), gained)],
+            ),
+            section(
+                "manoeuvre", "The manoeuvre",
+                "Stick movements one after the other, and the attitude that the simulation flies.",
+                [_attitude(window)], [rows_of(("movement", "times", "amplitude, rms"), moves)],
+            ),
+            section(
+                "envelope", "Where it may be flown",
+                "Scripts begin only inside the envelope, and end when they leave it.",
+                tables=[rows_of(("", "needed in simulation", "envelope"), _limits(result))],
+            ),
         ],
     })  # fmt: skip
 
@@ -96,9 +89,8 @@ def _bars(result: JsonDict) -> dict[str, Any]:
             ("after", "after the manoeuvre", "manoeuvre"),
         )
     ]  # fmt: skip
-    layout = {"yaxis": {"type": "log", "title": {"text": "half-width (%)"}}, "xaxis": {"type": "category"}}
-    return {"id": "gain-bars", "title": "Half-widths", "height": 320,
-            "views": [{"label": "", "data": data, "layout": layout}]}  # fmt: skip
+    layout = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
+    return figure("gain-bars", "Half-widths", data, layout, 320)
 
 
 def _attitude(window: Window) -> dict[str, Any]:
@@ -111,6 +103,4 @@ def _attitude(window: Window) -> dict[str, Any]:
         trace(role, label, t, angles[:, i])
         for i, (role, label) in enumerate((("measured", "roll"), ("before", "pitch"), ("after", "yaw")))
     ]
-    layout = {"xaxis": {"title": {"text": "time (s)"}}, "yaxis": {"title": {"text": "angle (°)"}}}
-    return {"id": "attitude", "title": "Attitude", "height": 320,
-            "views": [{"label": "", "data": data, "layout": layout}]}  # fmt: skip
+    return figure("attitude", "Attitude", data, {"xaxis": axis("time (s)"), "yaxis": axis("angle (°)")}, 320)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from quadid.inspection import Inspection
-from quadid.report.figures import WHOLE_POINTS, short, thinned
+from quadid.report.figures import WHOLE_POINTS, thinned
+from quadid.report.parts import axis, rows_of, section, short
 from quadid.report.verdict import Verdict
 from quadid.window import CHANNELS, Channel, Recording
 
@@ -64,7 +65,7 @@ def _data(recording: Recording, number: int) -> dict[str, Any]:
     intro = f"{recording.format}, {len(recording.channels)} channels."
     if recording.warnings:
         intro += " Notes: " + "; ".join(recording.warnings) + "."
-    return {"id": f"raw{number}", "title": recording.name, "intro": intro, "figures": figures, "tables": []}
+    return section(f"raw{number}", recording.name, intro, figures)
 
 
 def _figure(name: str, channel: Channel, identifier: str) -> dict[str, Any]:
@@ -77,27 +78,16 @@ def _figure(name: str, channel: Channel, identifier: str) -> dict[str, Any]:
         }
         for i in range(values.shape[1])
     ]  # fmt: skip
-    layout = {
-        "xaxis": {"title": {"text": "time [s]"}},
-    }
     t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
-    views = [{"label": "", "x": t, "data": data, "layout": layout}]
-    return {
-        "id": identifier,
-        "title": name.replace("_", " "),
-        "caption": CHANNELS[name][1],
-        "views": views,
-        "height": 220,
-    }
+    views = [{"label": "", "x": t, "data": data, "layout": {"xaxis": axis("time [s]")}}]
+    title, caption = name.replace("_", " "), CHANNELS[name][1]
+    return {"id": identifier, "title": title, "caption": caption, "views": views, "height": 220}
 
 
 def _checks(recording: Recording, inspection: Inspection, number: int) -> dict[str, Any]:
     rows = [[c.name.replace("_", " "), _WORDS[c.verdict.value], c.message, c.fix or "–"] for c in inspection.checks]
     outlook = [[o.parameter, "yes" if o.possible else "no", o.reason] for o in inspection.parameters]
-    return {
-        "id": f"checks{number}", "title": f"What {recording.name} allows", "intro": "", "figures": [],
-        "tables": [
-            {"head": ["Check", "Result", "Found", "What to do"], "rows": rows},
-            {"head": ["Parameter", "Possible", "Why"], "rows": outlook},
-        ],
-    }  # fmt: skip
+    tables = [
+        rows_of(("Check", "Result", "Found", "What to do"), rows), rows_of(("Parameter", "Possible", "Why"), outlook),
+    ]  # fmt: skip
+    return section(f"checks{number}", f"What {recording.name} allows", tables=tables)

@@ -1,7 +1,4 @@
-"""Figures as plain Plotly descriptions, without colours: the page gives every trace the colour of its role.
-
-Roles: ``measured``, ``before`` (current parameters), ``after`` (proposed ones), ``truth``, ``floor``.
-"""
+"""Figures of results: channels over time, errors, parameters, gains; see `quadid.report.parts` for their form."""
 
 from __future__ import annotations
 
@@ -14,9 +11,8 @@ import numpy as np
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import SetScore
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.report.parts import JsonDict, axis, figure, short, trace
 from quadid.types import FloatArray, IndexArray
-
-JsonDict = dict[str, Any]
 
 GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
     "rates": ("Body rates", (0, 1, 2)),
@@ -36,27 +32,6 @@ MOST_LOGS = 4
 """Logs that get pictures; the others are in the tables."""
 BUDGET = 90_000
 """Numbers that all pictures of channels may take together, so that a page stays below 6 MB."""
-
-
-def trace(role: str, name: str, x: FloatArray | None, y: FloatArray, **more: Any) -> JsonDict:
-    """One line of a figure; without `x` it takes that of its view.  Numbers keep what a picture can show."""
-    across = {} if x is None else {"x": short(x)}
-    return {"role": role, "name": name, **across, "y": short(y), "type": "scatter", "mode": "lines", **more}
-
-
-def short(values: FloatArray, resolution: float | None = None) -> list[float | None]:
-    """Numbers rounded to a two-thousandth of their range, so that a page stays small; None where not finite.
-
-    Args:
-        values: shape (n,).
-        resolution: smallest difference to keep, instead.
-    """
-    good = values[np.isfinite(values)]
-    if len(good) == 0:
-        return [None] * len(values)
-    finest = resolution or max(float(np.ptp(good)), 1e-3 * float(np.abs(good).max()), 1e-12) / 2000.0
-    decimals = max(0, math.ceil(-math.log10(finest)))
-    return [round(v, decimals) if math.isfinite(v) else None for v in values.tolist()]
 
 
 def channel_figures(
@@ -97,8 +72,8 @@ def _stack(
     t = after.t[rows] - after.t[0]
     data, layout = [], dict[str, Any]()
     for i, c in enumerate(channels):
-        axis = "" if i == 0 else str(i + 1)
-        where = {"xaxis": "x", "yaxis": f"y{axis}", "showlegend": i == 0}
+        place = "" if i == 0 else str(i + 1)
+        where = {"xaxis": "x", "yaxis": f"y{place}", "showlegend": i == 0}
         name, measured = CHANNEL_NAMES[c], after.measured[rows, c]
         lines = [
             ("before", labels[0], before.simulated[rows, c]),
@@ -115,13 +90,12 @@ def _stack(
             line = trace(role, label, None, inside, legendgroup=role, **where)
             data.append({**line, "y": short(inside, (high - low) / 2000.0)})
         share = 1.0 / len(channels)
-        layout[f"yaxis{axis}"] = {
+        layout[f"yaxis{place}"] = {
             "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
-            "title": {"text": f"{LABELS.get(name, name)} [{CHANNEL_UNITS[c]}]"},
-            "range": [low, high],
+            **axis(f"{LABELS.get(name, name)} [{CHANNEL_UNITS[c]}]", range=[low, high]),
         }
     last = "y" if len(channels) == 1 else f"y{len(channels)}"
-    layout["xaxis"] = {"title": {"text": "time [s]"}, "anchor": last}
+    layout["xaxis"] = axis("time [s]", anchor=last)
     return {"x": short(t), "data": data, "layout": layout}
 
 
@@ -175,12 +149,8 @@ def error_figure(scored: ScoredSet, identifier: str, labels: tuple[str, str] = P
         data.append(trace(role, name, t - zero, ratio))
     ends = series_ends(scored) - zero
     data.append(trace("floor", "sensor noise alone", ends, np.ones(2)))
-    layout = {
-        "xaxis": {"title": {"text": "time [s]"}},
-        "yaxis": {"title": {"text": "squared error / noise"}, "type": "log", "dtick": 1},
-    }
-    views = [{"label": "", "data": data, "layout": layout}]
-    return {"id": identifier, "title": "Error over the flight", "views": views, "height": 240}
+    layout = {"xaxis": axis("time [s]"), "yaxis": axis("squared error / noise", type="log", dtick=1)}
+    return figure(identifier, "Error over the flight", data, layout, 240)
 
 
 def series_ends(scored: ScoredSet) -> FloatArray:
@@ -217,24 +187,15 @@ def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str
     upper, lower = short(interval[:, 1] - value, 1e-5), short(value - interval[:, 0], 1e-5)
     bars = {"type": "data", "symmetric": False, "array": upper, "arrayminus": lower}
     common = {"y": names, "mode": "markers", "type": "scatter"}
-    data = [
+    data: list[JsonDict] = [
         {"role": "before", "name": "current", "x": [1.0] * len(names), **common},
         {"role": "after", "name": "proposed, 95 % interval", "x": short(value), "error_x": bars, **common},
     ]
     if truth:
         known = np.array([truth.get(n, np.nan) for n in names]) / scale
         data.append({"role": "truth", "name": "truth", "x": short(known), **common})
-    layout = {
-        "xaxis": {"title": {"text": "value / current value"}},
-        "yaxis": {"type": "category"},
-    }
-    views = [{"label": "", "data": data, "layout": layout}]
-    return {
-        "id": "parameters",
-        "title": "Proposed against current",
-        "views": views,
-        "height": 60 + 38 * len(names) + 60,
-    }
+    layout = {"xaxis": axis("value / current value"), "yaxis": {"type": "category"}}
+    return figure("parameters", "Proposed against current", data, layout, 120 + 38 * len(names))
 
 
 def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> JsonDict:
@@ -255,18 +216,9 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
     highest = max([v for _, v, _ in rows if v is not None and math.isfinite(v)], default=floor)
     edge = {"type": "line", "x0": floor, "x1": floor, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
     layout = {
-        "xaxis": {
-            "title": {"text": f"error, {finding['gain']['seconds']:g} s runs (noise = 1)"},
-            "range": [0.0, 1.05 * highest],
-        },
+        "xaxis": axis(f"error, {finding['gain']['seconds']:g} s runs (noise = 1)", range=[0.0, 1.05 * highest]),
         "yaxis": {"type": "category"},
         "hovermode": "closest",
         "shapes": [edge],
     }
-    views = [{"label": "", "data": data, "layout": layout}]
-    return {
-        "id": identifier,
-        "title": "Validation error with and without it",
-        "views": views,
-        "height": 90 + 32 * len(rows),
-    }
+    return figure(identifier, "Validation error with and without it", data, layout, 90 + 32 * len(rows))

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from quadid.health.changes import HEALTHY_SCORE
-from quadid.report.figures import trace
 from quadid.report.health_page import change_words
 from quadid.report.page import number
 from quadid.report.page import unit as unit_text
+from quadid.report.parts import axis, figure, level, rows_of, section, trace
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
 
 JsonDict = Mapping[str, Any]
@@ -99,37 +99,24 @@ def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
         score = np.array([row["score"] for row in own])
         line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=[row["log"] for row in own])
         data.append({**line, "x": [_date(row["started"]) for row in own]})
-    limit = {"y0": HEALTHY_SCORE, "y1": HEALTHY_SCORE}
     layout = {
-        "xaxis": {"type": "date"}, "yaxis": {"title": {"text": "healthy spreads"}, "rangemode": "tozero"},
-        "hovermode": "closest", "showlegend": True,
-        "shapes": [{"type": "line", "x0": 0, "x1": 1, "xref": "paper", "role": "floor", **limit}],
+        "xaxis": {"type": "date"}, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
+        "showlegend": True, "shapes": [level(HEALTHY_SCORE)],
     }  # fmt: skip
-    views = [{"label": "", "data": data, "layout": layout}]
-    figure = {"id": "fleet-health", "title": "Distance from healthy", "views": views, "height": 280}
-    changed = [row for row in judged if row["verdict"] != "unchanged"]
-    table = {
-        "head": ["Vehicle", "Flight", "Score", "Changed"],
-        "rows": [
-            [
-                row["unit"],
-                row["log"],
-                number(row["score"], 2),
-                _what_changed(row),
-            ]
-            for row in changed[-MOST_ROWS:]
-        ],
-    }
+    drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
+    changed = [
+        (row["unit"], row["log"], number(row["score"], 2), _what_changed(row))
+        for row in judged
+        if row["verdict"] != "unchanged"
+    ]
+    table = rows_of(("Vehicle", "Flight", "Score", "Changed"), changed[-MOST_ROWS:])
     count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
     most = "up to " * (len(set(count.values())) > 1) + str(max(count.values()))
     intro = (
         f"Each flight against the first {most} of its vehicle, which are taken "
         f"for healthy. 99 of 100 healthy flights stay below {HEALTHY_SCORE:.1f}, the line."
     )
-    return {
-        "id": "health", "title": "Health over flights", "intro": intro, "figures": [figure],
-        "tables": [table] if changed else [],
-    }  # fmt: skip
+    return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
 
 
 def _what_changed(row: JsonDict) -> str:
@@ -143,7 +130,7 @@ def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict
     if not figures:
         return None
     intro = "Every flight with its 95 % interval; a vehicle is a folder."
-    return {"id": "over-time", "title": "Parameters over time", "intro": intro, "figures": figures, "tables": []}
+    return section("over-time", "Parameters over time", intro, figures)
 
 
 def _one_figure(
@@ -165,11 +152,10 @@ def _one_figure(
     if not data:
         return None
     layout = {
-        "xaxis": {"type": "date"}, "yaxis": {"title": {"text": f"{name} [{mine[0]['unit']}]"}}, "hovermode": "closest",
+        "xaxis": {"type": "date"}, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
         "showlegend": True,
     }  # fmt: skip
-    views = [{"label": "", "data": data, "layout": layout}]
-    return {"id": f"fleet-{name}", "title": name, "views": views, "height": 280}
+    return figure(f"fleet-{name}", name, data, layout, 280)
 
 
 def _gap(high: float | None, low: float | None) -> float:
@@ -184,8 +170,7 @@ def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Se
     if not rows:
         return None
     more = f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
-    table = {"head": list(head), "rows": [list(r) for r in rows[:MOST_ROWS]]}
-    return {"id": identifier, "title": title, "intro": f"{intro}{more}".strip(), "figures": [], "tables": [table]}
+    return section(identifier, title, f"{intro}{more}".strip(), tables=[rows_of(head, rows[:MOST_ROWS])])
 
 
 def _units(summary: JsonDict) -> Any:

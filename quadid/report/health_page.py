@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from quadid.report.parts import axis, figure, rows_of, section
 from quadid.report.text_table import Cell, Column, TextTable
 from quadid.report.verdict import Level, Verdict
 
@@ -140,15 +141,11 @@ def health_page(
         "From above, nose up. Dashed: the load that each rotor carries in the baseline flights. Filled: now, a pixel a "
         "per cent. Red: damaged; yellow: suspected."
     )
-    changes = [
-        {
-            "head": ["Change", "Found", "Rejected alternatives (probability)"],
-            "rows": [
-                [change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."), _rivals(c)]
-                for c in result["changes"]
-            ],
-        }
+    found = [
+        (change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."), _rivals(c))
+        for c in result["changes"]
     ]
+    changes = [rows_of(("Change", "Found", "Rejected alternatives (probability)"), found)] if found else []
     trims = trim_table(result)
     head = [column.heading for column in trims.columns]
     rows = [[cell.text if isinstance(cell, Cell) else cell for cell in row] for row in trims.rows]
@@ -157,15 +154,9 @@ def health_page(
         "subtitle": f"{n} flight{'s' * (n != 1)} against {m} baseline flight{'s' * (m != 1)}",
         "verdict": asdict(health_verdict(result)),
         "sections": [
-            {"id": "airframe", "title": "Airframe", "intro": caption, "picture": picture, "figures": [], "tables": []},
-            {
-                "id": "changes", "title": "What changed", "figures": [], "tables": changes if result["changes"] else [],
-                "intro": _INTROS[result["verdict"]],
-            },
-            {
-                "id": "trim", "title": "Trim", "intro": trims.title, "figures": list(history),
-                "tables": [{"head": head, "rows": rows}],
-            },
+            section("airframe", "Airframe", caption, picture=picture),
+            section("changes", "What changed", _INTROS[result["verdict"]], tables=changes),
+            section("trim", "Trim", trims.title, history, [rows_of(head, rows)]),
         ],
         "warnings": result["warnings"],
         "provenance": provenance,
@@ -194,9 +185,6 @@ def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequenc
     ]  # fmt: skip
     layout = {
         "xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)},
-        "yaxis": {"title": {"text": "healthy spreads"}},
+        "yaxis": axis("healthy spreads"),
     }
-    return {
-        "id": "trims", "title": "Every flight", "caption": "distance from the baseline's mean",
-        "views": [{"label": "", "data": data, "layout": layout}], "height": 300,
-    }  # fmt: skip
+    return figure("trims", "Every flight", data, layout, 300, caption="distance from the baseline's mean")

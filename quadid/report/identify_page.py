@@ -13,6 +13,7 @@ from quadid.identify.result import ScoredSet
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.parameters import ParameterSet
 from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure
+from quadid.report.parts import rows_of, section
 from quadid.report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth
 from quadid.report.words import parameter_name, status_words
 
@@ -104,7 +105,4 @@ def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
         for i, name in enumerate(names)
     ]
     intro = "Near +1 or -1 the flight hardly separates two parameters: fly what moves one of them alone."
-    return {
-        "id": "correlations", "title": "Correlations", "intro": intro, "figures": [],
-        "tables": [{"head": ["", *names], "rows": rows}],
-    }  # fmt: skip
+    return section("correlations", "Correlations", intro, tables=[rows_of(["", *names], rows)])

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadid.identify.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
-from quadid.report.figures import LABELS, liveliest, trace
+from quadid.report.figures import LABELS, liveliest
+from quadid.report.parts import axis, trace
 from quadid.types import FloatArray
 
 if TYPE_CHECKING:
@@ -95,11 +96,11 @@ def draw(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> Fig
     for column, number in enumerate(figure.sets):
         t, lines = _lines(scores, number)
         for row, output in enumerate(outputs):
-            axis = axes[row, column]
+            plot = axes[row, column]
             for name, values in lines.items():
-                axis.plot(t, values[:, output], label=NAMES[name], **_STYLES[name])
-            axis.set_ylabel(label(output))
-            axis.grid(alpha=0.3)
+                plot.plot(t, values[:, output], label=NAMES[name], **_STYLES[name])
+            plot.set_ylabel(label(output))
+            plot.grid(alpha=0.3)
         axes[0, column].set_title(f"Set {number} ({'training' if number == 1 else 'validation'})", fontsize=10)
         axes[-1, column].set_xlabel("time [s]")
     handles, names = axes[0, 0].get_legend_handles_labels()
@@ -114,15 +115,12 @@ def interactive(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]])
     for number in figure.sets:
         t, lines = _lines(scores, number)
         data: list[JsonDict] = []
-        layout: JsonDict = {"xaxis": {"title": {"text": "time [s]"}, "anchor": "y3"}}
+        layout: JsonDict = {"xaxis": axis("time [s]", anchor="y3")}
         for row, output in enumerate(outputs):
-            axis = "" if row == 0 else str(row + 1)
-            layout[f"yaxis{axis}"] = {
-                "domain": [1.0 - (row + 1) / 3.0 + 0.03, 1.0 - row / 3.0 - 0.01],
-                "title": {"text": label(output)},
-            }
+            place = "" if row == 0 else str(row + 1)
+            layout[f"yaxis{place}"] = axis(label(output), domain=[1.0 - (row + 1) / 3.0 + 0.03, 1.0 - row / 3.0 - 0.01])
             for name, values in lines.items():
-                where = {"xaxis": "x", "yaxis": f"y{axis}", "showlegend": row == 0, "legendgroup": name}
+                where = {"xaxis": "x", "yaxis": f"y{place}", "showlegend": row == 0, "legendgroup": name}
                 data.append(trace(_ROLES[name], NAMES[name], t, values[:, output], **where))
         views.append({"label": f"Set {number}", "data": data, "layout": layout})
     return {"id": f"figure-{figure.number}", "title": figure.title, "views": views, "height": 460}

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from quadid.report.paper_figures import FIGURES
-from quadid.report.paper_tables import Table, all_tables, markdown
+from quadid.report.paper_tables import all_tables, markdown
+from quadid.report.parts import rows_of, section
+from quadid.report.words import effects_words
 
 JsonDict = Mapping[str, Any]
 
@@ -85,7 +87,8 @@ def paper_markdown(result: JsonDict, figures: str) -> str:
         f"{result['version']}. `make reproduce` renews this page.", "",
         f"Three sets of {flight['seconds']:g} s of a simulated Pelican, stabiliser at {flight['stabiliser_rate']:g} "
         "Hz, logged at 50 Hz; set 1 trains, sets 2 and 3 validate and are seen by no fit. The vehicle flies with "
-        f"effects that the paper's model lacks: {_effects(flight['effects'])}. The stabiliser's gains are given.", "",
+        f"effects that the paper's model lacks: {effects_words(flight['effects'])}. The stabiliser's gains are given.",
+        "",
     ]  # fmt: skip
     for table in all_tables(result):
         lines += [f"## {table.title}", "", markdown(table), ""]
@@ -98,31 +101,15 @@ def paper_markdown(result: JsonDict, figures: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _effects(effects: Mapping[str, Mapping[str, float]]) -> str:
-    from quadid.effects import EFFECTS
-
-    parts = []
-    for effect, values in effects.items():
-        told = ", ".join(f"{k} = {v:g} {EFFECTS[effect].parameter(k).unit}" for k, v in values.items())
-        parts.append(f"{effect.replace('_', ' ')} ({told})")
-    return ", ".join(parts)
-
-
 def paper_sections(result: JsonDict, figures: Sequence[JsonDict]) -> dict[str, Any]:
     """The page for `render`: tables, then interactive figures."""
     said = notes(result)
     sections = [
-        {
-            "id": f"table-{i}",
-            "title": t.title,
-            "intro": " ".join(said[t.title]).replace("*", ""),
-            "figures": [],
-            "tables": [_plain(t)],
-        }
+        section(f"table-{i}", t.title, " ".join(said[t.title]).replace("*", ""), tables=[rows_of(t.head, t.rows)])
         for i, t in enumerate(all_tables(result))
     ]
     intro = "The liveliest 20 s of each set; the paper's figures in the same order."
-    sections.append({"id": "figures", "title": "Figures 3 to 8", "intro": intro, "figures": figures, "tables": []})
+    sections.append(section("figures", "Figures 3 to 8", intro, figures))
     return {
         "title": TITLE,
         "subtitle": f"{result['date']}, seed {result['seed']}, three flights of {result['flight']['seconds']:g} s",
@@ -131,10 +118,6 @@ def paper_sections(result: JsonDict, figures: Sequence[JsonDict]) -> dict[str, A
             {"name": "paper", "value": SOURCE.replace("*", "")},
             {"name": "command", "value": result["command"]},
             {"name": "quadid", "value": result["version"]},
-            {"name": "flown with", "value": _effects(result["flight"]["effects"])},
+            {"name": "flown with", "value": effects_words(result["flight"]["effects"])},
         ],
     }
-
-
-def _plain(table: Table) -> dict[str, Any]:
-    return {"head": table.head, "rows": table.rows}

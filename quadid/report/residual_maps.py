@@ -21,11 +21,11 @@ from quadid.identify.segment_cost import Linearised
 from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
-from quadid.report.figures import trace
+from quadid.report.parts import axis, figure, level, trace
 from quadid.turning import conjugate, rotated
 from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
+from quadid.window import Window, beginning
 
 Mode = Literal["value", "slope"]
 
@@ -99,7 +99,7 @@ def residual_map(
         The map, against time only where nothing else of the equation is known; None where the flight lacks the
         channels.
     """
-    shooting = Shooting.cut(_first(windows), vehicle, SCORE_SECONDS)
+    shooting = Shooting.cut(beginning(windows, MOST_SECONDS, 2.0 * SCORE_SECONDS)[0], vehicle, SCORE_SECONDS)
     if not shooting.rollouts or effect not in PAIRS:
         return None
     shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
@@ -125,17 +125,6 @@ def switched_off(layout: Layout, theta: FloatArray, effect: str, names: Sequence
         out[entry.index] = entry.neutral
     if f"{effect}.time" in layout.entries:
         out[layout.entry(f"{effect}.time").index] = NEVER
-    return out
-
-
-def _first(windows: Sequence[Window]) -> list[Window]:
-    out, left = list[Window](), MOST_SECONDS
-    for window in windows:
-        rows = int(left / window.dt)
-        if rows < round(2.0 * SCORE_SECONDS / window.dt):
-            break
-        out.append(window if len(window) <= rows else window.slice(0, rows))
-        left -= len(out[-1]) * window.dt
     return out
 
 
@@ -264,15 +253,10 @@ def map_figure(found: ResidualMap, identifier: str, title: str) -> dict[str, Any
         data.append(trace(role, name, found.x, mean, mode="lines+markers", error_y=bars, showlegend=True))
     unit = f" [{found.against_unit}]" if found.against_unit else ""
     layout = {
-        "xaxis": {"title": {"text": f"{found.against}{unit}"}},
-        "yaxis": {"title": {"text": f"{found.channel} [{found.unit}]"}, "zeroline": True},
+        "xaxis": axis(f"{found.against}{unit}"),
+        "yaxis": axis(f"{found.channel} [{found.unit}]", zeroline=True),
         "hovermode": "closest",
-        "shapes": [{"type": "line", "x0": 0, "x1": 1, "xref": "paper", "y0": 0, "y1": 0, "role": "floor"}],
+        "shapes": [level(0.0)],
     }
-    return {
-        "id": identifier,
-        "title": "What it looks like",
-        "caption": f"mean of measured less simulated {found.channel} against {found.against}; flat at zero is right",
-        "views": [{"label": "", "data": data, "layout": layout}],
-        "height": 280,
-    }
+    caption = f"mean of measured less simulated {found.channel} against {found.against}; flat at zero is right"
+    return figure(identifier, "What it looks like", data, layout, 280, caption=caption)

@@ -36,3 +36,14 @@ def status_words(parameter: Mapping[str, Any]) -> str:
 def decided_before(parameter: Mapping[str, Any]) -> bool:
     """Whether earlier knowledge, such as a `sigma` of the vehicle file, decides the value rather than this flight."""
     return parameter["status"] == "prior_dominated" and bool(parameter.get("measured_before"))
+
+
+def effects_words(effects: Mapping[str, Mapping[str, float]]) -> str:
+    """Effects of a vehicle file with their values: ``motor lag (tau = 0.03 s)``."""
+    from quadid.effects import EFFECTS
+
+    parts = []
+    for effect, values in effects.items():
+        told = ", ".join(f"{k} = {v:g} {EFFECTS[effect].parameter(k).unit}" for k, v in values.items())
+        parts.append(f"{effect.replace('_', ' ')} ({told})")
+    return ", ".join(parts)

@@ -109,6 +109,7 @@ def html(shown: Shown, seed: int, command: str = LIBRARY) -> str:
     from quadid.report.diagnose_page import diagnosis_part
     from quadid.report.identify_page import identify_page
     from quadid.report.page import render
+    from quadid.report.words import effects_words
 
     done = shown.identified
     logs: Sequence[Log] = [*done.logs, *shown.hidden.logs]
@@ -123,18 +124,8 @@ def html(shown: Shown, seed: int, command: str = LIBRARY) -> str:
         ),
         diagnosis_part(
             shown.hidden.result, shown.hidden.sets[-1:], "hidden", HIDDEN_SECTION,
-            f"This vehicle flew with {_hidden_words()}, which the model does not know of.",
+            f"This vehicle flew with {effects_words(HIDDEN)}, which the model does not know of.",
             shown.hidden.maps(),
         ),
     ]  # fmt: skip
     return render(page)
-
-
-def _hidden_words() -> str:
-    from quadid.effects import EFFECTS
-
-    return ", ".join(
-        f"{effect.replace('_', ' ')} ({key} = {value:g} {EFFECTS[effect].parameter(key).unit})"
-        for effect, values in HIDDEN.items()
-        for key, value in values.items()
-    )

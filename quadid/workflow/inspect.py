@@ -12,7 +12,6 @@ from quadid.workflow.loading import (
     LONGEST,
     Log,
     as_vehicle,
-    beginning,
     first_imu_time,
     flown_parts,
     open_recording,
@@ -110,6 +109,7 @@ def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any],
     from quadid.grid import to_windows
     from quadid.identify.excitation import excitation
     from quadid.parameters import NOMINAL_UNITS
+    from quadid.window import beginning
 
     try:
         windows, _ = beginning(to_windows(recording, vehicle), LONGEST)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -203,19 +203,6 @@ def _gridded(recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cu
     zero = first_imu_time(recording)
     limits = [None if limit is None else zero + limit for limit in (cut.start, cut.stop)]
     return grid_recording(recording, vehicle, rate, limits[0], limits[1])
-
-
-def beginning(windows: Iterable[Window], longest: float) -> tuple[list[Window], float]:
-    """The first `longest` seconds of windows, and how long they are [s]; rests of less than a second are left out."""
-    taken: list[Window] = []
-    seconds = 0.0
-    for window in windows:
-        rows = int((longest - seconds) / window.dt)
-        if rows < 1.0 / window.dt:
-            break
-        taken.append(window if len(window) <= rows else window.slice(0, rows))
-        seconds += len(taken[-1]) * window.dt
-    return taken, seconds
 
 
 def parse_columns(texts: Sequence[str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
-from quadid.workflow.loading import LONGEST, beginning, open_recording, parse_cut
+from quadid.workflow.loading import LONGEST, open_recording, parse_cut
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -59,6 +59,7 @@ def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
     """What the fitted logs can tell about each parameter, from `LONGEST` s of them at most."""
     from quadid.identify.excitation import excitation
     from quadid.report.excitation_part import excitation_part
+    from quadid.window import beginning
 
     windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)
     return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)

@@ -256,7 +256,6 @@ def test_short_windows_are_dropped_and_counted() -> None:
     assert gridded.report.dropped == 1
     assert gridded.report.seconds_dropped == pytest.approx(0.38)
     assert len(to_windows(cut, PELICAN, None)) == 2
-    assert len(to_windows(cut, PELICAN, shortest=0.1)) == 2
 
 
 def test_absent_slow_or_wrong_rotor_columns_are_named() -> None:

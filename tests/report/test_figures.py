@@ -13,8 +13,8 @@ from quadid.report.figures import (
     gain_figure,
     liveliest,
     parameter_figure,
-    short,
 )
+from quadid.report.parts import short
 from tests.report.test_page import scored
 
 
