@@ -76,6 +76,22 @@ class NoiseModel:
         """What weights and whitens the channels of a segment; see `whitener`."""
         return _whitening(self._numbers, length, dt)
 
+    def whitened(self, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:
+        """Rows weighted and whitened; channels with masked samples in a segment stay unwhitened there.
+
+        Args:
+            rows: shape (segments, length, channels, columns).
+            weights: 1 where measured, 0 elsewhere, shape (segments, length, channels).
+            dt: time between samples [s].
+        """
+        whitener = self.whitener(rows.shape[1], dt)
+        out = rows * (weights / np.sqrt(self.variance))[..., None]
+        for c in np.flatnonzero(self.coloured):
+            full = np.all(weights[:, :, c] > 0.0, axis=1)
+            scaled = rows[full, :, c] * weights[full, :, c, None]
+            out[full, :, c] = np.matmul(whitener[c], scaled)
+        return out
+
     @property
     def _numbers(self) -> _Numbers:
         shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())

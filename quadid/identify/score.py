@@ -209,7 +209,7 @@ def settle_states(
 
 def _power(shooting: Shooting, lin: Linearised) -> FloatArray:
     """Whitened squares of every segment at its present initial state, shape (segments,); infinite where it ran away."""
-    white = shooting.whiten(lin.residuals[..., None], lin.weights)
+    white = shooting.noise.whitened(lin.residuals[..., None], lin.weights, shooting.dt)
     return np.asarray(np.nan_to_num(np.sum(white**2, axis=(1, 2, 3)), nan=np.inf))
 
 

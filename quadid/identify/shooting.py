@@ -27,8 +27,9 @@ from quadid.identify.segment_jacobian import Columns
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
-from quadid.model.rollout import Rollout, shared_rollout
+from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.model.shared_rollout import shared_rollout
 from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -275,7 +276,7 @@ class Shooting:
             base = lanes[..., :1].copy()
             rows = np.concatenate([(lanes[..., 1 : 1 + len(steps)] - base) / steps, base], axis=3)
             del lanes
-            white = self.whiten(rows, weights)
+            white = self.noise.whitened(rows, weights, self.dt)
             del rows
             flat = white.reshape(len(white), -1, len(steps) + 1)
             ridge = np.repeat(np.diag(1.0 / RIDGE[:k])[None], len(flat), axis=0)
@@ -285,16 +286,6 @@ class Shooting:
                 white[..., -1], np.all(weights > 0.0, axis=1), flat[..., k:-1], base[..., 0], weights,
                 np.sqrt(self.noise.variance), self.noise.coloured, whitener,
             )  # fmt: skip
-
-    def whiten(self, rows: FloatArray, weights: FloatArray) -> FloatArray:
-        """Weights and whitens rows of shape (segments, length, channels, columns); masked channels stay unwhitened."""
-        whitener = self.noise.whitener(self.length, self.dt)
-        out = rows * (weights / np.sqrt(self.noise.variance))[..., None]
-        for c in np.flatnonzero(self.noise.coloured):
-            full = np.all(weights[:, :, c] > 0.0, axis=1)
-            scaled = rows[full, :, c] * weights[full, :, c, None]
-            out[full, :, c] = np.matmul(whitener[c], scaled)
-        return out
 
 
 def _uses(places: tuple[int, ...], theta: FloatArray, free: Free) -> bool:

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from queue import SimpleQueue
 from typing import NamedTuple
-from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -292,19 +291,3 @@ class Rollout:
                 nearest = good[np.argmin(np.abs(rows[:, None] - good[None, :]), axis=1)] if len(good) < len(w) else rows
                 x0[:, place : place + values.shape[1]] = values[nearest]
         return x0
-
-
-_SHARED: WeakValueDictionary[tuple[int, int], Rollout] = WeakValueDictionary()
-
-
-def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
-    """The `Rollout` of this very window and vehicle that somebody still uses, or a new one.
-
-    Problems with segments of several lengths look at the same data; of a long log each copy would be a large part of
-    all memory.
-    """
-    key = (id(window), id(vehicle))  # of objects that the one found keeps alive
-    found = _SHARED.get(key)
-    if found is None:
-        found = _SHARED[key] = Rollout(window, vehicle)
-    return found

@@ -7,13 +7,12 @@ import math
 
 import numpy as np
 
-from quadid.chi_square import exceeded
 from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.layout import B, Layout
 from quadid.model.thrust import ThrustModel
-from quadid.online.fusion import DRIFT, Fused, Fusion, WindowEstimate
+from quadid.online.fusion import DRIFT, Fusion, WindowEstimate
 from quadid.online.gate import Case
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
@@ -23,8 +22,6 @@ from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
-AGREEMENT_PROBABILITY = 1e-3
-"""A window disagrees with the fused estimate when a distance like its own is less probable than this."""
 HELD_OUT_WINDOWS = 4
 """Newest windows without a common sample in which sets are compared."""
 NOISE_EVERY = 5
@@ -50,6 +47,7 @@ class Estimator:
         fusion: the fused windows.
         misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
         theta: full parameter vector, the best at hand.
+        noise: pooled sensor noise; None before the first fit.
         learned: whether `theta` rests on data.
         excitation: of the newest window, shape (6,); NaN before.
         start: first time of the data learned from [s]; NaN before.
@@ -74,7 +72,7 @@ class Estimator:
         prior = prior_of(model)
         self._prior_sigma = prior.sigma
         self.fusion = Fusion(np.log(prior.mean), prior.sigma, self._memory)
-        self._noise: NoiseModel | None = None
+        self.noise: NoiseModel | None = None
         self._pool = 0
         self.theta = self._initial
         self.misfit = np.full(6, np.nan)
@@ -98,11 +96,6 @@ class Estimator:
     def input_hash(self) -> str:
         """SHA-256 (hex) over vehicle, seed and all windows learned from."""
         return self._hash.hex()
-
-    @property
-    def noise(self) -> NoiseModel | None:
-        """Pooled sensor noise; None before the first fit."""
-        return self._noise
 
     @property
     def z_sigma(self) -> FloatArray:
@@ -145,7 +138,7 @@ class Estimator:
         self._asked = windows
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
-            number, self.model, windows, start, stop, self.theta, self._noise, self._search, self._seed, measure,
+            number, self.model, windows, start, stop, self.theta, self.noise, self._search, self._seed, measure,
             self.flexible,
         )  # fmt: skip
 
@@ -183,8 +176,8 @@ class Estimator:
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
             return
-        if self._noise is None or self._search or not np.array_equal(reply.noise.white, self._noise.white):
-            self._noise, self._pool = reply.noise, 1  # the first one, or the fit had to find it anew
+        if self.noise is None or self._search or not np.array_equal(reply.noise.white, self.noise.white):
+            self.noise, self._pool = reply.noise, 1  # the first one, or the fit had to find it anew
             return
         if reply.measured is None:
             return
@@ -192,9 +185,9 @@ class Estimator:
         share = 1.0 / self._pool
         white, slow = (
             np.sqrt((1.0 - share) * old**2 + share * new**2)
-            for old, new in ((self._noise.white, reply.measured.white), (self._noise.slow, reply.measured.slow))
+            for old, new in ((self.noise.white, reply.measured.white), (self.noise.slow, reply.measured.slow))
         )
-        self._noise = NoiseModel(white, slow, self._noise.slow_time)
+        self.noise = NoiseModel(white, slow, self.noise.slow_time)
 
     def parameters(self) -> ParameterSet | None:
         """The fused estimate with intervals and status; None before data."""
@@ -252,9 +245,8 @@ class Estimator:
             unexplained: as in `Case`.
             unproven: as in `Case`.
         """
-        fused = self.fusion.estimate()
-        assert fused is not None
-        agreeing, disagreement = self._agreement(fused, max(most, 3))
+        agreeing, odd = self.fusion.agreement(max(most, 3))
+        disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
         gains = self._held_out(in_force, seen)
         ratio = self._thrust_ratio()
         return Case(
@@ -272,30 +264,15 @@ class Estimator:
             return newest.mse, math.nan
         return newest.mse, newest.mse + newest.deviance(earlier) / newest.scale / max(newest.rows, 1.0)
 
-    def _agreement(self, fused: Fused, most: int) -> tuple[int, str]:
-        limit = exceeded(AGREEMENT_PROBABILITY, len(fused.z))
-        agreeing = 0
-        for window in self.fusion.disjoint(most):
-            if self.fusion.distance(window, fused.z) > limit:
-                return agreeing, self._worst(window, fused)
-            agreeing += 1
-        return agreeing, ""
-
-    def _worst(self, window: WindowEstimate, fused: Fused) -> str:
-        spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.fusion.drift**2)
-        j = int(np.argmax(np.abs(window.z - fused.z) / spread))
-        return f"{NOMINAL_NAMES[j]} differs by {np.expm1(window.z[j] - fused.z[j]):+.1%} in one of them"
-
     def _walked(self, most: int) -> dict[str, tuple[float, float]]:
         """Change of torque over inertia (log) from the oldest to the newest of the windows, and its deviation."""
-        windows = self.fusion.disjoint(most)
-        newest, oldest = self.fusion.alone(windows[0]), self.fusion.alone(windows[-1])
         out = {}
-        for name in ("J_xx", "J_yy") if len(windows) > 1 else ():
-            share = np.zeros(len(newest.z))
-            share[0], share[NOMINAL_NAMES.index(name)] = 1.0, -1.0
-            variance = share @ (newest.covariance + oldest.covariance) @ share
-            out[name] = float(share @ (newest.z - oldest.z)), math.sqrt(variance)
+        for name in ("J_xx", "J_yy"):
+            share = np.zeros(len(NOMINAL_NAMES))
+            share[B], share[NOMINAL_NAMES.index(name)] = 1.0, -1.0
+            walked = self.fusion.walked(share, most)
+            if walked is not None:
+                out[name] = walked
         return out
 
     def _held_out(self, in_force: OnlineSet | None, seen: float) -> tuple[float, ...]:

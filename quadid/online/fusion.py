@@ -22,6 +22,8 @@ CHANGE_PROBABILITY = 1e-5
 """A window whose disagreement with the fused estimate is less probable than this tells a change, if the next agrees."""
 SCATTER_PRIOR = 30.0
 """Degrees of freedom with which windows are believed to scatter as they claim."""
+AGREEMENT_PROBABILITY = 1e-3
+"""A window disagrees with the fused estimate when a distance like its own is less probable than this."""
 KEPT_WINDOWS = 120
 """Window estimates kept for agreement and held-out gain."""
 
@@ -204,6 +206,36 @@ class Fusion:
         own = self.alone(window)
         difference = own.z - z
         return float(difference @ np.linalg.solve(own.covariance + np.diag(self.drift**2), difference))
+
+    def agreement(self, most: int) -> tuple[int, tuple[int, float] | None]:
+        """How many of the newest disjoint windows agree in a row with the fused estimate, `most` at most.
+
+        And of the first that does not: which parameter is farthest off, and by how much, log scale.
+        """
+        fused = self.estimate()
+        windows = self.disjoint(most) if fused is not None else []
+        limit = exceeded(AGREEMENT_PROBABILITY, len(self._mean))
+        for agreeing, window in enumerate(windows):
+            if fused is not None and self.distance(window, fused.z) > limit:
+                spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.drift**2)
+                away = window.z - fused.z
+                farthest = int(np.argmax(np.abs(away) / spread))
+                return agreeing, (farthest, float(away[farthest]))
+        return len(windows), None
+
+    def walked(self, share: FloatArray, most: int) -> tuple[float, float] | None:
+        """Change of a sum of parameters from the oldest to the newest of disjoint windows, and its deviation.
+
+        Args:
+            share: of each parameter in the sum, shape (P,).
+            most: windows at most; None where there are fewer than two.
+        """
+        windows = self.disjoint(most)
+        if len(windows) < 2:
+            return None
+        newest, oldest = self.alone(windows[0]), self.alone(windows[-1])
+        variance = share @ (newest.covariance + oldest.covariance) @ share
+        return float(share @ (newest.z - oldest.z)), math.sqrt(variance)
 
     def _before(self, start: float) -> _Sum | None:
         return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)

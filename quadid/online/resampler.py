@@ -173,14 +173,6 @@ class Resampler:
             self.counts[name] += len(times)
             self.last[name] = max(self.last.get(name, -math.inf), newest)
 
-    def next_rows(self) -> Rows | None:
-        """The next block of rows, or None until enough has arrived."""
-        while self.busy:
-            rows = self.work()
-            if rows is not None:
-                return rows
-        return None
-
     @property
     def busy(self) -> bool:
         """Whether there is a piece of `work`."""

@@ -26,24 +26,21 @@ from quadid.online.change_supervisor import ChangeSupervisor
 from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
-from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.grid_buffer import GridBuffer
 from quadid.online.health_supervisor import HealthSupervisor
 from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action, Outbox
-from quadid.online.quality import Quality, judge
+from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, Phase, Publish, SetState
 from quadid.online.resampler import Resampler, Rows
 from quadid.online.settings import SessionSettings
 from quadid.online.status import SessionStatus
 from quadid.online.supervisor import Supervisor
 from quadid.online.window_fit import is_excited
+from quadid.online.window_supervisor import WindowSupervisor
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 
-LEAD = 0.22
-"""Flight before a window in which filters and delays settle [s]."""
-SHORT_WINDOW = 4.0
-"""Least data for a fit that a person asked for [s]."""
 _EPS = 1e-6
 _DONE = object()
 
@@ -74,7 +71,6 @@ class Session:
         self.settings = settings or SessionSettings()
         self.resampler = Resampler(vehicle, self.settings.rate)
         self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline)
-        self._vehicle = vehicle
         self._outbox = Outbox(self.resampler.time.stamp)
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
         self._store = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
@@ -86,14 +82,13 @@ class Session:
         self._supervisor = Supervisor(
             self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency
         )
-        self._cut = Cut((), 0.0, 0)
+        self._windows = WindowSupervisor(vehicle, self._store, self.settings, self._outbox, self._supervisor)
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
         self._land: Callable[[Any], Iterator[None]] = iter
         self._outdated = 0
-        self._now, self._tick_at, self._last_fit = -math.inf, math.nan, -math.inf
+        self._now, self._tick_at = -math.inf, math.nan
         self._work: Iterator[None] | None = None
-        self._asked_now = False
         self._number = 0
         if self.active_set.in_force is not None:
             self._estimator.start_from(self.active_set.in_force)
@@ -134,7 +129,7 @@ class Session:
 
     def fit_now(self) -> Answer:
         """Fits what there is at the next tick, without waiting for a full window."""
-        self._asked_now = True
+        self._windows.hurry()
         return Answer(True, "a fit follows at the next tick of the data")
 
     # --- output
@@ -172,16 +167,16 @@ class Session:
     def status(self) -> SessionStatus:
         """What the session is doing now."""
         newest, active_set = self.resampler.time.newest, self.active_set
-        windows = self._estimator.fusion.windows
+        windows, cut = self._estimator.fusion.windows, self._windows.cut
         force, pending = active_set.in_force, active_set.pending
         return SessionStatus(
             t=self._outbox.stamp(newest),
             phase=Phase.FITTING if self._waiting is not None else self._outbox.phase,
             reason=self._outbox.reason,
             excitation=self._estimator.excitation,
-            samples=sum(len(w) for w in self._cut.windows),
-            window_seconds=self._cut.seconds,
-            gaps=self._cut.gaps,
+            samples=sum(len(w) for w in cut.windows),
+            window_seconds=cut.seconds,
+            gaps=cut.gaps,
             mse=windows[-1].mse if windows else math.nan,
             fits=self._supervisor.fits,
             rejected=self._supervisor.rejected,
@@ -246,7 +241,7 @@ class Session:
         yield
         if self._change_supervisor.seen is not None:
             self._explain(tick)
-        elif self._asked_now or tick - self._last_fit >= self.settings.refit - _EPS:
+        elif self._windows.due(tick):
             yield from self._fit(tick)
 
     def _study(self, tick: float) -> None:
@@ -275,35 +270,10 @@ class Session:
             self._outbox.act(request)
 
     def _fit(self, tick: float) -> Iterator[None]:
-        wanted = self.settings.window
-        if self._asked_now:
-            self._asked_now, wanted = False, min(SHORT_WINDOW, wanted)
-        start = max(tick - self.settings.window - LEAD, self._supervisor.learn_from)
-        self._cut = self._store.cut(start - _EPS, tick - _EPS)
-        if self._cut.reason or tick - start < wanted - 0.5:
-            self._incomplete(tick, start)
-            return
-        yield
-        estimator = self._estimator
-        quality = judge(self._cut.windows, self._vehicle, estimator.thrust, estimator.learned)
-        self._supervisor.quality = quality
-        if quality != Quality():
-            phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
-            self._outbox.note(tick, phase, quality.fault or quality.grounded)
-            return
-        yield
-        self._last_fit = tick
-        start = max(start, tick - self.settings.window)
-        request = self._estimator.request(self._number + 1, self._cut.windows, start, tick)
-        self._await(request, partial(self._supervisor.fitted, request))
-        self._outbox.act(request)
-
-    def _incomplete(self, tick: float, start: float) -> None:
-        if self._cut.blocked:
-            self._outbox.note(tick, Phase.BLOCKED, self._cut.reason)
-            return
-        have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
-        self._outbox.state(Phase.COLLECTING, f"{have}; {self._cut.reason or 'no gaps'}")
+        request = yield from self._windows.ask(self._number + 1, tick, self._estimator)
+        if request is not None:
+            self._await(request, partial(self._supervisor.fitted, request))
+            self._outbox.act(request)
 
     def _apply(self) -> Iterator[None]:
         request, reply = self._waiting, self._reply

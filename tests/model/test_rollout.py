@@ -12,8 +12,9 @@ from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, shared_rollout
+from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
+from quadid.model.shared_rollout import shared_rollout
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -12,7 +12,7 @@ from quadid.online.channel_buffer import ChannelBuffer
 from quadid.online.resampler import Resampler, Rows
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Recording
-from tests.online.test_resampler import same
+from tests.online.test_resampler import next_rows, same
 
 PELICAN = Vehicle.shipped("pelican")
 STEP = 0.05
@@ -39,9 +39,9 @@ def both_ways(stream: list[Block]) -> tuple[list[Rows], list[Rows], Resampler, R
         whole.push_block(block)
         for sample in block.samples():
             single.push(sample)
-        while (rows := whole.next_rows()) is not None:
+        while (rows := next_rows(whole)) is not None:
             a.append(rows)
-        while (rows := single.next_rows()) is not None:
+        while (rows := next_rows(single)) is not None:
             b.append(rows)
     return a, b, whole, single
 

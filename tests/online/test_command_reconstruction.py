@@ -17,6 +17,7 @@ from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import Stabiliser
 from quadid.window import Recording
 from tests.online.driving import drive, samples
+from tests.online.test_resampler import next_rows
 
 PELICAN = Vehicle.shipped("pelican")
 HOVER = PELICAN.hover_speed(PELICAN.parameters["b"].initial)
@@ -37,7 +38,7 @@ def test_the_commands_are_those_of_the_vehicle(rate: float) -> None:
     for sample in samples(without_rotors(flight.recording)):
         steered.push(sample)
     differences, count = [], 0
-    while (a := told.next_rows()) is not None and (b := steered.next_rows()) is not None:
+    while (a := next_rows(told)) is not None and (b := next_rows(steered)) is not None:
         both = np.isfinite(a.columns["rotor_speed"]).all(axis=1) & np.isfinite(b.columns["rotor_speed"]).all(axis=1)
         differences.append((a.columns["rotor_speed"][both] ** 2 - b.columns["rotor_speed"][both] ** 2) / HOVER**2)
         if both.all():

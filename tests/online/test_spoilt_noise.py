@@ -55,7 +55,7 @@ def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, 
     learner.take(fitted(windows, None, search=True), trusted=True)
     assert learner.noise is not None
     good = learner.noise
-    learner._noise = spoilt(len(good.white))
+    learner.noise = spoilt(len(good.white))
     asked = learner.request(2, windows, 0.0, 10.0)
     assert asked.noise is not None
     assert asked.noise.white[0] == 3.0

@@ -8,8 +8,8 @@ import pytest
 from quadid.identify.shooting import Shooting
 from quadid.online import SessionSettings
 from quadid.online.grid_buffer import SHORTEST
-from quadid.online.session import LEAD
 from quadid.online.window_fit import FIT_SECONDS
+from quadid.online.window_supervisor import LEAD
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 

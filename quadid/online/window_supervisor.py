@@ -1,0 +1,82 @@
+"""From rows to the request of a fit: when the next window is due, what it holds, and whether it may be learned from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+from quadid.online.estimator import Estimator
+from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.outbox import Outbox
+from quadid.online.quality import Quality, judge
+from quadid.online.records import Phase
+from quadid.online.settings import SessionSettings
+from quadid.online.supervisor import Supervisor
+from quadid.online.window_fit import FitRequest
+from quadid.vehicle import Vehicle
+
+LEAD = 0.22
+"""Flight before a window in which filters and delays settle [s]."""
+SHORT_WINDOW = 4.0
+"""Least data for a fit that a person asked for [s]."""
+_EPS = 1e-6
+
+
+class WindowSupervisor:
+    """Cuts the windows of one session.
+
+    Attributes:
+        cut: the newest window, complete or not.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, store: GridBuffer, settings: SessionSettings, outbox: Outbox, supervisor: Supervisor
+    ) -> None:
+        """Cuts the rows of `store`, which are of `vehicle`."""
+        self._vehicle, self._store, self._settings = vehicle, store, settings
+        self._outbox, self._supervisor = outbox, supervisor
+        self.cut = Cut((), 0.0, 0)
+        self._last_fit, self._asked_now = -math.inf, False
+
+    def hurry(self) -> None:
+        """Makes the next tick due, without waiting for a full window."""
+        self._asked_now = True
+
+    def due(self, tick: float) -> bool:
+        """Whether it is time for a fit."""
+        return self._asked_now or tick - self._last_fit >= self._settings.refit - _EPS
+
+    def ask(self, number: int, tick: float, estimator: Estimator) -> Generator[None, None, FitRequest | None]:
+        """The fit of the window before `tick` [s], piece by piece; None, and the outbox says why, where it cannot be.
+
+        Args:
+            number: of the request.
+            tick: now [s].
+            estimator: what asks for the fit.
+        """
+        wanted = self._settings.window
+        if self._asked_now:
+            self._asked_now, wanted = False, min(SHORT_WINDOW, wanted)
+        start = max(tick - self._settings.window - LEAD, self._supervisor.learn_from)
+        self.cut = self._store.cut(start - _EPS, tick - _EPS)
+        if self.cut.reason or tick - start < wanted - 0.5:
+            self._incomplete(tick, start)
+            return None
+        yield
+        quality = judge(self.cut.windows, self._vehicle, estimator.thrust, estimator.learned)
+        self._supervisor.quality = quality
+        if quality != Quality():
+            phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
+            self._outbox.note(tick, phase, quality.fault or quality.grounded)
+            return None
+        yield
+        self._last_fit = tick
+        start = max(start, tick - self._settings.window)
+        return estimator.request(number, self.cut.windows, start, tick)
+
+    def _incomplete(self, tick: float, start: float) -> None:
+        if self.cut.blocked:
+            self._outbox.note(tick, Phase.BLOCKED, self.cut.reason)
+            return
+        have = f"{max(tick - start, 0.0):.0f} of {self._settings.window:g} s of flight"
+        self._outbox.state(Phase.COLLECTING, f"{have}; {self.cut.reason or 'no gaps'}")
