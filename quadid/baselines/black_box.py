@@ -11,10 +11,8 @@ from quadid.baselines.order import choose_order
 from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, quadrotor_io
 from quadid.baselines.state_space import SubspaceModel, predict
 from quadid.baselines.subspace import fit_subspace
-from quadid.errors import NotIdentifiableError
 from quadid.identify.noise_model import NoiseModel
-from quadid.identify.score import SCORE_SECONDS, covering, expected_squares
-from quadid.identify.shooting import Shooting
+from quadid.identify.score import SCORE_SECONDS, expected_squares, scored_problem
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -71,10 +69,7 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
     """
-    shooting = Shooting.cut(windows, vehicle, SCORE_SECONDS)
-    if not shooting.rollouts:
-        raise NotIdentifiableError("no stretch is long enough to be scored", f"{SCORE_SECONDS + 0.4:g} s without gaps")
-    shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
+    shooting = scored_problem(windows, vehicle, noise)
     expected = expected_squares(shooting, Layout(vehicle).initial(vehicle)).sum(axis=0)[:_CHANNELS]
     squares, samples = np.zeros(_CHANNELS), np.zeros(_CHANNELS)
     for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):

@@ -96,13 +96,7 @@ def mse_score(
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
     """
-    shooting = Shooting.cut(windows, vehicle, SCORE_SECONDS)
-    if not shooting.rollouts:
-        raise NotIdentifiableError(
-            f"{windows[0].name or 'window'}: no stretch is long enough to be scored",
-            f"{SCORE_SECONDS + 0.4:g} s without gaps", "record longer stretches at a steady rate",
-        )  # fmt: skip
-    shooting = shooting.with_noise(covering(noise, shooting.channels, vehicle))
+    shooting = scored_problem(windows, vehicle, noise)
     lin = settle_states(shooting, theta)
     series = _series(shooting, lin)
     known = shooting.channels if noise is None else len(noise.white)
@@ -162,6 +156,17 @@ def tallied(shooting: Shooting, theta: FloatArray, lin: Linearised | None = None
         np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1)), expected,
         np.count_nonzero(used, axis=(0, 1)).astype(np.float64), not np.isfinite(lin.cost).all(),
     )  # fmt: skip
+
+
+def scored_problem(windows: Sequence[Window], vehicle: Vehicle, noise: NoiseModel | None) -> Shooting:
+    """The segments that scores are made of, weighted by `noise`; raises NotIdentifiableError where there are none."""
+    shooting = Shooting.cut(windows, vehicle, SCORE_SECONDS)
+    if not shooting.rollouts:
+        raise NotIdentifiableError(
+            f"{windows[0].name or 'window'}: no stretch is long enough to be scored",
+            f"{SCORE_SECONDS + 0.4:g} s without gaps", "record longer stretches at a steady rate",
+        )  # fmt: skip
+    return shooting.with_noise(covering(noise, shooting.channels, vehicle))
 
 
 def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:

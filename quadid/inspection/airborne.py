@@ -72,6 +72,11 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
     return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= _FLIGHT)
 
 
+def within(t: FloatArray, spans: Spans) -> BoolArray:
+    """Which of the times [s], shape (n,), lie in one of the spans."""
+    return np.asarray(np.any([np.zeros(len(t), dtype=bool), *((t >= a) & (t <= b) for a, b in spans)], axis=0))
+
+
 def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, float]:
     """Returns relative thrust and the value that hovers."""
     values = channel.values

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.inspection.airborne import Spans
+from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
 from quadid.resample import sample_period
 from quadid.resampling_plan import GAP
@@ -84,7 +84,7 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     accel = recording.channels.get("accel")
     if accel is None:
         return Check("gravity", Verdict.UNKNOWN, "no accelerometer")
-    values = accel.values[_inside(accel.t, spans)] if spans else accel.values
+    values = accel.values[within(accel.t, spans)] if spans else accel.values
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
     numbers = {"length": length, "z": z}
@@ -203,10 +203,6 @@ def velocity_check(recording: Recording) -> Check:
         return Check("velocity_attitude", Verdict.ERROR, message, "use NED for both; ROS' ENU swaps x and y", numbers)
     message = f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
     return Check("velocity_attitude", Verdict.OK, message, numbers=numbers)
-
-
-def _inside(t: FloatArray, spans: Spans) -> BoolArray:
-    return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0))
 
 
 def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from quadid.inspection.airborne import Spans
+from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
 from quadid.inspection.motor_checks import Lagged
 from quadid.types import FloatArray
@@ -71,7 +71,7 @@ def _load(recording: Recording, spans: Spans) -> float:
     accel = recording.channels.get("accel")
     if accel is None:
         return 1.0
-    inside = np.any([(accel.t >= a) & (accel.t <= b) for a, b in spans], axis=0) if spans else np.zeros(0, np.bool_)
+    inside = within(accel.t, spans)
     load = -float(np.mean(accel.values[inside, 2])) / GRAVITY if inside.any() else 1.0
     return load if 0.8 < load < 1.5 else 1.0
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from quadid.errors import QuadidError
 from quadid.grid import to_windows
-from quadid.inspection.airborne import Spans
+from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
 from quadid.model.thrust import ThrustModel
 from quadid.resample import moving_mean
@@ -36,8 +36,8 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
         return Check("hover", Verdict.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
-    inside = np.any([(signal.t >= a) & (signal.t <= b) for a, b in spans], axis=0) if spans else None
-    if inside is None or not inside.any():
+    inside = within(signal.t, spans)
+    if not inside.any():
         return Check("hover", Verdict.UNKNOWN, "the vehicle does not fly in this log, as far as the rotors tell")
     speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
     guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.errors import QuadidError
-from quadid.inspection.airborne import Spans
+from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import BoolArray, FloatArray
@@ -43,7 +43,7 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     except QuadidError as error:
         return Check(name, Verdict.UNKNOWN, error.found)
     edges = _edges(spans)
-    inside = _flying(signal.t, spans)
+    inside = within(signal.t, spans)
     if len(edges) < 4 or np.count_nonzero(inside) < 20:
         return Check(name, Verdict.UNKNOWN, "too little flight to compare the rotors")
     squares, known = _means(signal.t, signal.values**2, edges, spans)
@@ -57,10 +57,6 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     if problem is not None:
         return Check(name, Verdict.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
     return Check(name, Verdict.OK, "the rotors agree with each other and with the thrust felt")
-
-
-def _flying(t: FloatArray, spans: Spans) -> BoolArray:
-    return np.asarray(np.any([(t >= a) & (t <= b) for a, b in spans], axis=0)) if spans else np.zeros(len(t), np.bool_)
 
 
 def _edges(spans: Spans) -> FloatArray:

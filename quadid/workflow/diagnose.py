@@ -139,8 +139,7 @@ class Diagnosed(Outcome):
         """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
         from quadid.report.residual_maps import residual_map
 
-        count = sum(s.role == "train" for s in self.sets)
-        windows = [w for log in self.logs[:count] for w in log.windows]
+        windows = [w for log in self._train for w in log.windows]
         model = self.workings.search.model
         drawn = {
             c.effect: residual_map(windows, self.nominal, model.theta, c.effect, c.names, self.noise)
