@@ -110,7 +110,7 @@ def run_optimiser(
     trials = []
     for seed in seeds[:1] if name in SEEDLESS else seeds:
         found = minimise(
-            name, problem.cost, problem.start, problem.lower, problem.upper, budget, seed, problem.residual, None, clock
+            name, problem.cost, problem.start, problem.lower, problem.upper, budget, seed, problem.residual, clock
         )
         trials.append(Trial(seed, found.x, found.cost, found.evaluations, found.seconds, found.stop.value))
     return Tried(name, tuple(trials))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError
-from quadid.identify.particle_swarm import checked_box, read_only
+from quadid.identify.particle_swarm import checked_box, place, read_only
 from quadid.types import FloatArray, IntArray
 
 SMALLEST_POPULATION = 4
@@ -94,7 +94,7 @@ class LShade:
             )
         self.budget, self._rng = budget, np.random.default_rng(seed)
         self._trials = self._lower + (self._upper - self._lower) * self._rng.random((self._first_size, n))
-        self._place_initial_points()
+        place(self.options.initial_points, self._trials, self._lower, self._upper)
         self._x, self._cost = np.empty((0, n)), np.empty(0)
         self._archive = np.empty((0, n))
         # Algorithm 2, line 4: all entries of M_CR and M_F are 0.5; NaN stands for the terminal value of M_CR.
@@ -138,16 +138,6 @@ class LShade:
     def population(self) -> int:
         """Present number of individuals."""
         return len(self._x) or self._first_size
-
-    def _place_initial_points(self) -> None:
-        if self.options.initial_points is None:
-            return
-        points = np.atleast_2d(np.array(self.options.initial_points, dtype=np.float64))
-        if points.shape[1:] != self._lower.shape or len(points) > len(self._trials):
-            raise ParameterError(f"initial points of shape {points.shape}", f"up to {self._trials.shape}")
-        if not np.all((points >= self._lower) & (points <= self._upper)):
-            raise ParameterError("an initial point outside the box", "lower <= point <= upper", "clip it to the box")
-        self._trials[: len(points)] = points
 
     def _breed(self) -> None:
         size, n = self._x.shape

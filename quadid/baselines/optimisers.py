@@ -23,9 +23,6 @@ from quadid.identify.particle_swarm import Stop as SwarmStop
 from quadid.identify.particle_swarm import Swarm, SwarmOptions, checked_box, read_only
 from quadid.types import FloatArray
 
-Polish = Callable[[Batch, FloatArray, FloatArray, FloatArray], FloatArray]
-"""A local search: (residual (k, n) -> (k, m), start (n,), lower (n,), upper (n,)) -> better point (n,)."""
-
 
 class Stop(StrEnum):
     """How an optimiser ended."""
@@ -65,7 +62,6 @@ def minimise(
     budget: int,
     seed: int,
     residual: Batch | None = None,
-    polish: Polish | None = None,
     clock: Callable[[], float] | None = None,
 ) -> Result:
     """Minimises a cost in a box with the optimiser called `name`.
@@ -80,7 +76,6 @@ def minimise(
         seed: of all randomness.
         residual: (k, n) -> (k, m), for ``least_squares`` and ``pso_polish``; half its sum of squares is minimised, so
             the cost should rise and fall with that.
-        polish: local search of ``pso_polish``; by default scipy's least squares.
         clock: returns seconds, for `Result.seconds`.
 
     Raises:
@@ -98,17 +93,17 @@ def minimise(
         raise ParameterError(f"'{name}' without a residual", "a function (k, n) -> (k, m)", "pass residual=")
     ledger = Ledger(cost_batch, residual, low, high, budget)
     begin = clock() if clock else math.nan
-    stop = _run(name, ledger, ledger.to_unit(start), seed, polish)
+    stop = _run(name, ledger, ledger.to_unit(start), seed)
     seconds = clock() - begin if clock else math.nan
     x = start if ledger.best is None else ledger.to_box(ledger.best)
     return Result(read_only(x), ledger.best_cost, ledger.evaluations, seconds, stop)
 
 
-def _run(name: str, ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _run(name: str, ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     kept = 1 if name in NEED_RESIDUAL else 0  # pays for the cost of the least residual
     ledger.budget -= kept
     try:
-        stop = _SOLVERS[name](ledger, start, seed, polish)
+        stop = _SOLVERS[name](ledger, start, seed)
     except BudgetSpentError:
         stop = Stop.BUDGET
     except NoGradientError:
@@ -119,12 +114,12 @@ def _run(name: str, ledger: Ledger, start: FloatArray, seed: int, polish: Polish
     return stop
 
 
-def _initial(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _initial(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     ledger.cost(start[None])
     return Stop.NOT_RUN
 
 
-def _quasi_newton(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _quasi_newton(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """L-BFGS-B (Byrd et al. 1995, doi:10.1137/0916069) with forward differences."""
     import scipy.optimize
 
@@ -135,7 +130,7 @@ def _quasi_newton(ledger: Ledger, start: FloatArray, seed: int, polish: Polish |
     return Stop.CONVERGED if found.success else Stop.STALLED
 
 
-def _least_squares(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _least_squares(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """Trust-region reflective least squares (Branch, Coleman & Li 1999, doi:10.1137/S1064827595289108)."""
     from scipy.optimize import least_squares
 
@@ -157,7 +152,7 @@ def _least_squares(ledger: Ledger, start: FloatArray, seed: int, polish: Polish 
     return Stop.CONVERGED if found.status > 0 else Stop.STALLED
 
 
-def _differential_evolution(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _differential_evolution(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """Storn & Price 1997 (doi:10.1023/A:1008202821328), best1bin, vectorised, no polish."""
     import scipy.optimize
 
@@ -172,7 +167,7 @@ def _differential_evolution(ledger: Ledger, start: FloatArray, seed: int, polish
     return Stop.CONVERGED if found.success else Stop.STALLED
 
 
-def _cma_es(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _cma_es(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """CMA-ES (Hansen 2016, arXiv:1604.00772) by pycma, initial step a quarter of the box, bounds by transformation."""
     import cma
 
@@ -191,7 +186,7 @@ def _cma_es(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None)
     return Stop.CONVERGED if met else Stop.STALLED
 
 
-def _l_shade(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _l_shade(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """L-SHADE with the published settings; a small budget gets a population it can afford for ten generations."""
     n = len(start)
     population = max(SMALLEST_POPULATION, min(18 * n, ledger.budget // 10))
@@ -215,36 +210,30 @@ def _swarm(ledger: Ledger, start: FloatArray, seed: int, particles: int, options
     return ends.get(swarm.stop, Stop.BUDGET)
 
 
-def _pso(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _pso(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """The constriction swarm, 4 n particles, the start among them."""
     particles = _particles(len(start), ledger.budget)
     options = SwarmOptions(iterations=ledger.budget // particles, initial_points=start)
     return _swarm(ledger, start, seed, particles, options)
 
 
-def _pso_algorithm_1(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _pso_algorithm_1(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """The paper's Algorithm 1 as printed: one particle at a time, all particles random, inertia weight 0.9 to 0.4."""
     particles = _particles(len(start), ledger.budget)
     ledger.cost(start[None])
     return _swarm(ledger, start, seed, particles, SwarmOptions.algorithm_1(ledger.budget // particles))
 
 
-def _pso_polish(ledger: Ledger, start: FloatArray, seed: int, polish: Polish | None) -> Stop:
+def _pso_polish(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """A short swarm to find the basin (64 n evaluations, at most half the budget), then a local search."""
     n, swarm_budget = len(start), min(64 * len(start), ledger.budget // 2)
     particles = _particles(n, swarm_budget)
     options = SwarmOptions(iterations=max(swarm_budget // particles - 1, 1), initial_points=start)
     _swarm(ledger, start, seed, particles, options)
-    best = start if ledger.best is None else ledger.best
-    if polish is None:
-        return _least_squares(ledger, best, seed, None)
-    low, high = ledger.to_box(np.zeros(n)), ledger.to_box(np.ones(n))
-    polished = polish(lambda x: ledger.residual(ledger.to_unit(x)), ledger.to_box(best), low, high)
-    ledger.cost(ledger.to_unit(polished)[None])
-    return Stop.CONVERGED
+    return _least_squares(ledger, start if ledger.best is None else ledger.best, seed)
 
 
-_SOLVERS: dict[str, Callable[[Ledger, FloatArray, int, Polish | None], Stop]] = {
+_SOLVERS: dict[str, Callable[[Ledger, FloatArray, int], Stop]] = {
     "initial": _initial,
     "quasi_newton": _quasi_newton,
     "least_squares": _least_squares,

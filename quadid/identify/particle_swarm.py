@@ -148,7 +148,7 @@ class Swarm:
         # the position and the first step stay in the box.
         self._x = np.minimum(self._lower + self._width * self._rng.random(shape), self._upper)
         target = self._lower + self._width * self._rng.random(shape)
-        self._place_initial_points()
+        place(self.options.initial_points, self._x, self._lower, self._upper)
         self._v = target - self._x
         self._own_best, self._own_cost = self._x.copy(), np.full(particles, np.inf)
         self.best, self.best_cost = read_only(self._x[0]), math.inf
@@ -198,16 +198,6 @@ class Swarm:
         """Inertia weight of the iteration in progress, t = 1 ... T."""
         o = self.options
         return o.w_start + (o.w_end - o.w_start) * min(self.iteration / max(o.iterations - 1, 1), 1.0)
-
-    def _place_initial_points(self) -> None:
-        if self.options.initial_points is None:
-            return
-        points = np.atleast_2d(np.array(self.options.initial_points, dtype=np.float64))
-        if points.shape[1:] != self._lower.shape or len(points) > len(self._x):
-            raise ParameterError(f"initial points of shape {points.shape}", f"up to {self._x.shape}")
-        if not np.all((points >= self._lower) & (points <= self._upper)):
-            raise ParameterError("an initial point outside the box", "lower <= point <= upper", "clip it to the box")
-        self._x[: len(points)] = points
 
     def _move(self, turn: slice) -> None:
         o, x, v = self.options, self._x[turn], self._v[turn]
@@ -268,6 +258,22 @@ def read_only(values: FloatArray) -> FloatArray:
     copy = values.copy()
     copy.setflags(write=False)
     return copy
+
+
+def place(points: ArrayLike | None, among: FloatArray, lower: FloatArray, upper: FloatArray) -> None:
+    """Writes initial points (k, n), if there are any, over the first of a population (N, n).
+
+    Raises:
+        ParameterError: more points than the population has, of another length, or outside the box.
+    """
+    if points is None:
+        return
+    given = np.atleast_2d(np.array(points, dtype=np.float64))
+    if given.shape[1:] != lower.shape or len(given) > len(among):
+        raise ParameterError(f"initial points of shape {given.shape}", f"up to {among.shape}")
+    if not np.all((given >= lower) & (given <= upper)):
+        raise ParameterError("an initial point outside the box", "lower <= point <= upper", "clip it to the box")
+    among[: len(given)] = given
 
 
 def checked_box(lower: ArrayLike, upper: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -142,35 +142,6 @@ def test_least_squares_needs_few_evaluations_and_differences_are_in_the_account(
     assert 3 * (len(START) + 1) < result.evaluations < 100
 
 
-def test_polish_is_called_with_the_best_of_the_swarm_and_its_evaluations_count() -> None:
-    calls: list[FloatArray] = []
-
-    def polish(inner: Batch, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        calls.append(x)
-        np.testing.assert_allclose([lower, upper], [LOWER, UPPER])
-        np.testing.assert_allclose(inner(x[None]), residual(x[None]), atol=1e-12)
-        inner(np.tile(TRUTH, (9, 1)))
-        return TRUTH
-
-    plain = run("pso_polish", 400)
-    result = run("pso_polish", 400, polish=polish)
-    assert len(calls) == 1
-    assert result.cost < 1e-25
-    assert result.stop is Stop.CONVERGED
-    assert plain.evaluations != result.evaluations
-
-
-def test_a_polish_that_spends_the_budget_keeps_its_best_point() -> None:
-    def greedy(inner: Batch, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        inner(TRUTH[None])
-        while True:
-            inner(x[None])
-
-    result = run("pso_polish", 200, polish=greedy)
-    assert (result.stop, result.evaluations) == (Stop.BUDGET, 200)
-    assert result.cost < 1e-25
-
-
 def test_seconds_are_the_callers() -> None:
     ticks = iter([10.0, 12.5])
     assert run("initial", clock=lambda: next(ticks)).seconds == 2.5
