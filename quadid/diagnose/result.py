@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -79,24 +79,8 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data of contract form."""
-        return {
-            "effect": self.effect,
-            "confident": self.confident,
-            "parameters": [
-                {"name": p.name, "unit": p.unit, "value": p.value, "ci95": jsonable(p.ci95)} for p in self.parameters
-            ],
-            "gain": {
-                "mse_before": self.gain.mse_before,
-                "mse_after": self.gain.mse_after,
-                "ci95": list(self.gain.ci95),
-                "seconds": self.gain.seconds,
-            },
-            "p_value": self.p_value,
-            "alternatives": [{"effect": a.effect, "mse_after": a.mse_after} for a in self.alternatives],
-            "evidence": self.evidence,
-            "per_log": self.per_log,
-            "ordinary": self.ordinary,
-        }
+        parameters = [{**asdict(p), "ci95": jsonable(p.ci95)} for p in self.parameters]
+        return {**asdict(self), "parameters": parameters}
 
 
 @dataclass(frozen=True)

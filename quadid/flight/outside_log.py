@@ -10,6 +10,7 @@ from scipy.signal import cont2discrete, lfilter
 
 from quadid.flight import sensors
 from quadid.flight.loop import OnBoard, Plan, Track
+from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 
@@ -117,7 +118,7 @@ def attitude_steps(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     parts = [sensors.quaternion_exp(np.column_stack(c)) for c in (
         (angles[:, 0], zero, zero), (zero, angles[:, 1], zero), (zero, zero, angles[:, 2]))]  # fmt: skip
     turned = sensors.quaternion_multiply(sensors.quaternion_multiply(parts[2], parts[1]), parts[0])
-    rows.attitude = sensors.continuous_sign(turned)
+    rows.attitude = continuous_sign(turned)
 
 
 def clock_jitter(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
@@ -125,7 +126,7 @@ def clock_jitter(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     steps = rows.steps + np.clip(rng.normal(0.0, v["sigma"], len(rows.steps)), -0.01, 0.01) / rows.plan.dt
     before, after = sensors.attitude_at(rows.track, rows.steps), sensors.attitude_at(rows.track, steps)
     step = sensors.quaternion_multiply(before * np.array([1.0, -1.0, -1.0, -1.0]), after)
-    rows.attitude = sensors.continuous_sign(sensors.quaternion_multiply(rows.attitude, step))
+    rows.attitude = continuous_sign(sensors.quaternion_multiply(rows.attitude, step))
     _reread(rows, rows.track, steps)
 
 

@@ -15,6 +15,7 @@ from quadid.flight.outside_log import LogRows
 from quadid.flight.sensors import SensorNoise
 from quadid.flight.setup import Effects, Setup
 from quadid.flight.truth import TruthParameters
+from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Window
@@ -142,7 +143,7 @@ def _sensor_rows(flown: Flown, rotor: FloatArray) -> LogRows:
     rows = LogRows(
         gyro=gyro + flown.gyro_noise[at],
         accel=accel + flown.noise("accel", flown.sensor.accel, 3),
-        attitude=sensors.continuous_sign(attitude),
+        attitude=continuous_sign(attitude),
         steps=steps,
         track=track,
         plan=plan,
@@ -199,7 +200,7 @@ def true_states(flown: Flown) -> Truth:
         quaternion_of(np.ascontiguousarray(state[k, 6:15].reshape(3, 3)), quaternion[k])
     return Truth(
         t=plan.dt * plan.log_every * np.arange(plan.rows, dtype=np.float64),
-        quaternion=sensors.continuous_sign(quaternion),
+        quaternion=continuous_sign(quaternion),
         rates=state[:, 15:18].copy(),
         velocity=state[:, 3:6].copy(),
         position=state[:, 0:3].copy(),

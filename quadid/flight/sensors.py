@@ -84,12 +84,6 @@ def quaternion_exp(vector: FloatArray) -> FloatArray:
     return np.hstack([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)])
 
 
-def continuous_sign(q: FloatArray) -> FloatArray:
-    """Flips quaternions so that neighbours lie on the same half sphere."""
-    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
-    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
-
-
 def attitude_at(track: Track, steps: FloatArray) -> FloatArray:
     """AHRS attitude at fractional step numbers, normalised linear interpolation; shape (n, 4)."""
     steps = np.clip(steps, 0.0, len(track.attitude) - 1.0)

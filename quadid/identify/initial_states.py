@@ -57,12 +57,12 @@ class InitialStates:
         if n_pre in self.starts:
             return self.starts[n_pre]
         measured = [first_states(r, s, n_pre) for r, s in zip(rollouts, segments, strict=True)]
-        reckoned = tuple(_frozen(x[:, _VELOCITY].copy()) for x in measured)
+        reckoned = tuple(frozen(x[:, _VELOCITY].copy()) for x in measured)
         if _ADJACENT in self.starts:
             near = self.starts[_ADJACENT]
             for x, found, began in zip(measured, near.x0, near.reckoned, strict=True):
                 x[:, _VELOCITY] += found[:, _VELOCITY] - began
-        return Starts(tuple(_frozen(x) for x in measured), reckoned)
+        return Starts(tuple(frozen(x) for x in measured), reckoned)
 
     def replaced(self, n_pre: int, starts: Starts) -> InitialStates:
         """The same with other starts `n_pre` rows before the segments."""
@@ -72,14 +72,14 @@ class InitialStates:
         """The same after the steps `da` along the tangents, shape (segments of all windows, k)."""
         old = self.starts[n_pre]
         moved = (retract(x, d) for x, d in zip(old.x0, _split(da, old.x0), strict=True))
-        return self.replaced(n_pre, old._replace(x0=tuple(_frozen(x) for x in moved)))
+        return self.replaced(n_pre, old._replace(x0=tuple(frozen(x) for x in moved)))
 
     def chosen(self, n_pre: int, better: BoolArray, other: InitialStates) -> InitialStates:
         """These states for segments where `better`, those of `other` elsewhere."""
         mine, its = self.starts[n_pre], other.starts[n_pre]
         parts = _split(better, mine.x0)
         x0 = tuple(
-            _frozen(np.where(take[:, None], new, old)) for take, new, old in zip(parts, mine.x0, its.x0, strict=True)
+            frozen(np.where(take[:, None], new, old)) for take, new, old in zip(parts, mine.x0, its.x0, strict=True)
         )
         return self.replaced(n_pre, mine._replace(x0=x0))
 
@@ -87,12 +87,13 @@ class InitialStates:
         """States of some segments of each window, as `Shooting.taking`; windows of which none is kept are left out."""
 
         def some(arrays: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
-            return tuple(_frozen(a[kept]) for a, kept in zip(arrays, places, strict=True) if len(kept))
+            return tuple(frozen(a[kept]) for a, kept in zip(arrays, places, strict=True) if len(kept))
 
         return InitialStates({n: Starts(some(s.x0), some(s.reckoned)) for n, s in self.starts.items()})
 
 
-def _frozen(array: FloatArray) -> FloatArray:
+def frozen(array: FloatArray) -> FloatArray:
+    """The same array, read-only from now on."""
     array.setflags(write=False)
     return array
 

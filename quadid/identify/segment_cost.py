@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.identify.initial_states import InitialStates
+from quadid.identify.initial_states import InitialStates, frozen
 from quadid.types import FloatArray, IndexArray
 
 _LONGEST_STEP = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)
@@ -49,12 +49,12 @@ class Linearised:
     @cached_property
     def information(self) -> FloatArray:
         """Of all segments on the scaled parameters, shape (P, P), read-only."""
-        return _sealed(self.gram.sum(axis=0))
+        return frozen(self.gram.sum(axis=0))
 
     @cached_property
     def gradient(self) -> FloatArray:
         """Half the slope of the cost of all segments, shape (P,), read-only."""
-        return _sealed(self.grad.sum(axis=0))
+        return frozen(self.grad.sum(axis=0))
 
     @cached_property
     def total_cost(self) -> float:
@@ -77,11 +77,6 @@ class Linearised:
         da = -(offset if z is None else offset + slope @ z)
         limit = _LONGEST_STEP[: da.shape[1]]
         return self.states.stepped(self.n_pre, np.clip(da, -limit, limit))
-
-
-def _sealed(values: FloatArray) -> FloatArray:
-    values.setflags(write=False)
-    return values
 
 
 def join(parts: list[Linearised]) -> Linearised:
