@@ -11,7 +11,6 @@ from typing import Any
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks, deserializer
 from quadid_node.intake import Intake
-from quadid_node.messages import Clock
 from quadid_node.presets import source
 from quadid_node.rounds import ROUND_SECONDS
 from quadid_node.service import Service
@@ -33,12 +32,12 @@ def own_code(seconds: float) -> dict[str, Any]:
         topics = file.topics
         messages = [(topics[number].name, data) for number, _, data in file.messages(topics.keys())]
     inputs = source("canonical").inputs
-    chooser, clock = Chooser(best_ranks(inputs)), Clock()
+    chooser = Chooser(best_ranks(inputs))
     intake = Intake()
     arrived: dict[str, deque[bytes]] = {}
     for e in inputs:
         arrived[e.topic] = deque()
-        decoder = Decoder(e, clock, chooser, 4, deserializer(e.type))
+        decoder = Decoder(e, chooser, 4, deserializer(e.type))
         intake.open(e, e.topic, decoder, lambda q=arrived[e.topic]: q.popleft() if q else None)  # type: ignore[misc]
     service = Service(PELICAN, SessionSettings(window=60.0, diagnose=0.0), InlineWorker())
     a_round = round(len(messages) / seconds * ROUND_SECONDS)

@@ -23,7 +23,6 @@ from benchmarks.speed.cases import effect_table, kernel_table
 from benchmarks.speed.page import page
 from benchmarks.speed.pieces import pieces
 from benchmarks.speed.plots import draw
-from benchmarks.speed.single import single
 from benchmarks.speed.timing import machine
 
 
@@ -33,7 +32,6 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
     return {
         "kernel": lambda: kernel_table(rounds),
         "effects": lambda: effect_table(rounds),
-        "single": lambda: single(rounds),
         "instructions": instructions,
         "pieces": lambda: pieces(rounds),
         "objectives": lambda: peers.objectives(rounds),
