@@ -158,7 +158,7 @@ def _fit(request: FitRequest) -> FitReply:
     if shooting.count == 0:
         return request.failed("no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
-    bounds = _bounds(shooting, theta, free)
+    bounds = bounds_of(shooting.linearise(theta, free).information)
     drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)
     if not is_excited(bounds) and not drowned:
         return FitReply(request.number, excitation=bounds)
@@ -169,7 +169,7 @@ def _fit(request: FitRequest) -> FitReply:
         theta, sensor = _search(replace(request, noise=None) if drowned else request, layout)
         noise = _missed(request, layout, theta, sensor)
         shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
-        if drowned and not is_excited(bounds := _bounds(shooting, theta, free)):
+        if drowned and not is_excited(bounds := bounds_of(shooting.linearise(theta, free).information)):
             return FitReply(request.number, excitation=bounds)
     result = _polish(shooting, theta, free)
     if not np.isfinite(result.cost):
@@ -239,10 +239,6 @@ def is_excited(bounds: FloatArray) -> bool:
     return bool(np.all(bounds[place] <= EXCITED))
 
 
-def _bounds(shooting: Shooting, theta: FloatArray, free: Free) -> FloatArray:
-    return bounds_of(shooting.linearise(theta, free).information)
-
-
 def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
     """Whether the motion suffices with usual noise, and the noise at hand is far above that.
 
@@ -251,7 +247,7 @@ def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
     usual = NoiseModel.guess(shooting.channels, shooting.vehicle.noise)
     if not np.any(shooting.noise.variance > INFLATED * usual.variance):
         return False
-    return is_excited(_bounds(shooting.with_noise(usual), theta, free))
+    return is_excited(bounds_of(shooting.with_noise(usual).linearise(theta, free).information))
 
 
 def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel]:
