@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from quadid.online import Diagnosed, Event, Publish
 from quadid.online.records import OnlineSet
 from quadid.window import Sample
 from quadid_node.mavlink_decode import MavlinkDecoder
+from quadid_node.mavlink_parameters import parameters_of
 from quadid_node.mavlink_peers import Source
 from quadid_node.mavlink_requests import Requests
 from quadid_node.mavlink_wire import LinkError, Wire, dialect, sender
@@ -32,7 +33,6 @@ FRAMES_A_SECOND = 4000
 """More frames than this are a flood: the rest is dropped unread."""
 LIST_EVERY = 1.0
 """All our parameters are told so often at most [s]: one short request asks for seventeen frames."""
-PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
 _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 _REAL32 = 9
@@ -170,7 +170,7 @@ class MavlinkLink:
     def _on_parameter(self, kind: str, message: Any) -> None:
         if not self._for_us(message):
             return
-        entries = self._entries()
+        entries = parameters_of(self._set)
         if kind == "PARAM_REQUEST_LIST":
             self._list_due = True
             return
@@ -205,7 +205,7 @@ class MavlinkLink:
             self._measure(now)
         if self._list_due and now - self._listed >= LIST_EVERY:
             self._list_due, self._listed = False, now
-            for index in range(len(self._entries())):
+            for index in range(len(parameters_of(self._set))):
                 self._send_parameter(index)
         if self.vehicle_system:
             self._ask(now)
@@ -218,7 +218,7 @@ class MavlinkLink:
         if isinstance(output, Publish) and output.topic == "parameters":
             self._set = output.item
             self._tell = self._clock()
-            for index in range(len(self._entries())):
+            for index in range(len(parameters_of(self._set))):
                 self._send_parameter(index)
             self._send_values()
             self._say(6, f"quadid: set {output.item.sequence} {output.item.state.value}")
@@ -261,37 +261,25 @@ class MavlinkLink:
         self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
         self._before, self._measured = dict(counts), now
 
-    def _entries(self) -> list[tuple[str, float]]:
-        """Our read-only parameters: number and state of the set, then values and relative standard deviations."""
-        if self._set is None:
-            return [("QI_SEQ", 0.0)]
-        high, low = divmod(self._set.sequence, 1 << 24)  # a float holds 24 bits
-        out = [("QI_SEQ", float(low)), ("QI_SEQ_HI", float(high)), ("QI_MASS", self._set.mass)]
-        out += [("QI_STALE", float(self._set.state.value == "stale")), ("QI_OLD", float(bool(self._set.outdated)))]
-        for p in self._set.parameters:
-            if p.name in PARAMETERS:
-                out += [(PARAMETERS[p.name], p.value), (f"{PARAMETERS[p.name]}_SD", p.sigma)]
-        return out
-
     def _send_parameter(self, index: int) -> None:
-        entries = self._entries()
+        entries = parameters_of(self._set)
         name, value = entries[index]
         self._wire.send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, len(entries), index))
 
     def _send_values(self) -> None:
-        ms = int((self._clock() - self._begin) * 1e3) % 2**32
-        for name, value in self._entries():
-            if len(name) <= 10:
-                self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+        self._send_named([(name, value) for name, value in parameters_of(self._set) if len(name) <= 10])
 
     def _send_health(self, report: HealthReport) -> None:
         """Score and loss of each rotor [%] as named values; what changed is a line of text of its own."""
-        values = [("QI_HEALTH", report.score), *((f"QI_LOSS{j + 1}", 100 * v) for j, v in enumerate(report.rotor_loss))]
+        losses = [(f"QI_LOSS{j + 1}", 100 * v) for j, v in enumerate(report.rotor_loss)]
+        self._send_named([("QI_HEALTH", report.score), *losses])
+        if not report.has_baseline:
+            self._say(5, f"quadid: {report.text}")
+
+    def _send_named(self, values: Sequence[tuple[str, float]]) -> None:
         ms = int((self._clock() - self._begin) * 1e3) % 2**32
         for name, value in values:
             self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
-        if not report.has_baseline:
-            self._say(5, f"quadid: {report.text}")
 
     def _say(self, severity: int, text: str) -> None:
         plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text).encode()
