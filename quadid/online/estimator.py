@@ -108,11 +108,6 @@ class Estimator:
         """Standard deviations of log(b / J_xx) and log(b / J_yy)."""
         return np.asarray(np.hypot(self.z_sigma[0], self.z_sigma[2:4]))
 
-    @property
-    def mass(self) -> float:
-        """Mass of the vehicle file, on which every parameter rests [kg]."""
-        return self.vehicle.mass
-
     def value(self, name: str) -> float:
         """A nominal parameter, the best at hand."""
         return float(self.theta[NOMINAL_NAMES.index(name)])

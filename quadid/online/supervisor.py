@@ -165,7 +165,7 @@ class Supervisor:
         item = OnlineSet(
             0, decision.state, decision.reason, parameters, outbox.stamp(self._estimator.start), stop,
             self._estimator.rows, mse, unseen, self._estimator.input_hash, check=decision.check,
-            mass=self._estimator.mass,
+            mass=self._estimator.vehicle.mass,
         )  # fmt: skip
         if decision.state is SetState.ACCEPTED:
             outbox.act(*active_set.accept(item, "auto", stop, request.stop))

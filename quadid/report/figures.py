@@ -11,7 +11,7 @@ import numpy as np
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import SetScore
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.parts import JsonDict, axis, figure, short, trace
+from quadid.report.parts import JsonDict, axis, figure, short, trace, upright
 from quadid.types import FloatArray, IndexArray
 
 GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -214,11 +214,10 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
         for name, value, role in rows[::-1]
     ]
     highest = max([v for _, v, _ in rows if v is not None and math.isfinite(v)], default=floor)
-    edge = {"type": "line", "x0": floor, "x1": floor, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
     layout = {
         "xaxis": axis(f"error, {finding['gain']['seconds']:g} s runs (noise = 1)", range=[0.0, 1.05 * highest]),
         "yaxis": {"type": "category"},
         "hovermode": "closest",
-        "shapes": [edge],
+        "shapes": [upright(floor)],
     }
     return figure(identifier, "Validation error with and without it", data, layout, 90 + 32 * len(rows))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from quadid.inspection import flying_spans
-from quadid.report.figures import trace
+from quadid.report.parts import axis, figure, rows_of, section, trace, upright
 from quadid.resample import sample_period
 from quadid.rotor_signal import rotor_channel
 from quadid.types import FloatArray
@@ -30,17 +30,13 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
         place: of the log among those of the page.
     """
     spans = flying_spans(recording, vehicle)
-    figure, said = vibration(recording, vehicle, f"log{place}-vibration") if spans else (None, "")
+    drawn, said = vibration(recording, vehicle, f"log{place}-vibration") if spans else (None, "")
     modes = mode_rows(recording)
-    if figure is None and not modes:
+    if drawn is None and not modes:
         return None
-    return {
-        "id": f"flight-{place}",
-        "title": f"Flight of {recording.name}",
-        "intro": said,
-        "figures": [] if figure is None else [figure],
-        "tables": [{"head": ["flight mode", "from (s)", "to (s)"], "rows": modes}] if modes else [],
-    }
+    figures = [] if drawn is None else [drawn]
+    tables = [rows_of(("flight mode", "from (s)", "to (s)"), modes)] if modes else []
+    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables)
 
 
 def mode_rows(recording: Recording) -> list[list[str]]:
@@ -67,16 +63,12 @@ def vibration(recording: Recording, vehicle: Vehicle, identifier: str) -> tuple[
         trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(zip(_ROLES, _AXES, strict=True))
     ]
     turning, said = _turning(recording, vehicle, float(frequency[-1]))
-    lines = [] if turning is None else [
-        {"type": "line", "x0": turning, "x1": turning, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
-    ]  # fmt: skip
     layout = {
-        "xaxis": {"title": {"text": "frequency (Hz)"}},
-        "yaxis": {"type": "log", "title": {"text": "(m/s²)/√Hz"}},
-        "shapes": lines,
+        "xaxis": axis("frequency (Hz)"),
+        "yaxis": axis("(m/s²)/√Hz", type="log"),
+        "shapes": [] if turning is None else [upright(turning)],
     }
-    views = [{"label": "", "data": data, "layout": layout}]
-    return {"id": identifier, "title": "Vibration in the air", "height": 300, "views": views}, said
+    return figure(identifier, "Vibration in the air", data, layout, 300), said
 
 
 def spectrum(accel: Channel, spans: tuple[tuple[float, float], ...]) -> tuple[FloatArray, FloatArray] | None:

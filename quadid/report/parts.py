@@ -46,6 +46,11 @@ def axis(text: str, **more: Any) -> JsonDict:
     return {"title": {"text": text}, **more}
 
 
+def upright(x: float) -> JsonDict:
+    """An upright line through a figure."""
+    return {"type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
+
+
 def level(y: float) -> JsonDict:
     """A line across a figure at the height that all should keep to."""
     return {"type": "line", "x0": 0, "x1": 1, "xref": "paper", "y0": y, "y1": y, "role": "floor"}
