@@ -131,7 +131,7 @@ print(json.dumps(heard))
 """
 
 
-def fly(script: tuple[Path, dict[str, str]], low_at: float) -> tuple[int, str, dict[str, Any]]:
+def fly(script: tuple[Path, dict[str, str]], low_at: float, hover: float = 0.4) -> tuple[int, str, dict[str, Any]]:
     """Exit code and words of the script, and what the stand-in heard; the battery falls `low_at` s after Offboard."""
     import json
 
@@ -144,7 +144,8 @@ def fly(script: tuple[Path, dict[str, str]], low_at: float) -> tuple[int, str, d
     )  # fmt: skip
     try:
         done = subprocess.run(
-            [sys.executable, str(path), "--ros-args", "-p", "hover_thrust:=0.4"], env=environment, capture_output=True,
+            [sys.executable, str(path), "--ros-args", "-p", f"hover_thrust:={hover}"],
+            env=environment, capture_output=True,
             text=True, timeout=120, check=False,
         )  # fmt: skip
         out, _ = autopilot.communicate("", timeout=30)
@@ -191,3 +192,11 @@ def test_a_low_battery_ends_it(script: tuple[Path, dict[str, str]]) -> None:
     assert heard["commands"] == [[176, 1.0, 4.0, 3.0]]
     rows = np.array(heard["setpoints"])
     assert np.ptp(rows[rows[:, 1] == OFFBOARD][:, 0]) < SETTLE + 3.0
+
+
+def test_without_a_hover_thrust_it_does_not_start(script: tuple[Path, dict[str, str]]) -> None:
+    """A guess could be half of it or twice."""
+    code, text, heard = fly(script, math.inf, 0.0)
+    assert code == 1
+    assert "give hover_thrust" in text
+    assert not heard["setpoints"]
