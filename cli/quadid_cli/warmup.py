@@ -47,7 +47,8 @@ def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
 
     def follow(name: str) -> None:
         with subprocess.Popen(
-            [sys.executable, "-c", _CHILD.format(name)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+            [sys.executable, "-P", "-c", _CHILD.format(name)],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         ) as child:  # fmt: skip
             assert child.stdout is not None

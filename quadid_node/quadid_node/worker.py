@@ -172,7 +172,7 @@ class ProcessWorker:
     def _start(self) -> None:
         environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "quadid_node.worker_main", str(self._memory)],
+            [sys.executable, "-P", "-m", "quadid_node.worker_main", str(self._memory)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
         )  # fmt: skip
         for pipe in (self._child.stdin, self._child.stdout):

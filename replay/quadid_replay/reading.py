@@ -73,7 +73,7 @@ def read_in_child(path: Path, preset: str, columns: Mapping[str, str] | None = N
     """
     allowed = limits(path.stat().st_size)
     request = json.dumps([str(path.absolute()), preset, dict(columns or {}), *allowed])
-    command = [sys.executable, "-m", __name__, request]
+    command = [sys.executable, "-P", "-m", __name__, request]  # no module of the folder we stand in
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as child:
         try:
             answer, _ = child.communicate(timeout=STANDING * allowed.seconds)

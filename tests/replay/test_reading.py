@@ -39,6 +39,18 @@ def test_a_child_reads_what_is_read_here(tmp_path: Path) -> None:
         assert not there.channels[name].values.flags.writeable
 
 
+def test_no_code_of_the_folder_we_stand_in_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    """Whoever packs a folder of logs may put a numpy.py into it: `python -m` would import that one."""
+    write_mcap(tmp_path / "a.mcap", full_recording(1.0, 50.0))
+    (tmp_path / "numpy.py").write_text("open('ran', 'w').close()\nraise SystemExit\n")
+    monkeypatch.chdir(tmp_path)
+    assert read_in_child(tmp_path / "a.mcap", "auto").channels
+    assert not (tmp_path / "ran").exists()
+    happened(25, "a log beside a numpy.py in the folder we stand in: read, and that file is not run")
+
+
 @pytest.mark.usefixtures("all_large")
 def test_more_memory_than_allowed_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
