@@ -23,4 +23,5 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def _equations(text: str) -> str:
     text = _BLOCK.sub(lambda m: f'\n<div style="margin: 0.8em 0">{convert(m[1], display="block")}</div>\n', text)
-    return _INLINE.sub(lambda m: convert(m[1]), text)
+    # Within a span: to Markdown an element "math" at the begin of a line would be a block of its own.
+    return _INLINE.sub(lambda m: f"<span>{convert(m[1])}</span>", text)

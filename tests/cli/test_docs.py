@@ -87,5 +87,6 @@ def test_equations_become_mathml_and_code_is_left_alone(repository: Path) -> Non
     spec.loader.exec_module(module)
     page = module.on_page_markdown("a $x^2$ b `$HOME and $PATH`\n\n$$ y = 1 $$\n\n```\n$$ z $$\n```\n")
     assert page.count("<math") == 2
+    assert "\n<math" not in module.on_page_markdown("in the text\n$x^2$ begins a line")
     assert "`$HOME and $PATH`" in page
     assert "$$ z $$" in page
