@@ -22,14 +22,14 @@ from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
 from quadid.identify.covariance import parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
-from quadid.identify.gauss_newton import polish
+from quadid.identify.gauss_newton import Polished, polish
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
+from quadid.identify.reliability import MISFIT, reliability
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
 from quadid.identify.shooting import Shooting
-from quadid.model.layout import Layout
 from quadid.model.supply import with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, Parameter, Status
 from quadid.types import FloatArray
@@ -109,7 +109,7 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
     ]
-    parameters, moved = possible_moments(_nominal_parameters(vehicle, search.model, verdict))
+    parameters, moved = possible_moments(_nominal_parameters(decisive, begun.short, search.model, verdict))
     warnings += [] if moved is None else [moved]
     text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
     prediction = None
@@ -137,13 +137,18 @@ def _prediction(
     return out
 
 
-def _nominal_parameters(vehicle: Vehicle, model: Model, verdict: Verdict) -> tuple[Parameter, ...]:
+def _nominal_parameters(decisive: Shooting, short: Shooting, model: Model, verdict: Verdict) -> tuple[Parameter, ...]:
     """The nominal six beside the findings, as an identification gives them.
 
-    Where the cause of the error is unknown, so is what it does to them: none is identified.
+    Where the model misses something, estimates must agree as those of an identification.  Where the cause of the error
+    is unknown, so is what it does to them: none is identified.
     """
-    initial = Layout(vehicle).initial(vehicle)
-    everything = parameter_set(model.free, model.theta, initial, model.uncertainty)
+    uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
+    if model.reduced_chi_square > MISFIT:
+        brief = polish(short, model.theta, model.free, model.prior, iterations=8)
+        found = Polished(model.theta, model.lin, model.cost, 0, brief.outcome)
+        uncertain = reliability(decisive, found, model.free, model.prior, brief).widened(uncertain)
+    everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = (p for p in everything if p.name in NOMINAL_NAMES)
     if verdict is not Verdict.UNKNOWN:
         return tuple(nominal)
