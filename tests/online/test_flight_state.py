@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadid_node.playback import stream
 from quadid_replay import open_log
 
@@ -17,9 +16,9 @@ from quadid.online.flight_state import Velocity, step_beside
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.resampler import Resampler, Rows
 from quadid.turning import conjugate, rotated
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
-FloatArray = NDArray[np.float64]
 RATE = 50.0
 
 
