@@ -20,7 +20,7 @@ from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.answered import answers
-from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced
+from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced, with_sampling_error
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
 from quadid.online.model_vehicle import moved
@@ -206,6 +206,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
         return request.failed("the simulation diverges at every point tried")
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
     bounds = bounds_of(estimate.information)
+    estimate = with_sampling_error(estimate, request.windows, vehicle, nominal, result.theta, shooting.noise)
     reply = FitReply(
         request.number, "", bounds, is_excited(bounds), estimate, result.theta, shooting.noise,
         vehicle=vehicle,
