@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,8 +68,20 @@ class Block:
                 yield Sample(t, name, tuple(values[k]))
 
 
+def _never_changes(values: ArrayLike) -> TypeGuard[FloatArray]:
+    """Whether these are rows of doubles that nobody can write to, so that they need no copy."""
+    if not (isinstance(values, np.ndarray) and values.dtype == np.float64 and values.flags.c_contiguous):
+        return False
+    owner: object = values
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return False
+        owner = owner.base
+    return owner is None
+
+
 def _frozen(values: ArrayLike, name: str, columns: int | None) -> FloatArray:
-    array = np.array(values, dtype=np.float64, order="C")
+    array = values if _never_changes(values) else np.array(values, dtype=np.float64, order="C")
     if array.ndim == 1 and columns == 1:
         array = array[:, None]
     if array.ndim != 2 or (columns is not None and array.shape[1] != columns):

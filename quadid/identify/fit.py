@@ -169,7 +169,9 @@ def fit(
         result = polish(final, first.theta, free, robust=options.robust)
         noise, more = with_memory(windows, final, result.theta, free_names)
         final, spent = final.with_noise(noise), spent + more
-        result = polish(final, result.theta, free, states=result.states, robust=options.robust)
+        theta, states = result.theta, result.states
+        del result  # of a long log its residuals are a large part of all memory
+        result = polish(final, theta, free, states=states, robust=options.robust)
     if not np.isfinite(result.cost):
         final, result = short, first
     report("polish", 1.0)

@@ -59,15 +59,16 @@ class Polished:
         return self.lin.states
 
 
-def robust_weights(shooting: Shooting, lin: Linearised) -> list[FloatArray]:
-    """Huber weights of every sample (square roots of the row weights), per window."""
-    white = np.abs(lin.residuals) / np.sqrt(shooting.noise.variance)
-    weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(white, HUBER)))
-    out, place = [], 0
-    for segments in shooting.segments:
-        out.append(weight[place : place + len(segments.starts)])
-        place += len(segments.starts)
-    return out
+def robust_weights(shooting: Shooting, lin: Linearised) -> FloatArray:
+    """Huber weights of every sample (square roots of the row weights), 0 where nothing was measured, as `Linearised`.
+
+    Shape (segments, length, channels).
+    """
+    weight = lin.residuals / np.sqrt(shooting.noise.variance)
+    np.maximum(np.abs(weight, out=weight), HUBER, out=weight)
+    np.sqrt(np.divide(HUBER, weight, out=weight), out=weight)
+    weight[lin.weights == 0.0] = 0.0
+    return weight
 
 
 def polish(
@@ -169,14 +170,13 @@ def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) 
     return not reached <= (1.0 + _SETTLED) * lin.total_cost
 
 
-def _renewed(shooting: Shooting, lin: Linearised) -> list[FloatArray] | None:
+def _renewed(shooting: Shooting, lin: Linearised) -> FloatArray | None:
     """New robust weights; None when they would hardly differ from those in use."""
     weights = robust_weights(shooting, lin)
-    steady = shooting.robust is not None and all(
-        np.max(np.abs(new - old), initial=0.0) <= _STEADY_WEIGHT
-        for new, old in zip(weights, shooting.robust, strict=True)
-    )
-    return None if steady else weights
+    if shooting.robust is None:
+        return weights
+    change = weights - shooting.robust
+    return weights if np.max(np.abs(change, out=change), initial=0.0) > _STEADY_WEIGHT else None
 
 
 def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.identify.shooting import Free, Shooting
-from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.types import FloatArray, IndexArray
 
 LOWEST = 3.0
 """Frequency [Hz] below which residual power is not counted as noise."""
@@ -41,18 +41,16 @@ def mode_power(
     Returns:
         Power found, power of unit white noise, and the number of segments, per channel; NaN where none is complete.
     """
-    parts: list[tuple[FloatArray, FloatArray, BoolArray]] = []
+    found, null = np.zeros((2, shooting.channels, shooting.length))
+    counts = np.zeros(shooting.channels, dtype=np.intp)
     for c in shooting.columns(theta, free, states, parameters=False):
-        powers = [_powers(c.residual, c.basis)]
-        powers += [_powers(rng.standard_normal(c.residual.shape), c.basis) for _ in range(DRAWS)]
-        parts.append((powers[0], np.mean(powers[1:], axis=0), c.complete))
-    found, null = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-    complete = np.concatenate([p[2] for p in parts])
-    counts = complete.sum(axis=0)
+        found += np.einsum("scm,sc->cm", _powers(c.residual, c.basis), c.complete)
+        for _ in range(DRAWS):
+            powers = _powers(rng.standard_normal(c.residual.shape), c.basis)
+            null += np.einsum("scm,sc->cm", powers, c.complete) / DRAWS
+        counts += c.complete.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean_found = np.einsum("scm,sc->cm", found, complete) / counts[:, None]
-        mean_null = np.einsum("scm,sc->cm", null, complete) / counts[:, None]
-    return mean_found, mean_null, counts.astype(np.intp)
+        return found / counts[:, None], null / counts[:, None], counts
 
 
 def _powers(residual: FloatArray, basis: FloatArray) -> FloatArray:

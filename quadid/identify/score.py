@@ -281,7 +281,7 @@ def _series(shooting: Shooting, lin: Linearised) -> Series:
 
 
 def _outputs(rows: FloatArray, channels: int) -> tuple[FloatArray, FloatArray]:
-    """Measured rows (n, 16) as channels with a place left for the attitude, and the attitude quaternions (n, 4)."""
+    """Measured rows (n, channels + 1) as channels, with a place left for the attitude, and the quaternions (n, 4)."""
     y = np.concatenate([rows[:, :3], np.zeros((len(rows), 3)), rows[:, 7:]], axis=1)[:, :channels]
     return np.ascontiguousarray(y), rows[:, 3:7]
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -77,18 +76,3 @@ class Linearised:
         da = -(offset if z is None else offset + slope @ z)
         limit = _LONGEST_STEP[: da.shape[1]]
         return self.states.stepped(self.n_pre, np.clip(da, -limit, limit))
-
-
-def join(parts: list[Linearised]) -> Linearised:
-    """Puts the segments of several windows one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-
-    def cat(name: str) -> FloatArray:
-        return np.concatenate([getattr(p, name) for p in parts])
-
-    back = (np.concatenate([p.back[0] for p in parts]), np.concatenate([p.back[1] for p in parts]))
-    window = np.concatenate([p.window for p in parts])
-    fields = ("gram", "grad", "cost", "occam", "rows", "residuals", "weights", "time")
-    arrays: dict[str, Any] = {f: cat(f) for f in fields}
-    return replace(parts[0], back=back, window=window, **arrays)

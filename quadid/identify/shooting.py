@@ -22,7 +22,6 @@ from quadid.identify.initial_states import InitialStates, Starts
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.parameterization import Free as Free
 from quadid.identify.segment_cost import Linearised as Linearised
-from quadid.identify.segment_cost import join
 from quadid.identify.segment_jacobian import Columns
 from quadid.model.kernel import LANES
 from quadid.model.layout import Layout, places
@@ -62,7 +61,8 @@ class Shooting:
         channels: residual channels, those that every window has.
         length: rows of a segment; lead: rows before it in which filters settle; dt: grid step [s].
         noise: noise model used for weights.
-        robust: row weights against outliers, one array (segments, length, channels) a window, or None.
+        robust: weights against outliers, 0 where nothing was measured, (segments of all windows, length, channels);
+            or None.
         local: parameters that each segment has a value of its own for, eliminated with its initial state; what they
             explain, such as slow moments that the model lacks, no longer pulls at the others.
     """
@@ -76,7 +76,7 @@ class Shooting:
     lead: int
     dt: float
     noise: NoiseModel
-    robust: tuple[FloatArray, ...] | None = None
+    robust: FloatArray | None = None
     local: tuple[str, ...] = ()
 
     @classmethod
@@ -120,9 +120,9 @@ class Shooting:
         """The same problem weighted with another noise model."""
         return replace(self, noise=noise)
 
-    def with_robust(self, weights: Sequence[FloatArray] | None) -> Shooting:
-        """The same problem with other row weights against outliers."""
-        return replace(self, robust=None if weights is None else tuple(weights))
+    def with_robust(self, weights: FloatArray | None) -> Shooting:
+        """The same problem with other weights against outliers."""
+        return replace(self, robust=weights)
 
     def with_local(self, names: Sequence[str]) -> Shooting:
         """The same problem with other parameters that each segment has a value of its own for."""
@@ -146,8 +146,13 @@ class Shooting:
             self,
             rollouts=tuple(self.rollouts[i] for i in windows),
             segments=tuple(self.segments[i].at(kept[i]) for i in windows),
-            robust=None if self.robust is None else tuple(self.robust[i][kept[i]] for i in windows),
+            robust=None if self.robust is None else self.robust[np.concatenate(self._of_all(kept))],
         )
+
+    def _of_all(self, kept: Sequence[IndexArray]) -> list[IndexArray]:
+        """Places of segments within their windows as places among the segments of all windows."""
+        ends = np.cumsum([len(s.starts) for s in self.segments])
+        return [k + end - len(s.starts) for k, end, s in zip(kept, ends, self.segments, strict=True)]
 
     def thinned(self, every: int) -> Shooting:
         """The same problem on every n-th segment of each window, the first included."""
@@ -182,11 +187,20 @@ class Shooting:
         starts = self.starts(n_pre, states)
         states = (states or MEASURED).replaced(n_pre, starts)
         both = Free((*self.free(self.local).entries, *free.entries))
-        parts = []
+        local, weights = len(self.local), self._weights()
+        into = Reduced.room(self.count, k + local, len(free.entries), self.length, self.channels)
+        place, counts = 0, [len(s.starts) for s in self.segments]
         for i, (x0, reckoned) in enumerate(zip(*starts, strict=True)):
+            which = slice(place, place + counts[i])
             prior = self._state_prior(i, x0[:, 7:10] - reckoned, k)
-            parts.append(self._reduced(i, theta, both, x0.copy(), prior, states, n_pre, k))
-        return join(parts)
+            self._reduce(i, theta, both, x0.copy(), prior, n_pre, k, weights[which], into.part(which))
+            place = which.stop
+        times = [r.window.t[s.starts] for r, s in zip(self.rollouts, self.segments, strict=True)]
+        return Linearised(
+            into.gram, into.grad, into.cost, into.occam, np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
+            into.base, weights, (into.offset[:, :k], into.slope[:, :k]),
+            np.repeat(np.arange(len(counts), dtype=np.intp), counts), np.concatenate(times), states, n_pre,
+        )  # fmt: skip
 
     def _state_prior(self, i: int, away: FloatArray, k: int) -> StatePrior:
         ridge = np.concatenate([1.0 / RIDGE[:k] ** 2, np.full(len(self.local), LOCAL_SIGMA**-2.0)])
@@ -197,6 +211,12 @@ class Shooting:
         """1 where a window's segments were measured, 0 elsewhere, shape (segments, length, channels)."""
         rows = self.segments[i].starts[:, None] + np.arange(self.length)
         return np.asarray(self.rollouts[i].valid[rows][..., : self.channels], dtype=np.float64)
+
+    def _weights(self) -> FloatArray:
+        """1 where measured or the robust weight, 0 elsewhere, shape (segments of all windows, length, channels)."""
+        if self.robust is not None:
+            return self.robust
+        return np.concatenate([self.measured_weights(i) for i in range(len(self.rollouts))])
 
     def _directions(self, theta: FloatArray, free: Free, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""
@@ -221,19 +241,16 @@ class Shooting:
         thetas, dx, steps = self._directions(theta, free, k)
         return self.rollouts[i].roll(self.segments[i], thetas, x0, dx, n_pre)[0], steps
 
-    def _reduced(
-        self, i: int, theta: FloatArray, free: Free, x0: FloatArray, prior: StatePrior, states: InitialStates,
-        n_pre: int, k: int,
-    ) -> Linearised:  # fmt: skip
+    def _reduce(
+        self, i: int, theta: FloatArray, free: Free, x0: FloatArray, prior: StatePrior, n_pre: int, k: int,
+        weights: FloatArray, into: Reduced,
+    ) -> None:  # fmt: skip
         """Linearises the segments of one window, local parameters first in `free`, and eliminates what each has own."""
-        segments, local, weights = self.segments[i], len(self.local), self.measured_weights(i)
-        if self.robust is not None:
-            weights = weights * self.robust[i]
+        segments, local = self.segments[i], len(self.local)
         thetas, dx, steps = self._directions(theta, free, k)
         lane = packing(thetas, self.layout.rotors, self.channels)
         thetas, dx = packed(thetas, lane), packed(dx, lane)
         whitening = self.noise.whitening(self.length, self.dt)
-        into = Reduced.room(len(x0), k + local, len(steps) - k - local, self.length, self.channels)
         moved = np.empty((*weights.shape, local))
 
         def use(which: slice, out: FloatArray) -> None:
@@ -248,11 +265,6 @@ class Shooting:
         if local:
             # What the local parameters explain is no residual.
             into.base[...] -= np.einsum("silj,sj->sil", moved, into.offset[:, k:])
-        return Linearised(
-            into.gram, into.grad, into.cost, into.occam, np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
-            into.base, weights, (into.offset[:, :k], into.slope[:, :k]), np.full(len(x0), i, dtype=np.intp),
-            self.rollouts[i].window.t[segments.starts], states, n_pre,
-        )  # fmt: skip
 
     def columns(
         self, theta: FloatArray, free: Free, states: InitialStates | None = None, parameters: bool = True

@@ -20,17 +20,17 @@ def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
         channels: residual channels to look at, the first 9, 12 or 15.
 
     Returns:
-        Rates, quaternion, specific force, velocity, position (n, 16), at rest where missing; and where each channel
-        was measured, shape (n, channels).
+        Rates, quaternion, specific force, and of those looked at velocity and position, shape (n, channels + 1), at
+        rest where missing; and where each channel was measured, shape (n, channels).
     """
     n = len(window)
-    measured = np.zeros((n, 16))
+    measured = np.zeros((n, channels + 1))
     measured[:, 3] = 1.0
     valid = np.zeros((n, channels), dtype=bool)
     places = ((window.gyro, 0, 0), (window.attitude, 3, 3), (window.accel, 7, 6), (window.velocity, 10, 9),
               (window.position, 13, 12))  # fmt: skip
     for values, column, channel in places:
-        if values is None:
+        if values is None or channel >= channels:
             continue
         good = np.isfinite(values).all(axis=1)
         measured[good, column : column + values.shape[1]] = values[good]

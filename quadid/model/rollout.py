@@ -34,7 +34,7 @@ TAU, SLOWER = places("motor_lag")
 (OFFSET,) = places("thrust_curve.offset")
 _PART_ROWS = 800
 """Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
-_TABLES = Recent(64 << 20)
+_TABLES = Recent(32 << 20)
 """Rotor moments kept for the next calls, of all windows together: four tables of a log of 500 s take 26 MB."""
 NUMBERS = itertools.count()
 """Of simulations: what is kept of one is found by it."""
@@ -100,7 +100,6 @@ class Rollout:
             window.rotor_speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
             window.dt,
         )  # fmt: skip
-        self._mask = self.valid.astype(np.float64)
         self.flight = Flight(self.mass, self.reach, hub, plan, window.t0, window.dt, *window.log_span)
         self._number = next(NUMBERS)
 
@@ -136,9 +135,11 @@ class Rollout:
                 f"out of shapes {residuals.shape}, {ends.shape}; these arguments need {shapes[0]}, {shapes[1]}"
             )
 
+        mask = self.valid.astype(np.float64)
+
         def one(block: int, lanes: _Lanes) -> None:
             rows = residuals[block].reshape(count, segments.length, self.channels * LANES)
-            self._run(segments, n_pre, x0, lanes, self._mask, None, rows, ends[block], _NOTHING)
+            self._run(segments, n_pre, x0, lanes, mask, None, rows, ends[block], _NOTHING)
 
         self._each_block(segments, n_pre, theta, dx, self.channels, one)
         return residuals, ends
@@ -161,6 +162,7 @@ class Rollout:
         count, width = len(segments.starts), segments.length * self.channels * LANES
         lanes = self._prepared(segments, n_pre, theta, dx, self.channels)
         step = max(_PART_ROWS // (segments.length * len(lanes)), 1)
+        mask = self.valid.astype(np.float64)
         room: SimpleQueue[FloatArray] = SimpleQueue()
 
         def part(first: int) -> None:
@@ -172,7 +174,7 @@ class Rollout:
             ends = aligned((len(some.starts), N_STATE, LANES))
             for block, one in enumerate(lanes):
                 rows = out[block].reshape(len(some.starts), segments.length, -1)
-                self._run(some, n_pre, x0[which], one, self._mask, None, rows, ends, _NOTHING)
+                self._run(some, n_pre, x0[which], one, mask, None, rows, ends, _NOTHING)
             use(which, out)
             room.put(space)
 

@@ -104,7 +104,7 @@ def test_weights_of_good_samples_are_one_and_of_outliers_fall_with_their_size() 
     theta = at_truth(shooting, flown(3).truth.parameters)
     lin = shooting.linearise(theta, shooting.free([]))
     white = np.abs(lin.residuals) / np.sqrt(shooting.noise.variance)
-    (weights,) = robust_weights(shooting, lin)
+    weights = robust_weights(shooting, lin)
     np.testing.assert_array_equal(weights[white <= polishing.HUBER], 1.0)
     far = white > polishing.HUBER
     np.testing.assert_allclose((weights * white)[far] ** 2, polishing.HUBER * white[far])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,3 +27,19 @@ def test_the_last_polish_takes_a_bounded_part_of_the_log_and_says_so(monkeypatch
     whole = fit([window], vehicle, FitOptions(iterations=0))
     assert not whole.warnings
     assert np.all(whole.uncertainty.sigma < found.uncertainty.sigma), "fewer data, wider intervals"
+
+
+def test_stretches_of_a_log_are_views_of_it_and_what_may_still_change_is_copied() -> None:
+    window = flown(3).window
+    assert window.gyro is not None
+    part = window.slice(100, 200)
+    assert part.gyro is not None
+    assert np.shares_memory(part.gyro, window.gyro)
+    assert np.shares_memory(part.rotor_speed, window.rotor_speed)
+    mine = np.array(window.rotor_speed)
+    sealed = mine[:]
+    sealed.setflags(write=False)
+    for rows in (mine, sealed):
+        kept = replace(window, rotor_speed=rows)
+        mine[0, 0] += 1.0
+        assert kept.rotor_speed[0, 0] == rows[0, 0] - 1.0, "whoever owns these rows may still write to them"

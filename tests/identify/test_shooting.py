@@ -328,3 +328,22 @@ def test_the_swarm_sees_the_same_valley_as_the_eliminated_cost() -> None:
     assert np.ptp(difference) < 0.02 * np.ptp(swarm)
     assert np.argmin(swarm) == np.argmin(plain)
     assert len(projected_cost(shooting, truth, free, 5)(thetas[:3])) == 3
+
+
+def test_robust_weights_of_two_windows_go_with_the_segments_that_are_taken() -> None:
+    window = flown(3).window
+    shooting = Shooting.cut(
+        [window.slice(0, 700), without_rows(window.slice(900, 1500), gyro=slice(40, 60))], PELICAN, 0.4, NOISE
+    )
+    theta, free = at_truth(shooting, flown(3).truth.parameters), shooting.free(NOMINAL_NAMES)
+    plain = shooting.linearise(theta, free)
+    weights = np.where(plain.weights > 0.0, np.random.default_rng(0).uniform(0.3, 1.0, plain.weights.shape), 0.0)
+    robust = shooting.with_robust(weights)
+    whole, some = robust.linearise(theta, free), robust.thinned(3).linearise(theta, free)
+    counts = [len(s.starts) for s in shooting.segments]
+    kept = np.concatenate([np.arange(0, counts[0], 3), counts[0] + np.arange(0, counts[1], 3)])
+    np.testing.assert_array_equal(some.weights, weights[kept])
+    np.testing.assert_array_equal(some.window, whole.window[kept])
+    np.testing.assert_allclose(some.cost, whole.cost[kept], rtol=1e-12)
+    np.testing.assert_allclose(some.time, whole.time[kept])
+    assert whole.total_cost < plain.total_cost
