@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,15 @@ from quadid.workflow.fleet import Job, Row, blank, identify_one
 
 AHEAD = 4
 """Jobs handed out for each worker, so that the scheduler's memory does not grow with the number of logs."""
+ATTEMPTS = 4
+"""Workers that may die with a log before it is given up; workers also die for reasons that are not the log's."""
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+
+_QUIET = {
+    "distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
+}  # fmt: skip
+"""Dask otherwise looks at every worker's stack each 10 ms and at itself each 20 ms, which nobody here sees."""
 
 
 class ClusterError(QuadidError):
@@ -37,8 +45,11 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    settings = {"distributed.scheduler.allowed-failures": 0, "distributed.nanny.pre-spawn-environ": _ONE_THREAD}
-    with dask.config.set(settings):
+    settings = {
+        "distributed.scheduler.allowed-failures": 0, "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
+        "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
+    }  # fmt: skip
+    with dask.config.set({**settings, **_QUIET}):
         if address is not None:
             try:
                 client = Client(address, timeout="10s", set_as_default=False)
@@ -60,20 +71,44 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
 
 
 def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = identify_one) -> Iterator[Row]:
-    """Runs `work` on all jobs and yields each row as it is ready; a log that kills its worker costs that log only."""
+    """Runs `work` on all jobs and yields one row of each as it is ready, whichever workers die on the way.
+
+    A log whose workers die `ATTEMPTS` times, the last time with nothing else in them, costs that log only.
+    """
     threads = sum(client.nthreads().values())
     if threads == 0:
         raise ClusterError("the cluster has no workers", "at least one", "start one with `dask worker ADDRESS`")
-    suspects: list[Job] = []
-    for future, job in _stream(client, jobs, work, AHEAD * threads):
-        if future.status == "finished":
-            yield dict(future.result())
+    # A dying worker takes along jobs that waited in it.  So these come again, as many as there are workers, and at last
+    # one by one, where only a log that kills its worker is lost.
+    ahead = [AHEAD * threads, *[threads] * (ATTEMPTS - 2), 1]
+    for most in ahead:
+        jobs = yield from _answered(_stream(client, jobs, work, most))
+    yield from map(_lost, jobs)
+
+
+def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job]]:
+    """Yields the rows of ended futures; returns the jobs whose worker died."""
+    died = []
+    for future, job in ended:
+        row = _row(future)
+        if row is None:
+            died.append(job)
         else:
-            suspects.append(job)
-    # A dying worker takes along results that it held for others.  Alone, only the log that kills it is lost.
-    for job in suspects:
-        for future, _ in _stream(client, [job], work, 1):
-            yield dict(future.result()) if future.status == "finished" else _lost(job)
+            yield row
+    return died
+
+
+def _row(future: Any) -> Row | None:
+    """What an ended future holds; None where its worker died with the job, or with the result before it was fetched."""
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
+    if future.status != "finished":
+        return None
+    try:
+        return dict(future.result())
+    except (KilledWorker, FutureCancelledError):
+        return None
 
 
 def _stream(
@@ -101,5 +136,5 @@ def _stream(
 
 
 def _lost(job: Job) -> Row:
-    reason = "the worker died twice with this log: too much memory (see --memory), or a crash in a library"
+    reason = f"{ATTEMPTS} workers died with this log: too much memory (see --memory), or a crash in a library"
     return {**blank(job), "status": "failed", "reason": reason, "took": None}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
+import signal
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -131,7 +133,36 @@ def test_a_log_that_kills_its_worker_is_reported_and_the_rest_goes_on(folder: Pa
     assert len(rows) == 5
     lost = [row for row in rows.values() if row["status"] != "done"]
     assert [row["name"] for row in lost] == ["alpha/empty.bin"]
-    assert "worker died" in lost[0]["reason"]
+    assert "workers died with this log" in lost[0]["reason"]
+
+
+def test_workers_killed_at_random_lose_no_log_and_do_none_twice(tmp_path: Path) -> None:
+    """Four workers die in the middle of it; a log is worked on again only where its worker died with it."""
+    jobs = [Job(str(tmp_path), f"flight{i}", "alpha", "", 0, 0, "", 50.0, 1, False) for i in range(40)]
+    account = tmp_path / "account"
+
+    def slow(job: Job) -> Row:
+        import os
+        import time
+
+        time.sleep(0.2)
+        with account.open("a") as file:
+            file.write(f"{job.name}\n")
+        return {"name": job.name, "status": "done", "worker": os.getpid()}
+
+    rng = random.Random(7)
+    rows = []
+    with cluster(None, 2, "1GiB") as client:
+        for row in results(client, jobs, slow):
+            rows.append(row)
+            if len(rows) in (3, 11, 17, 30):
+                os.kill(rng.choice(list(client.run(os.getpid).values())), signal.SIGKILL)
+    assert sorted(row["name"] for row in rows) == sorted(job.name for job in jobs)
+    assert {row["status"] for row in rows} == {"done"}
+    assert len({row["worker"] for row in rows}) > 2, "workers that died were replaced"
+    finished = account.read_text().split()
+    # One that was killed between its last line and the answer is done again, and only such a one.
+    assert len(finished) - len(jobs) <= 4
 
 
 def test_a_cluster_that_is_already_there(folder: Path) -> None:
