@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
 from quadid.chi_square import Z95
-from quadid.health.comparison import Explained, compare, distance, p_healthy
+from quadid.health.comparison import Explained, compare, distance, exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses
 from quadid.health.spread import Healthy, healthy_spread
 from quadid.health.trims import AXES, FlightTrim
@@ -20,7 +20,7 @@ from quadid.vehicle import Vehicle
 SIGNIFICANT = 0.01
 """A change is one that healthy flights make less often than this."""
 HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
-"""The score beyond which a flight is changed."""
+"""The score that one healthy flight in a hundred exceeds."""
 _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
 _UNEXPLAINED = 1e-3
@@ -89,7 +89,7 @@ class Health:
         verdict: unchanged, changed or unknown.
         changes: the most probable explanation; without confidence where the verdict is unchanged.
         score: how far the flights are from healthy ones, in standard deviations of these.
-        p_value: chance that healthy flights differ so much.
+        p_value: chance that healthy flights speak for a change as much.
         trim: of the flights in question, shape (4,), see `trims.AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.
@@ -137,13 +137,11 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     shares = np.mean([flight.shares for flight in flights], axis=0)
     change, deviation = trim - healthy.mean, healthy.predictive(len(flights))
     far = distance(change, deviation, healthy.freedom)
-    p_value = p_healthy(change, deviation, healthy.freedom)
-    found = compare(change, healthy, len(flights), hypotheses(vehicle, shares, healthy.mean))
-    changed = p_value < SIGNIFICANT
-    rest = change - found[0].hypothesis.effect @ found[0].value
-    left = float((distance(rest, deviation, healthy.freedom) ** 2).sum())
-    explained = float(chdtrc(len(AXES), left)) > _UNEXPLAINED
-    verdict = "unchanged" if not changed else "changed" if explained else "unknown"
+    p_value = p_unchanged(change, healthy, len(flights), vehicle)
+    found = compare(exact(change), healthy, len(flights), hypotheses(vehicle, shares, healthy.mean))
+    rest = exact(change) - found[0].hypothesis.effect @ found[0].value
+    explained = p_healthy(rest, deviation, healthy.freedom) > _UNEXPLAINED
+    verdict = "unknown" if not explained else "changed" if p_value < SIGNIFICANT else "unchanged"
     changes = _changes(found, vehicle, verdict == "changed")
     score = float(np.sqrt((far**2).sum()))
     return Health(
@@ -165,7 +163,8 @@ def changes_of(
         shares: each rotor's share of the load with the change, shape (rotors,).
         changed: whether it is one; else nothing is named with confidence.
     """
-    return _changes(compare(change, healthy, flights, hypotheses(vehicle, shares, healthy.mean)), vehicle, changed)
+    offered = hypotheses(vehicle, shares, healthy.mean)
+    return _changes(compare(exact(change), healthy, flights, offered), vehicle, changed)
 
 
 def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool) -> tuple[Change, ...]:
@@ -202,6 +201,12 @@ def _interval(one: Explained, k: int, scale: float = 1.0) -> tuple[float, tuple[
     return value, (value - half, value + half)
 
 
+def _added(one: Explained, k: int) -> tuple[float, tuple[float, float]]:
+    """A part of the loaded vehicle's mass as a fraction of the vehicle's without it, with its interval."""
+    value, (low, high) = _interval(one, k)
+    return value / (1.0 - value), (low / (1.0 - low), high / (1.0 - high))
+
+
 def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...]) -> Change:
     rotor = one.hypothesis.rotors[k] + 1
     loss, loss_ci = _interval(one, 2 * k)
@@ -226,7 +231,7 @@ def _of_mass(
         return Change(effect, tuple(parameters), one.p_value, share, sure, rivals, sentence)
 
     if kind == "effort":
-        value, (low, high) = _interval(one, 0)
+        value, (low, high) = _added(one, 0)
         more = (
             f"All rotors together need {100.0 * value:+.1f} % command for the same force, their balance is as it was."
         )
@@ -234,8 +239,7 @@ def _of_mass(
         thrust = value > 0.0 and vehicle.command.kind != "rotor_speed"
         rival = Rival(("mass_change" if thrust else "thrust_drop",), (), one.p_value, share)
         if thrust:
-            drop = [1.0 - float(np.exp(-v)) for v in (value, low, high)]
-            return (change("thrust_drop", [("fraction", "", drop[0], (drop[1], drop[2]))], more, (rival, *lost)),)
+            return (change("thrust_drop", [("fraction", "", *_interval(one, 0))], more, (rival, *lost)),)
         return (change("mass_change", [("fraction", "", value, (low, high))], more, (rival, *lost)),)
     arm = vehicle.arm
     place = [(name, "m", *_interval(one, k, arm)) for k, name in enumerate("xy")]
@@ -243,6 +247,6 @@ def _of_mass(
     shift = change("cg_offset", place, f"The centre of gravity moved by {where}; the yaw trim stayed.")
     if kind == "cg_offset":
         return (shift,)
-    mass, interval = _interval(one, 2)
+    mass, interval = _added(one, 2)
     more = f"The rotors carry {100.0 * mass:.1f} % more, off centre."
     return (change("mass_change", [("fraction", "", mass, interval)], more), shift)

@@ -1,8 +1,8 @@
 """What may have changed, and what it would do to the trim: linear in its parameters, with priors from physics.
 
 A rotor j with share s_j of the load that loses the fraction l of its thrust and q of its drag torque moves the trim by
-l s_j (G_kj - trim_k) in roll and pitch, by q s_j G_3j - l s_j trim_3 in yaw and by l s_j in effort.  A mass m w at
-(x, y) from the centre moves it by -w y / arm, w x / arm, 0 and w.
+l s_j (G_kj - trim_k) in roll and pitch, by q s_j G_3j - l s_j trim_3 in yaw and by l s_j in effort.  A mass w at
+(x, y) from the centre, w the part of the loaded vehicle's, moves it by -w y / arm, w x / arm, 0 and w.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from quadid.vehicle import Vehicle
 
 LOSS = 0.2
 """Prior standard deviation of a rotor's loss of thrust."""
-DRAG_APART = ((0.04, 0.9), (0.15, 0.1))
-"""Prior standard deviations of its loss of drag torque from that of thrust, with their probabilities: a cut blade loses
-about as much of both (R^4 and R^5 of its length), one with tape or a bend may lose thrust and gain drag."""
+DRAG_APART = ((0.02, 0.9), (0.15, 0.1))
+"""Prior standard deviations of its loss of drag torque from that of thrust, with their probabilities: a tired motor
+loses as much of both, a cut blade nearly so (R^4 and R^5 of its length; a tenth of `LOSS` apart), one with tape or a
+bend may lose thrust and gain drag."""
 MASS = 0.1
 """Prior standard deviation of an added mass, as a fraction."""
 REACH = 0.7

@@ -21,6 +21,8 @@ from studies.health.recorded import CRAZYFLIE, LARGE, Judged, is_single, kind_ri
 AIRFRAMES = ("E8", "E9")
 CUT = 2
 """The rotor whose propeller was cut alone, from 0."""
+WEIGHT, NEIGHBOURS = 0.02, 0.2
+"""A light weight on an arm, and what each of two neighbouring rotors loses: look-alikes of rotors and of a weight."""
 
 
 class Power(NamedTuple):
@@ -118,7 +120,32 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
     for airframe in AIRFRAMES:
         spread = healthy_spread(_baseline(judged, airframe)).deviation
         lines.append(f"| {airframe} | {_shown(spread)} | {_shown(_again(judged, airframe))} |")
-    return "\n".join([*lines, "", _doubles(judged)])
+    return "\n".join([*lines, "", _look_alikes(judged, draws), "", _doubles(judged), "", _outside(judged)])
+
+
+def _look_alikes(judged: Sequence[Judged], draws: int) -> str:
+    """How often a light weight on an arm and two neighbouring cuts are told from each other's like."""
+    shares = [
+        " and ".join(f"{100.0 * np.mean(rotor == power(judged, a, moved, draws).rotor):.0f} %" for a in AIRFRAMES)
+        for moved, rotor in ((partial(_loaded, WEIGHT), False), (partial(_cut_both, NEIGHBOURS), True))
+    ]
+    frames = " and ".join(AIRFRAMES)
+    return (
+        f"A weight of {100.0 * WEIGHT:.0f} % at a hub, as W1, is told from that rotor in {shares[0]} of draws for "
+        f"{frames}; {100.0 * NEIGHBOURS:.0f} % lost by each of M1 and M2 is told from a weight between them in "
+        f"{shares[1]}."
+    )
+
+
+def _loaded(mass: float, healthy: Healthy) -> FloatArray:
+    """Change of trim by a mass (fraction of the vehicle's) at the cut rotor's hub, shape (4,)."""
+    x, y = CRAZYFLIE.rotors[CUT].position[:2]
+    return np.array([-y / CRAZYFLIE.arm * mass, x / CRAZYFLIE.arm * mass, 0.0, mass]) / (1.0 + mass)
+
+
+def _cut_both(loss: float, healthy: Healthy) -> FloatArray:
+    """Change of trim where the first two rotors lose as much, shape (4,)."""
+    return loss * (_effect(healthy, 0) + _effect(healthy, 1))
 
 
 def _cut(loss: float, healthy: Healthy) -> FloatArray:
@@ -137,6 +164,18 @@ def _again(judged: Sequence[Judged], airframe: str) -> FloatArray:
             by.setdefault(j.flown.cut, []).append(j.flown.trim.mean)
     pairs = np.array([a - b for a, b, *more in (v for v in by.values() if len(v) == 2) if not more])
     return np.asarray(np.median(np.abs(pairs), axis=0) / 0.6745 / np.sqrt(2.0))
+
+
+def _outside(judged: Sequence[Judged]) -> str:
+    """Flights that no spread accounts for: cuts that fly as healthy ones, weights that move the yaw trim."""
+    uncut = [j for j in judged if is_single(j, LARGE, 99.0) and j.health.p_value > 0.5]
+    weights = [j for j in judged if "glued" in j.flown.weight and abs(j.health.distance[2]) > 3.0]
+    cuts = [f"{j.flown.file} ({j.flown.total:g} mm, p = {j.health.p_value:.2f})" for j in uncut]
+    yawed = [f"{j.flown.file} ({j.health.distance[2]:+.1f} spreads of yaw)" for j in weights]
+    return (
+        f"Outside of this: {' and '.join(cuts)} fly as healthy flights do; nothing in their trims names a rotor. A "
+        f"weight balances without yaw; {' and '.join(yawed)} carry one and yaw as with a cut, and get that answer."
+    )
 
 
 def _doubles(judged: Sequence[Judged]) -> str:

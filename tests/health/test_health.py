@@ -7,10 +7,10 @@ import pytest
 
 from quadid.errors import NotIdentifiableError
 from quadid.health import Health, assess, flight_trim, healthy_spread
-from quadid.health.comparison import p_healthy
-from quadid.health.hypotheses import hypotheses
-from quadid.health.trims import trim_directions
-from quadid.vehicle import Vehicle
+from quadid.health.comparison import exact, p_healthy, p_unchanged
+from quadid.health.hypotheses import hypotheses, rotor_effect
+from quadid.health.trims import trim_directions, trim_of_load
+from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command
 from quadid.window import Recording
 from studies.health.flights import Wrong, hover, squared_speeds
@@ -139,6 +139,28 @@ def test_effects_of_the_hypotheses_are_those_of_balance() -> None:
     moved = trims(Wrong(mass=small * vehicle.mass, place=(0.1, 0.05)))
     numbers = np.array([0.1 / vehicle.arm, 0.05 / vehicle.arm, 1.0])
     np.testing.assert_allclose(moved / small, payload.effect @ numbers, atol=2e-3)
+
+
+def test_lost_thrust_adds_up_rotor_by_rotor_however_large() -> None:
+    lost, drag = {1: 0.3, 2: 0.15}, {1: 0.2, 2: 0.25}
+    before, after = (squared_speeds(PELICAN_X, one, np.zeros(4)) for one in (Wrong(), Wrong(lost, drag)))
+    trim, changed = (trim_of_load(w, GRAVITY, PELICAN_X) for w in (before, after))
+    offered = hypotheses(PELICAN_X, after / after.sum(), trim)
+    both = next(one for one in offered if one.rotors == (0, 1))
+    np.testing.assert_allclose(exact(changed - trim), both.effect @ [0.3, 0.2, 0.15, 0.25], atol=1e-12)
+
+
+def test_the_verdict_s_p_value_is_uniform_and_finds_lost_thrust_rather_than_gained() -> None:
+    healthy = healthy_spread([flight_trim(hover(PELICAN_X, seed=k), PELICAN_X) for k in range(1, 7)])
+    rng = np.random.default_rng(8)
+    draws = healthy.predictive(1) * rng.standard_t(healthy.freedom, size=(100, 4))
+    p = np.array([p_unchanged(draw, healthy, 1, PELICAN_X) for draw in draws])
+    for level in (0.05, 0.5):
+        assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * np.sqrt(level * (1 - level) / len(p)))
+    lost = 0.05 * rotor_effect(PELICAN_X, 2, 0.25, healthy.mean).sum(axis=1)
+    chances = [p_unchanged(change, healthy, 1, PELICAN_X) for change in (lost, -lost)]
+    assert chances[0] < p_healthy(lost, healthy.predictive(1), healthy.freedom)
+    assert chances[0] < chances[1]
 
 
 def test_p_values_of_healthy_flights_are_uniform() -> None:
