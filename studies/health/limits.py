@@ -131,7 +131,7 @@ def _look_alikes(judged: Sequence[Judged], draws: int) -> str:
     ]
     frames = " and ".join(AIRFRAMES)
     return (
-        f"A weight of {100.0 * WEIGHT:.0f} % at a hub, as W1, is told from that rotor in {shares[0]} of draws for "
+        f"A weight of {100.0 * WEIGHT:.0f} % at a hub is told from that rotor in {shares[0]} of draws for "
         f"{frames}; {100.0 * NEIGHBOURS:.0f} % lost by each of M1 and M2 is told from a weight between them in "
         f"{shares[1]}."
     )
