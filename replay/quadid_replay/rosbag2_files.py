@@ -54,7 +54,7 @@ class Database:
             # No value is larger than the file that holds it; what an expression makes would be.
             self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, _SHORTEST))
             self.topics: dict[int, Topic] = self._read_topics()
-        except _DAMAGE as error:
+        except (*_DAMAGE, MemoryError) as error:  # the latter for a row that claims to be larger than memory
             raise self._damaged(error) from error
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:
@@ -97,8 +97,9 @@ class Database:
         return out
 
     def _damaged(self, error: Exception) -> LogError:
+        why = plain(str(error), 80) or "sizes that cannot be"
         return LogError(
-            f"{self._path.name}: a damaged SQLite database ({plain(str(error), 80)})", "a whole rosbag2 database",
+            f"{self._path.name}: a damaged SQLite database ({why})", "a whole rosbag2 database",
             "sqlite3 FILE .recover, or copy it again after the recorder has stopped",
         )  # fmt: skip
 

@@ -22,7 +22,7 @@ from quadid_replay.schemas import schema_text
 from quadid.errors import LogError
 from quadid.types import BoolArray, IndexArray
 from tests.faults.evidence import Happened
-from tests.fuzz import rosbag2_format
+from tests.fuzz import campaign, rosbag2_format
 from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash
 from tests.replay.test_mcap import header
@@ -211,3 +211,10 @@ def test_speeds_of_escs_that_no_vehicle_has_are_left_out(tmp_path: Path, index: 
             log.add(0.02 * k, speeds)
     assert open_log(opened(tmp_path, bytes(log.data))).channels["rotor_speed"].values.shape == (6, 4)
     happened(3, f"telemetry log with ESC_STATUS from rotor {index}: the first four are read, no others")
+
+
+def test_a_database_whose_rows_claim_more_than_memory_is_damaged(tmp_path: Path, happened: Happened) -> None:
+    """SQLite tells this one as a lack of memory."""
+    with pytest.raises(LogError, match="damaged SQLite database") as told:
+        open_log(opened(tmp_path, campaign.input_of("rosbag2", 229_688)))
+    happened(1, f"rosbag2 whose pages claim sizes that cannot be: '{str(told.value)[:80]}'")
