@@ -4,7 +4,7 @@
 
 All cases of a table are run in turn, round by round, and told as medians: on a busy machine absolute times grow, ratios
 stay.  Processor time (both cores together) stands beside wall time, the load average beside each table.
-`--parts peers,starts` measures only those and keeps the rest of an earlier run.
+`--parts peers,starts` measures only those, and what the machine could do at best, and keeps the rest of an earlier run.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 from benchmarks.speed import peers, whole
 from benchmarks.speed.assembly import instructions
 from benchmarks.speed.cases import effect_table, kernel_table
+from benchmarks.speed.limits import limits
 from benchmarks.speed.page import page
 from benchmarks.speed.pieces import pieces
 from benchmarks.speed.plots import draw
@@ -30,6 +31,7 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
     """What can be measured, in the order of the page."""
     few = max(rounds // 2, 1)
     return {
+        "limits": lambda: limits(rounds, folder),
         "kernel": lambda: kernel_table(rounds),
         "effects": lambda: effect_table(rounds),
         "instructions": instructions,
@@ -64,7 +66,7 @@ def main() -> None:
     results: dict[str, Any] = {"schema": "quadid.benchmark.speed/1", **known}
     with tempfile.TemporaryDirectory() as folder:
         all_parts = parts(options.rounds, options.longest, Path(folder))
-        for name in options.parts.split(",") if options.parts else all_parts:
+        for name in ["limits", *options.parts.split(",")] if options.parts else all_parts:
             begin = time.perf_counter()
             results[name] = {"machine": machine(), "rounds": options.rounds, **all_parts[name]()}
             target.write_text(whole.written(results), encoding="utf-8")

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from benchmarks.kernel import every_effect, particles, peak_case
-from quadid.model import body_kernel, kernel, rollout_kernel, rotor_kernel, sensor_kernel
+from quadid.model import body_kernel, kernel, lag_kernel, rollout_kernel, rotor_kernel, sensor_kernel
 from quadid.model.rows import A_G, ALL_MOMENTS, HALF, N_ROWS, ROTOR, X_QW
 from quadid.model.simd import LANES, aligned
 from quadid.vehicle import Vehicle
@@ -68,7 +68,7 @@ def _best(run: Callable[[], object]) -> float:
 def _loop(call: str) -> Any:
     """A compiled loop over steps that calls one piece."""
     scope: dict[str, Any] = {}
-    for module in (kernel, body_kernel, rotor_kernel, sensor_kernel, rollout_kernel):
+    for module in (kernel, body_kernel, rotor_kernel, lag_kernel, sensor_kernel, rollout_kernel):
         scope |= vars(module)
     source = f"def loop(steps, {ARGUMENTS}):\n    for i in range(steps):\n        k = i % {ROWS}\n        {call}\n"
     exec(source, scope)  # one source for all, so that nothing differs but the call
@@ -85,7 +85,7 @@ def _arrays() -> tuple[list[Any], Any]:
     s[X_QW : X_QW + LANES] = 1.0
     kernel.body_constants(theta, vehicle.mass, rotors, 0.1, s)
     sensor_kernel.sensor_constants(theta, 0.02, s)
-    rotor_kernel.rotor_constants(theta, 0.02, rot, s)
+    lag_kernel.rotor_constants(theta, 0.02, rot, s)
     u = np.full((ROWS, rotors), vehicle.hover_speed())
     rotor_kernel.rotors_start(u, 0, rot)
     geometry = np.column_stack([vehicle.rotor_positions[:, :2], vehicle.spins])

@@ -59,7 +59,7 @@ def identification(rounds: int) -> dict[str, Any]:
 
     cases = {"64 x 100, polish, intervals": FULL, "standard search": FitOptions(seed=1)}
     times = interleaved({n: lambda n=n, o=o: run(n, o) for n, o in cases.items()}, rounds)  # type: ignore[misc]
-    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}}
+    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}, "rows": len(window)}
 
 
 def refits(rounds: int) -> dict[str, Any]:
@@ -77,17 +77,25 @@ def refits(rounds: int) -> dict[str, Any]:
 
 
 def logs(rounds: int, folder: Path) -> dict[str, Any]:
-    """Reading of logs by format."""
+    """Reading of logs by format, beside the libraries of others on the same file."""
     from quadid_replay import open_log
+
+    from benchmarks.speed.log_libraries import LIBRARIES
 
     paths = [logged(folder, 500.0, suffix) for suffix in (".mcap", ".tlog", ".csv")]
     recorded = Path(os.environ.get("QUADID_DATA", ""))
     for pattern in ("ardupilot/**/*.bin", "px4/**/*.ulg"):
         paths += sorted(recorded.glob(pattern), key=lambda p: p.stat().st_size)[-1:]
-    times = interleaved({p.suffix: lambda p=p: open_log(p) for p in paths}, rounds)  # type: ignore[misc]
+    cases: dict[str, Any] = {}
     for path in paths:
-        size = path.stat().st_size / 1e6
-        times[path.suffix] |= {"megabytes": size, "ms_per_mb": 1e3 * times[path.suffix]["wall"] / size}
+        cases[f"{path.suffix}, quadid"] = lambda p=path: open_log(p)
+        for name, read in LIBRARIES.get(path.suffix, {}).items():
+            cases[f"{path.suffix}, {name}"] = lambda p=path, read=read: read(p)
+    times = interleaved(cases, rounds)
+    sizes = {path.suffix: path.stat().st_size / 1e6 for path in paths}
+    for name, t in times.items():
+        size = sizes[name.split(",")[0]]
+        t |= {"megabytes": size, "ms_per_mb": 1e3 * t["processor"] / size}
     return {"times": times}
 
 
@@ -101,7 +109,8 @@ def commands(rounds: int, folder: Path) -> dict[str, Any]:
         "... with --report": ("identify", str(flown), *model, "--report", str(folder / "report.html")),
         "quadid diagnose, 120 s MCAP": ("diagnose", str(short), *model),
     }
-    return {"times": interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)}  # type: ignore[misc]
+    times = interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)  # type: ignore[misc]
+    return {"times": times, "megabytes": {n: Path(a[1]).stat().st_size / 1e6 for n, a in cases.items()}}
 
 
 HIDDEN: dict[str, dict[str, dict[str, float]]] = {
@@ -169,6 +178,7 @@ def _exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
 def particles_and_parameters(rounds: int) -> dict[str, Any]:
     """The swarm's cost against particles, the linearisation against free parameters and against windows."""
     from quadid.identify.fit import SWARM_SECONDS
+    from quadid.identify.global_search import projected_cost
     from quadid.identify.noise_estimation import flexible_names
     from quadid.identify.shooting import Shooting
     from quadid.parameters import NOMINAL_NAMES
@@ -176,7 +186,7 @@ def particles_and_parameters(rounds: int) -> dict[str, Any]:
     vehicle, window = Vehicle.shipped("pelican"), flight(120.0)
     shooting = Shooting.cut([window], vehicle, SWARM_SECONDS)
     theta, free = shooting.layout.initial(vehicle), shooting.free(NOMINAL_NAMES)
-    cost = shooting.swarm_cost(theta, free, shooting.count)
+    cost = projected_cost(shooting, theta, free, shooting.count)
     names = list(dict.fromkeys([*NOMINAL_NAMES, *flexible_names(shooting.layout, shooting)]))
     pieces = {n: [window.slice(i * len(window) // n, (i + 1) * len(window) // n) for i in range(n)] for n in (1, 4, 16)}
     split = {n: Shooting.cut(parts, vehicle, SWARM_SECONDS) for n, parts in pieces.items()}

@@ -1,0 +1,70 @@
+"""What bounds each row of the page on this machine: arithmetic, memory, disk, start of Python, both cores busy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+Result = Mapping[str, Any]
+
+NOTHING = "–"
+SAMPLE_BYTES = 144
+"""Of one row of a window: four rotors, rates, attitude, force, references, in doubles."""
+
+
+def arithmetic(results: Result, steps: float, cores: int = 1) -> float | None:
+    """Seconds that so many nominal particle-steps take at the arithmetic peak of the cores; None if not measured."""
+    kernel = results.get("kernel")
+    return None if kernel is None else 1e-9 * steps * kernel["operations"] / kernel["fma_per_ns"] / cores
+
+
+def at_peak(results: Result, gains: list[float]) -> str:
+    """What ratios to other programs would be with the kernel at the arithmetic peak."""
+    if "kernel" not in results:
+        return NOTHING
+    share = results["kernel"]["share_of_peak"]
+    most = [f"{gain / share:.0f}" for gain in (min(gains), max(gains))]
+    return f"{' to '.join(dict.fromkeys(most))} times (arithmetic peak)"
+
+
+def search(results: Result) -> str:
+    """Arithmetic of the 64 x 100 search over 500 s on both cores."""
+    part = results["identification"]
+    evaluations, cores = part["evaluations"]["64 x 100, polish, intervals"], part["machine"]["cores"]
+    rows = part.get("rows")
+    seconds = None if rows is None else arithmetic(results, evaluations * rows, cores)
+    return NOTHING if seconds is None else f"{seconds:.2f} s (arithmetic of {evaluations} vectors, {cores} cores)"
+
+
+def busy(times: Result, cores: int) -> str:
+    """Its own processor time spread over all cores."""
+    return f"{times['processor'] / cores:.2g} s ({cores} cores busy)"
+
+
+def started(results: Result, megabytes: float = 0.0) -> str:
+    """The start of Python, and a log from the disk."""
+    found = results.get("limits")
+    if found is None:
+        return NOTHING
+    log = 1e6 * megabytes / found["disk_read"]
+    return f"{found['python_start']:.2f} s (start of Python)" + (f" + {log:.2g} s (disk)" if megabytes else "")
+
+
+def held(results: Result, rows: float) -> str:
+    """Memory of the libraries and the windows alone."""
+    found = results.get("limits")
+    return NOTHING if found is None else f"{found['fit_import_mb'] + 1e-6 * rows * SAMPLE_BYTES:.0f} MB"
+
+
+def machine_limits(r: Result) -> list[str]:
+    """Lines of the page's table of what the machine can do."""
+    rates = {name: f"{1e-6 * r[name]:.0f} MB/s, {1e9 / r[name]:.2g} ms/MB" for name in ("disk_read", "sha256")}
+    return [
+        "| what | measured |", "|---|---|",
+        f"| memory, copied | {1e-9 * r['memory_bandwidth']:.1f} GB/s |",
+        f"| disk, written and flushed | {1e-6 * r['disk_write']:.0f} MB/s |",
+        f"| disk, read | {rates['disk_read']} |",
+        f"| SHA-256, which names every log that is read | {rates['sha256']} |",
+        f"| start of Python | {r['python_start']:.3f} s |",
+        f"| ... and import of the fit | {r['fit_import']:.2f} s, {r['fit_import_mb']:.0f} MB |",
+    ]  # fmt: skip
