@@ -12,12 +12,6 @@ SAMPLE_BYTES = 144
 """Of one row of a window: four rotors, rates, attitude, force, references, in doubles."""
 
 
-def arithmetic(results: Result, steps: float, cores: int = 1) -> float | None:
-    """Seconds that so many nominal particle-steps take at the arithmetic peak of the cores; None if not measured."""
-    kernel = results.get("kernel")
-    return None if kernel is None else 1e-9 * steps * kernel["operations"] / kernel["fma_per_ns"] / cores
-
-
 def at_peak(results: Result, gains: list[float]) -> str:
     """What ratios to other programs would be with the kernel at the arithmetic peak."""
     if "kernel" not in results:
@@ -25,15 +19,6 @@ def at_peak(results: Result, gains: list[float]) -> str:
     share = results["kernel"]["share_of_peak"]
     most = [f"{gain / share:.0f}" for gain in (min(gains), max(gains))]
     return f"{' to '.join(dict.fromkeys(most))} times (arithmetic peak)"
-
-
-def search(results: Result) -> str:
-    """Arithmetic of the 64 x 100 search over 500 s on both cores."""
-    part = results["identification"]
-    evaluations, cores = part["evaluations"]["64 x 100, polish, intervals"], part["machine"]["cores"]
-    rows = part.get("rows")
-    seconds = None if rows is None else arithmetic(results, evaluations * rows, cores)
-    return NOTHING if seconds is None else f"{seconds:.2f} s (arithmetic of {evaluations} vectors, {cores} cores)"
 
 
 def busy(times: Result, cores: int) -> str:

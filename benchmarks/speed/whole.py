@@ -59,7 +59,7 @@ def identification(rounds: int) -> dict[str, Any]:
 
     cases = {"64 x 100, polish, intervals": FULL, "standard search": FitOptions(seed=1)}
     times = interleaved({n: lambda n=n, o=o: run(n, o) for n, o in cases.items()}, rounds)  # type: ignore[misc]
-    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}, "rows": len(window)}
+    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}}
 
 
 def refits(rounds: int) -> dict[str, Any]:
