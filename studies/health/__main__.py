@@ -57,7 +57,9 @@ def _simulated(each: int) -> str:
         f"## Simulated flights\n`make health`, seed {simulated.SEED}; Pelican (plus and X frame) of "
         f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each, in closed loop (`quadid.flight`) and "
         "by the balance of a hover. From flight to flight every rotor's thrust differs by 1 %, the battery sits 0.7 mm "
-        f"elsewhere, the load differs by 1 % (1 sigma).\n\n{simulated.table(each)}"
+        f"elsewhere, the load differs by 1 % (1 sigma).\n\n{simulated.table(each)}\n\nA rotor that lost thrust "
+        "alone and a weight at its hub have the same trims: no hover tells them apart. The weight, the likelier, is "
+        "the answer."
     )
 
 

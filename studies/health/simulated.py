@@ -136,5 +136,5 @@ def table(each: int = 6) -> str:
         errors = np.array(by["closed loop"]).T[2:]
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
         cells.append(f"{', '.join(sizes)} %" if sizes else "–")
-        lines.append(f"| {group} | {len(rows)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {group} | {len(errors.T)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
