@@ -23,7 +23,7 @@ Effects = Mapping[str, Mapping[str, float]]
 
 
 def check_effects(effects: Effects, rotors: int) -> dict[str, dict[str, float]]:
-    """Completes effects with neutral values and checks names and ranges.
+    """Completes effects with neutral values, optional numbers left out, and checks names and ranges.
 
     Args:
         effects: effect name -> parameter name -> value; parameters left out are neutral.
@@ -45,7 +45,7 @@ def check_effects(effects: Effects, rotors: int) -> dict[str, dict[str, float]]:
                 raise ParameterError(f"effect '{name}' has no parameter '{key}'", ", ".join(known), nearest(key, known))
             if np.isnan(value):
                 raise ParameterError(f"{name}.{key} is not a number", "a number")
-        values = {p.name: p.neutral for p in EFFECTS[name].parameters if not p.beside}
+        values = {p.name: p.neutral for p in EFFECTS[name].parameters if not p.optional}
         values |= {k: float(v) for k, v in given.items()}
         for key, value in values.items():
             p = EFFECTS[name].parameter(key.rstrip("0123456789").rstrip("_"))
@@ -105,15 +105,13 @@ def small_rotation(vector: FloatArray) -> FloatArray:
 
 
 class _Lookup:
-    """Reads effect values, neutral where an effect is absent."""
+    """Reads effect values, neutral where an effect or an optional number is absent."""
 
     def __init__(self, effects: Mapping[str, Mapping[str, float]]) -> None:
         self.effects = effects
 
     def __call__(self, effect: str, parameter: str) -> float:
-        if effect in self.effects:
-            return self.effects[effect][parameter]
-        return EFFECTS[effect].parameter(parameter).neutral
+        return self.effects.get(effect, {}).get(parameter, EFFECTS[effect].parameter(parameter).neutral)
 
     def beside(self, effect: str, parameter: str, base: str) -> float:
         """Value of a parameter that is another one's unless it is given."""

@@ -34,10 +34,11 @@ def answers(request: FitRequest, reply: FitReply) -> bool:
     channels = {min((_channels(w) for w in request.windows), default=0)}
     if request.noise is not None:
         channels.add(len(request.noise.white))
+    no_numbers = reply.estimate is not None and not reply.estimate.finite
     return (
         all(a is None or a.shape == (_SIX,) for a in (reply.excitation, reply.misfit))
         and all(n is None or _is_noise(n, channels) for n in (reply.noise, reply.measured))
-        and (reply.theta is None or _is_vector(reply.theta, request.theta))
+        and (reply.theta is None or _is_vector(reply.theta, request.theta, no_numbers))
         and (reply.estimate is None or _is_estimate(reply.estimate, request))
     )
 
@@ -60,8 +61,10 @@ def _is_noise(noise: NoiseModel, channels: Container[int]) -> bool:
     return noise.shape is None or noise.shape.shape == (*shape, SHAPE_POINTS)
 
 
-def _is_vector(theta: FloatArray, asked: FloatArray) -> bool:
-    return theta.shape == asked.shape and bool(np.isfinite(theta).all() and np.all(theta[:_SIX] > 0.0))
+def _is_vector(theta: FloatArray, asked: FloatArray, no_numbers: bool) -> bool:
+    """Finite and possible, but where the estimate is told to be no numbers: then nothing of it is taken in."""
+    possible = bool(np.isfinite(theta).all() and np.all(theta[:_SIX] > 0.0))
+    return theta.shape == asked.shape and (possible or no_numbers)
 
 
 def _is_estimate(estimate: WindowEstimate, request: FitRequest) -> bool:
