@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -22,6 +23,9 @@ _QUIET = {
     "distributed.admin.system-monitor.interval": "5s",
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms and at itself each 20 ms, which nobody here sees."""
+
+STARTING = 30.0
+"""Time that a worker may take to start [s]."""
 
 
 class ClusterError(QuadidError):
@@ -68,6 +72,9 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
         )  # fmt: skip
         with own, Client(own, set_as_default=False) as client:
             yield client
+            # Dask cannot close a cluster while the worker that replaces a dead one starts.
+            with contextlib.suppress(TimeoutError):
+                client.wait_for_workers(count, timeout=STARTING)
 
 
 def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = identify_one) -> Iterator[Row]:
