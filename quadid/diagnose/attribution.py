@@ -237,7 +237,7 @@ class _Halves(NamedTuple):
 
 def _second_halves(scorer: Shooting, nominal: Model, model: Model, logs: Sequence[Window]) -> _Halves | None:
     """Refits what belongs to a flight on the first half of each log and scores its second half; None without such."""
-    per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
+    per_log = model.per_log_names
     refitted, simple, rows = [], [], 0.0
     for window in logs:
         middle = len(window) // 2

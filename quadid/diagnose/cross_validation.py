@@ -40,10 +40,21 @@ def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: Inde
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     if grad.shape[1] == 0:
         return cost
+    z = steps_without(gram, grad, prior_precision)
+    return np.asarray(cost + 2.0 * np.sum(grad * z, axis=1) + np.einsum("bp,bpq,bq->b", z, gram, z))
+
+
+def steps_without(gram: FloatArray, grad: FloatArray, prior_precision: FloatArray) -> FloatArray:
+    """Scaled step to the optimum of all blocks but one, for each in turn, shape (blocks, P).
+
+    Args:
+        gram: of each block, shape (blocks, P, P).
+        grad: half the slope of the deviance of each block, shape (blocks, P).
+        prior_precision: of each parameter, shape (P,).
+    """
     h_rest = gram.sum(axis=0) - gram + np.diag(np.maximum(prior_precision, 1e-12))
     g_rest = grad.sum(axis=0) - grad
-    z = -np.linalg.solve(h_rest, g_rest[..., None])[..., 0]
-    return np.asarray(cost + 2.0 * np.sum(grad * z, axis=1) + np.einsum("bp,bpq,bq->b", z, gram, z))
+    return np.asarray(-np.linalg.solve(h_rest, g_rest[..., None])[..., 0])
 
 
 def sum_by_block(values: FloatArray, labels: IndexArray) -> FloatArray:

@@ -13,12 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from quadid.diagnose.attribution import Validation
-from quadid.diagnose.cross_validation import block_labels, sum_by_block
+from quadid.diagnose.cross_validation import block_labels, steps_without, sum_by_block
 from quadid.diagnose.model import Model, free_names
-from quadid.effects import EFFECTS
 from quadid.identify.fit import Fit
 from quadid.identify.gauss_newton import polish
-from quadid.identify.priors import default_prior
+from quadid.identify.priors import default_prior, posterior_covariance
 from quadid.identify.score import SCORE_SECONDS, Tally, covering, mse_score, settle_states, tallied
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -63,9 +62,8 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
         return float("inf")
     labels = block_labels(lin)
     gram, grad = (sum_by_block(a, labels) for a in (lin.gram, lin.grad))
-    prior = np.diag(1.0 / default_prior(scorer, free).sigma ** 2)
-    all_h, all_g = gram.sum(axis=0) + prior, grad.sum(axis=0)
-    step = np.linalg.solve(all_h, all_g) - np.linalg.solve(all_h - gram, (all_g - grad)[..., None])[..., 0]
+    prior = default_prior(scorer, free)
+    step = posterior_covariance(lin.information, prior) @ lin.gradient + steps_without(gram, grad, prior.precision)
     total: Tally | None = None
     for block, moved in enumerate(step):
         kept = [np.flatnonzero(labels[lin.window == i] == block) for i in range(len(scorer.rollouts))]
@@ -82,7 +80,7 @@ def _scorer(fit: Fit, windows: Sequence[Window]) -> Shooting:
 
 def _refitted(fit: Fit, model: Model, logs: Sequence[Window]) -> float | None:
     """Error of the second half of each log, what belongs to a flight refitted on its first; None without such."""
-    per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
+    per_log = model.per_log_names
     total: Tally | None = None
     for window in logs if per_log else ():
         middle = len(window) // 2

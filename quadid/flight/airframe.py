@@ -177,23 +177,23 @@ def hub_forces(
         air: aerodynamics.
     """
     fx = fy = fz = roll = pitch = yaw = 0.0
+    drag_reach, axial_reach = air.drag_reach, air.axial_reach
     for i in range(omega.shape[0]):
         x, y, z = body.arms[changed, i, 0], body.arms[changed, i, 1], body.arms[changed, i, 2]
         weight = body.mass * omega[i] / air.hover_sum
-        near, far = air.drag_reach, air.axial_reach
-        along = -weight * air.drag_x * (velocity[0] + near * (rates[1] * z - rates[2] * y))
-        across = -weight * air.drag_y * (velocity[1] + near * (rates[2] * x - rates[0] * z))
-        lost = -weight * air.axial * (velocity[2] + far * (rates[0] * y - rates[1] * x))
-        ahead = velocity[0] + rates[1] * z - rates[2] * y
-        aside = velocity[1] + rates[2] * x - rates[0] * z
+        turned_x, turned_y = rates[1] * z - rates[2] * y, rates[2] * x - rates[0] * z
+        along = -weight * air.drag_x * (velocity[0] + drag_reach * turned_x)
+        across = -weight * air.drag_y * (velocity[1] + drag_reach * turned_y)
+        lost = -weight * air.axial * (velocity[2] + axial_reach * (rates[0] * y - rates[1] * x))
+        ahead, aside = velocity[0] + turned_x, velocity[1] + turned_y
         lift = -body.mass / omega.shape[0] * air.lift * (ahead * ahead + aside * aside)
         fx += along
         fy += across
         fz += lost + lift
         # arm x force, the force in the rotor plane acting higher by the height of `rotor_drag_moment`
-        roll += y * (far * lost + lift) - (near * z - air.moment_y) * across
-        pitch += (near * z - air.moment_x) * along - x * (far * lost + lift)
-        yaw += near * (x * across - y * along)
+        roll += y * (axial_reach * lost + lift) - (drag_reach * z - air.moment_y) * across
+        pitch += (drag_reach * z - air.moment_x) * along - x * (axial_reach * lost + lift)
+        yaw += drag_reach * (x * across - y * along)
     return fx, fy, fz, roll, pitch, yaw
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.errors import ParameterError, nearest
+from quadid.errors import ParameterError
 from quadid.workflow.files import file_name, write_text
 from quadid.workflow.loading import as_vehicle
 from quadid.workflow.logs import Given, listed
@@ -69,11 +69,10 @@ class Proposed:
 
 def check_forms(forms: Sequence[str]) -> None:
     """Raises ParameterError for a form that is not written."""
-    from quadid.report.manoeuvres import FORMS
+    from quadid.report.manoeuvres import check_form
 
     for form in forms:
-        if form not in FORMS:
-            raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
+        check_form(form)
 
 
 def parse_height(text: str) -> tuple[float, float]:

@@ -90,6 +90,7 @@ STAND_IN = """
 import json, sys, threading
 import rclpy
 from px4_msgs.msg import *
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 low_at = float(sys.argv[1])
 rclpy.init()
@@ -125,8 +126,8 @@ node.create_timer(0.02, tick)
 threading.Thread(target=lambda: (sys.stdin.read(), rclpy.try_shutdown()), daemon=True).start()
 try:
     rclpy.spin(node)
-except Exception:
-    pass
+except ExternalShutdownException:
+    pass  # how `try_shutdown` ends `spin`
 print(json.dumps(heard))
 """
 

@@ -16,6 +16,12 @@ FORMS = {
 }
 
 
+def check_form(form: str) -> None:
+    """Raises ParameterError for a form that is not written."""
+    if form not in FORMS:
+        raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
+
+
 def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
     """Texts of a form by the end of their file names.
 
@@ -27,6 +33,7 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
     Raises:
         ParameterError: an unknown form, or too short a manoeuvre for it.
     """
+    check_form(form)
     if form == "ardupilot-lua":
         return {".manoeuvre.lua": ardupilot_lua(plan)}
     if form == "ardupilot-sid":
@@ -39,6 +46,4 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
         return system_id(plan, hover_throttle)
     if form == "px4":
         return {".manoeuvre_px4.py": px4_ros2(plan)}
-    if form == "sticks":
-        return {".sticks.txt": sticks(plan)}
-    raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
+    return {".sticks.txt": sticks(plan)}
