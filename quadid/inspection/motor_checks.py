@@ -10,6 +10,7 @@ from quadid.errors import QuadidError
 from quadid.grid import to_windows
 from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
+from quadid.model.supply import voltage_at
 from quadid.model.thrust import ThrustModel
 from quadid.resample import moving_mean
 from quadid.rotor_signal import rotor_signal
@@ -62,9 +63,9 @@ def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray
     """Factor on the speeds at times `t` [s] by the supply voltage, shape (n, 1) or (1,); 1 where none is known."""
     exponent = vehicle.effects.get("supply_voltage", {}).get("exponent", 0.0)
     battery = recording.channels.get("battery")
-    if not exponent or battery is None:
+    volts = voltage_at(t, battery.t, battery.values[:, 0]) if exponent and battery is not None else None
+    if volts is None:
         return np.ones(1)
-    volts = np.interp(t, battery.t, battery.values[:, 0])
     return np.asarray((volts / (vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
 
 

@@ -12,11 +12,16 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 
+def voltage_at(times: FloatArray, t: FloatArray, volts: FloatArray) -> FloatArray | None:
+    """Voltage at `times` [V], linear between readings `volts` at `t`; None where no reading is above zero."""
+    good = np.isfinite(volts) & (volts > 0.0)
+    return np.interp(times, t[good], volts[good]) if good.any() else None
+
+
 def _voltage(window: Window) -> FloatArray | None:
-    """Voltage at every row [V], linear between readings, shape (n,); None without any."""
-    volts = np.ravel(window.battery) if window.battery is not None else np.empty(0)
-    good = np.flatnonzero(np.isfinite(volts) & (volts > 0.0))
-    return np.interp(np.arange(len(volts)), good, volts[good]) if len(good) else None
+    """Voltage at every row [V], shape (n,); None without any."""
+    rows = np.arange(len(window), dtype=np.float64)
+    return None if window.battery is None else voltage_at(rows, rows, np.ravel(window.battery))
 
 
 def with_reference_voltage(vehicle: Vehicle, windows: Sequence[Window]) -> Vehicle:

@@ -27,6 +27,10 @@ class ThrustModel:
         layout = Layout(vehicle)
         return cls(layout, layout.initial(vehicle))
 
+    def at_speed(self, speed: float) -> FloatArray:
+        """Thrust of each rotor [N], shape (rotors,), where all turn at `speed` [rad/s]."""
+        return self.single(np.full((1, len(self._share)), speed))[0]
+
     def single(self, rotor_speed: FloatArray) -> FloatArray:
         """Thrust of each rotor [N], shape (n, rotors), of speeds [rad/s], shape (n, rotors)."""
         thrust = self._b * np.maximum(rotor_speed - self._dead_speed, 0.0) ** 2 + self._offset

@@ -141,6 +141,7 @@ def propose(
     """
     from quadid.experiment import Limits, Simulator, manoeuvre_file
     from quadid.experiment import propose as chosen
+    from quadid.report.programs.facts import Facts
 
     check_limits(seconds, tilt, rate_limit, battery)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
@@ -156,7 +157,8 @@ def propose(
         "files": [],
         "logs": [str(log.path) for log in given],
     }
-    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, _hover_throttle(believed))
+    hover = Facts(believed, believed.name).hover_thrust or HOVER_THROTTLE
+    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, hover)
 
 
 def _plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
@@ -178,16 +180,6 @@ def _plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, fl
     promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
     segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
     return Plan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
-
-
-def _hover_throttle(vehicle: Vehicle) -> float:
-    """Share of full thrust that hovers."""
-    from quadid.vehicle import GRAVITY
-
-    full = vehicle.command.max_speed
-    if full is None:
-        return HOVER_THROTTLE
-    return vehicle.mass * GRAVITY / (len(vehicle.rotors) * vehicle.parameters["b"].initial * full**2)
 
 
 def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) -> dict[str, Any]:

@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.workflow.excite import propose
 from tests.cli.conftest import Cli, Flights, one_line
 
 
@@ -91,6 +93,16 @@ def test_alike_movements_stand_together_and_every_form_is_written(inside: Cli, t
         assert path.endswith(end)
         assert "15 to 35 m" in Path(path).read_text(encoding="utf-8")
     compile(Path(result["files"][5]).read_text(encoding="utf-8"), "fly.py", "exec")
+
+
+def test_throttle_at_hover_follows_the_thrust_curve() -> None:
+    pelican = Vehicle.shipped("pelican")
+    b, full = pelican.parameters["b"].initial, 900.0
+    command = {"kind": "pwm", "max_speed": full}
+    changes = {"effects": {"thrust_curve": {"dead_speed": 100.0}}, "command": command}
+    proposed = propose(vehicle=Vehicle.model_validate(pelican.model_dump() | changes), seconds=6.5)
+    hover = pelican.mass * GRAVITY / (4.0 * b * (full - 100.0) ** 2)
+    assert proposed.hover_throttle == pytest.approx(hover)
 
 
 def test_too_little_height_or_time_is_refused(inside: Cli, tmp_path: Path) -> None:

@@ -157,6 +157,20 @@ def test_ardupilot_gets_the_curve_that_was_fitted_and_names_what_it_cannot_hold(
     assert "propExpo" not in frame_of(vehicle)
 
 
+def test_full_and_hover_thrust_follow_the_thrust_curve_and_weak_rotors(vehicle: Vehicle) -> None:
+    curve, weak = {"dead_speed": 120.0}, {"rotor": 2, "loss": 0.1}
+    curved = vehicle.model_copy(update={"effects": {"thrust_curve": curve, "weak_rotor": weak}})
+    text = export(curved, "px4", "x")[".params"]
+    values = {row[2]: float(row[3]) for row in (line.split("\t") for line in text.splitlines() if line[0] != "#")}
+    full = 2.3e-5 * (SPEED - 120.0) ** 2
+    assert [values[f"CA_ROTOR{i}_CT"] for i in range(4)] == pytest.approx([full, 0.9 * full, full, full])
+    assert values["SIH_T_MAX"] == pytest.approx(3.9 / 4.0 * full)
+    hover = 1.3 * GRAVITY / (3.9 * full)
+    assert values["MPC_THR_HOVER"] == pytest.approx(hover)
+    parameters = export(curved, "ardupilot", "x")[".param"]
+    assert float(next(line for line in parameters.splitlines() if "THST_HOVER" in line)[15:]) == pytest.approx(hover)
+
+
 def test_pulse_widths_of_the_vehicle_are_spin_limits_of_the_simulator() -> None:
     pelican = Vehicle.shipped("pelican")
     pwm = pelican.command.model_copy(update={"kind": "pwm", "range": (1150.0, 1950.0), "max_speed": 900.0})

@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.effects import rotor_losses
+from quadid.model.thrust import ThrustModel
 from quadid.parameters import NOMINAL_UNITS
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
@@ -85,12 +86,15 @@ class Facts:
         """Rotor speed at full command [rad/s], where the vehicle file knows it."""
         return self.vehicle.command.max_speed
 
+    @cached_property
+    def full_thrust(self) -> FloatArray | None:
+        """Thrust of every rotor at full command [N], shape (rotors,), where the full rotor speed is known."""
+        return None if self.max_speed is None else ThrustModel.stated(self.vehicle).at_speed(self.max_speed)
+
     @property
     def hover_thrust(self) -> float | None:
         """Share of the full thrust that hovers, where the full rotor speed is known."""
-        if self.max_speed is None:
-            return None
-        return self.vehicle.mass * GRAVITY / (float(self.thrust.sum()) * self.max_speed**2)
+        return None if self.full_thrust is None else self.vehicle.mass * GRAVITY / float(self.full_thrust.sum())
 
     @property
     def unproven(self) -> str:

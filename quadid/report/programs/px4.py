@@ -34,8 +34,8 @@ def px4(facts: Facts) -> str:
     for i, (rotor, arm) in enumerate(zip(facts.vehicle.rotors, facts.arms, strict=True)):
         rows += [(f"CA_ROTOR{i}_P{axis}", float(arm[j]), _FLOAT) for j, axis in enumerate("XYZ")]
         rows.append((f"CA_ROTOR{i}_KM", rotor.spin * facts.torque_per_thrust, _FLOAT))
-        if facts.max_speed is not None:
-            rows.append((f"CA_ROTOR{i}_CT", float(facts.thrust[i]) * facts.max_speed**2, _FLOAT))
+        if facts.full_thrust is not None:
+            rows.append((f"CA_ROTOR{i}_CT", float(facts.full_thrust[i]), _FLOAT))
     if facts.hover_thrust is None:
         lines.append("# No CA_ROTORn_CT, THR_MDL_FAC, MPC_THR_HOVER: the rotor speed at full command is not known")
         lines.append("# (command.max_speed in the vehicle file).")
@@ -59,9 +59,11 @@ def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
         ("SIH_L_ROLL", float(np.mean(np.abs(facts.arms[:, 1])))),
         ("SIH_L_PITCH", float(np.mean(np.abs(facts.arms[:, 0])))),
     ]
-    if facts.max_speed is not None:
-        full = float(np.mean(facts.thrust)) * facts.max_speed**2
-        rows += [("SIH_T_MAX", full), ("SIH_Q_MAX", full * facts.torque_per_thrust)]
+    if facts.max_speed is not None and facts.full_thrust is not None:
+        rows += [
+            ("SIH_T_MAX", float(np.mean(facts.full_thrust))),
+            ("SIH_Q_MAX", facts.torque_per_thrust * float(np.mean(facts.thrust)) * facts.max_speed**2),
+        ]
     if "rotor_drag" in facts.vehicle.effects:
         rows.append(("SIH_KDV", facts.vehicle.mass * 0.5 * (k("rotor_drag", "k_x") + k("rotor_drag", "k_y"))))
     if "rate_damping" in facts.vehicle.effects:
