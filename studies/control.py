@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from quadid.flight import TruthParameters, draw_truth, fly
-from quadid.flight.airframe import Oddity
+from quadid.flight.airframe_constants import Oddity
 from quadid.flight.setup import Setup, prepare
 from quadid.identify.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES

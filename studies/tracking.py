@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from quadid.flight.airframe import STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
+from quadid.flight.airframe import STATES, derivative, orthonormalise, rotor_wrench
+from quadid.flight.airframe_constants import Air, Body, Oddity
 from quadid.flight.jit import kernel
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY

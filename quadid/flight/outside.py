@@ -99,8 +99,8 @@ def _effects() -> tuple[OutsideEffect, ...]:
             "gusts", "environment", "Turbulence pushes and turns (Dryden-like).",
             {"push": s(0.3, 0.9, "m/s^2"), "turn": s(0.4, 1.2, "rad/s^2"), "time": s(0.3, 1.0, "s", fixed)}, f.gusts),
         make(
-            "translational_lift", "environment", "Thrust grows, and the vehicle rolls, with airspeed.",
-            {"gain": s(0.02, 0.05, "s/m"), "roll": s(0.3, 0.8, "rad/m^2")}, f.translational_lift),
+            "transverse_flow", "environment", "Flying diagonally rolls the vehicle.",
+            {"roll": s(0.3, 0.8, "rad/m^2")}, f.transverse_flow),
         make(
             "dead_time_jitter", "software", "Every command takes its own time.",
             {"jitter": s(0.02, 0.045, "s")}, f.dead_time_jitter),

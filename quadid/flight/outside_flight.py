@@ -125,9 +125,9 @@ def gusts(scene: Scene, v: Values, rng: np.random.Generator) -> None:
     scene.push(slice(3, 6), v["turn"] * turn / np.std(turn) * np.array([1.0, 1.0, 0.3]))
 
 
-def translational_lift(scene: Scene, v: Values, rng: np.random.Generator) -> None:
-    """Thrust grows with horizontal airspeed; flying diagonally rolls the vehicle."""
-    scene.setup.odd = scene.setup.odd._replace(lift_gain=v["gain"], lift_roll=v["roll"])
+def transverse_flow(scene: Scene, v: Values, rng: np.random.Generator) -> None:
+    """Inflow that differs from side to side rolls a vehicle that flies diagonally."""
+    scene.setup.odd = scene.setup.odd._replace(cross_roll=v["roll"])
 
 
 def dead_time_jitter(scene: Scene, v: Values, rng: np.random.Generator) -> None:

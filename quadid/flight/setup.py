@@ -12,7 +12,7 @@ import numpy as np
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses, rotor_losses
 from quadid.errors import ParameterError, nearest
-from quadid.flight.airframe import Air, Body, Oddity
+from quadid.flight.airframe_constants import Air, Body, Oddity
 from quadid.flight.loop import NO_TIME, Events, OnBoard
 from quadid.flight.rotors import Drive
 from quadid.flight.truth import TruthParameters

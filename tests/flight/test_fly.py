@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.effects import EFFECTS
 from quadid.errors import ParameterError
 from quadid.flight import (
     OUTSIDE,
@@ -136,8 +137,9 @@ def test_outside_effects(name: str) -> None:
     assert odd.truth.outside == {name: values}
 
 
-def test_outside_effects_are_of_many_natures() -> None:
+def test_outside_effects_are_of_many_natures_and_none_is_one_of_the_catalogue() -> None:
     assert len(OUTSIDE) >= 10
+    assert not set(OUTSIDE) & set(EFFECTS)
     assert {e.nature for e in OUTSIDE.values()} == {"structure", "propulsion", "environment", "sensors", "software"}
     with pytest.raises(ParameterError, match="gusts"):
         draw_outside("gust", 1)

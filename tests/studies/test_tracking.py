@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth
-from quadid.flight.airframe import Oddity
+from quadid.flight.airframe_constants import Oddity
 from quadid.flight.setup import prepare
 from quadid.parameters import NOMINAL_NAMES
 from studies.control import CRAFT, PATHS, unmixer
