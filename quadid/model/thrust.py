@@ -29,7 +29,7 @@ class ThrustModel:
 
     def at_speed(self, speed: float) -> FloatArray:
         """Thrust of each rotor [N], shape (rotors,), where all turn at `speed` [rad/s]."""
-        return self.single(np.full((1, len(self._share)), speed))[0]
+        return np.asarray(self.single(np.full((1, len(self._share)), speed))[0])
 
     def single(self, rotor_speed: FloatArray) -> FloatArray:
         """Thrust of each rotor [N], shape (n, rotors), of speeds [rad/s], shape (n, rotors)."""
