@@ -6,14 +6,15 @@ import argparse
 import json
 import os
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from studies.page import put_section
-from studies.peers import online, recipe, simulated
+from studies.peers import online, recipe, recorded, simulated
 
-PARTS = ("simulated", "recipe", "online")
+PARTS = ("simulated", "recorded", "recipe", "online")
 PACKAGES = ("mujoco", "filterpy")
 
 
@@ -34,6 +35,8 @@ def main() -> None:
     for part in given.parts or PARTS:
         if part == "simulated":
             _simulated(given.out, given.seeds)
+        elif part == "recorded":
+            _put(given.out, "recorded", recorded.section(given.data))
         elif part == "recipe":
             _put(given.out, "recipe", recipe.section(given.data))
         else:
@@ -44,11 +47,11 @@ def _simulated(out: Path, seeds: int) -> None:
     path = out / "peers.json"
     records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     simulated.warm_up()
-    done = {(r["case"], r["seed"]) for r in records}
+    done = {(r["case"], r["seed"], r["program"]) for r in records}
     for seed in range(1, seeds + 1):
-        for case in simulated.CASES:
-            if (case, seed) not in done:
-                records.append(simulated.record(case, seed))
+        for case, program in product(simulated.CASES, simulated.PROGRAMS):
+            if (case, seed, program) not in done:
+                records.append(simulated.record(case, seed, program))
                 path.write_text(json.dumps(records) + "\n", encoding="utf-8")
         _put(out, "simulated", simulated.section(records))
 

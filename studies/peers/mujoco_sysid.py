@@ -2,7 +2,7 @@
 
 The vehicle is a free body; thrusts, drag torques and the rotors' gyroscopic torque are actuators with gains b, d and
 J_r, driven by the measured rotor speeds and, for the last, rates.  The world is NED, the body FRD, gravity points along
-+z.  Chunks of a second begin in the measured attitude and rate; residuals are divided by the sensors' true noise.
++z.  Chunks of a second begin in the measured attitude and rate; residuals are divided by the sensors' noise.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -29,8 +29,8 @@ FINER = 2
 FLATTEST = 0.999
 """Largest J_zz as a share of J_xx + J_yy; MuJoCo refuses what no body has."""
 _J_XX, _J_YY, _J_ZZ = (NOMINAL_NAMES.index(name) for name in ("J_xx", "J_yy", "J_zz"))
-NOISE = {"gyro": 0.02, "accelerometer": 0.2, "attitude": 0.0025}
-"""Noise of the simulated logs [rad/s, m/s^2, of a quaternion's parts]."""
+NOISE = (0.02, 0.2, 0.0025)
+"""Noise of the simulated logs: gyro [rad/s], accelerometer [m/s^2], a quaternion's parts."""
 
 
 class Answer(NamedTuple):
@@ -72,18 +72,23 @@ def _apply(vehicle: Vehicle) -> Callable[[Any, Any], None]:
     return modifier
 
 
-def identify(window: Window, vehicle: Vehicle, guess: Mapping[str, float], factor: float = 4.0) -> Answer:
-    """Estimates the nominal parameters (their logarithms) of a log with gyro, attitude and accelerometer.
+def identify(
+    windows: Sequence[Window], vehicle: Vehicle, noise: tuple[float, float, float] = NOISE,
+    factor: float = 4.0, chunk: float = CHUNK,
+) -> Answer:  # fmt: skip
+    """Estimates the nominal parameters (their logarithms) of flights with gyro, attitude and accelerometer.
 
     Args:
-        window: the flight.
-        vehicle: geometry and mass.
-        guess: where the search begins.
+        windows: the flights, on one grid.
+        vehicle: geometry, mass and initial guess.
+        noise: standard deviations of gyro [rad/s], accelerometer [m/s^2] and a quaternion's parts.
         factor: bounds, as factors of the guess.
+        chunk: length of the simulated pieces [s].
     """
     begin = time.process_time()
     spec = mujoco.MjSpec.from_string(mjcf(vehicle))
-    spec.option.timestep = window.dt / FINER
+    guess = {name: p.initial for name, p in vehicle.parameters.items()}
+    spec.option.timestep = windows[0].dt / FINER
     start = np.log([guess[name] for name in NOMINAL_NAMES])
     low, high = start - np.log(factor), start + np.log(factor)
     start[_J_ZZ] = min(guess["J_zz"] / (guess["J_xx"] + guess["J_yy"]), FLATTEST - 0.01)
@@ -91,9 +96,9 @@ def identify(window: Window, vehicle: Vehicle, guess: Mapping[str, float], facto
     parameters = sysid.ParameterDict()
     parameters.add(sysid.Parameter("numbers", start, low, high, modifier=_apply(vehicle)))
     _apply(vehicle)(spec, parameters["numbers"])
-    sequences = _sequences(window, vehicle, spec)
+    sequences = _sequences(windows, vehicle, spec, chunk)
     residual = sysid.build_residual_fn(
-        models_sequences=[sequences], modify_residual=_difference, n_threads=2, resample_true=False
+        models_sequences=[sequences], modify_residual=_difference(noise), n_threads=2, resample_true=False
     )
     with contextlib.redirect_stdout(io.StringIO()):  # it prints every step
         found, result = sysid.optimize(parameters, residual, verbose=False)
@@ -121,40 +126,54 @@ def _slope_of_log_j_zz(x: FloatArray) -> FloatArray:
     return slope
 
 
-def _sequences(window: Window, vehicle: Vehicle, spec: Any) -> Any:
-    """The log in chunks, each from the state that was measured."""
+def _sequences(windows: Sequence[Window], vehicle: Vehicle, spec: Any, seconds: float) -> Any:
+    """The flights in chunks, each from the state that was measured."""
     model = spec.compile()
-    spins = np.array([rotor.spin for rotor in vehicle.rotors])
-    steps, dt = round(CHUNK / window.dt), window.dt / FINER
-    assert window.gyro is not None
-    assert window.attitude is not None
-    assert window.accel is not None
-    states, controls, sensors, names = [], [], [], []
-    for first in range(0, len(window) - steps, steps):
-        rows = slice(first, first + steps + 1)
-        speed, rate = window.rotor_speed[rows], window.gyro[rows]
-        total = speed @ spins
-        drive = np.column_stack([speed**2, total * rate[:, 1], -total * rate[:, 0]])
-        held = np.repeat(drive, FINER, axis=0)[: steps * FINER + 1]
-        controls.append(sysid.TimeSeries(dt * np.arange(len(held)), held))
-        measured = np.hstack([window.gyro[rows], window.accel[rows], window.attitude[rows]])
-        sensors.append(sysid.TimeSeries.from_names(window.dt * np.arange(steps + 1), measured, model))
-        place, moving = np.concatenate([np.zeros(3), window.attitude[first]]), np.concatenate([np.zeros(3), rate[0]])
-        states.append(sysid.create_initial_state(model, place, moving))
-        names.append(f"chunk{first}")
+    states, controls, sensors = [], [], []
+    for window in windows:
+        steps = round(seconds / window.dt)
+        for first in range(0, len(window) - steps, steps):
+            state, held, measured = _chunk(window.slice(first, first + steps + 1), vehicle, model)
+            states.append(state)
+            controls.append(held)
+            sensors.append(measured)
+    names = [f"chunk{k}" for k in range(len(states))]
     return sysid.ModelSequences("quadrotor", spec, names, states, controls, sensors)
 
 
-def _difference(
-    parameters: Any, predicted: Any, measured: Any, model: Any, return_all: bool, state: FloatArray, **_: Any
-) -> tuple[FloatArray, Any, Any]:
+def _chunk(chunk: Window, vehicle: Vehicle, model: Any) -> tuple[Any, Any, Any]:
+    """Initial state, actuators' inputs and measurements."""
+    gyro, attitude, accel = chunk.gyro, chunk.attitude, chunk.accel
+    assert gyro is not None
+    assert attitude is not None
+    assert accel is not None
+    speed, dt = chunk.rotor_speed, chunk.dt / FINER
+    total = speed @ np.array([rotor.spin for rotor in vehicle.rotors])
+    drive = np.column_stack([speed**2, total * gyro[:, 1], -total * gyro[:, 0]])
+    held = np.repeat(drive, FINER, axis=0)[: (len(chunk) - 1) * FINER + 1]
+    place, moving = np.concatenate([np.zeros(3), attitude[0]]), np.concatenate([np.zeros(3), gyro[0]])
+    measured = np.hstack([gyro, accel, attitude])
+    return (
+        sysid.create_initial_state(model, place, moving),
+        sysid.TimeSeries(dt * np.arange(len(held)), held),
+        sysid.TimeSeries.from_names(chunk.dt * np.arange(len(chunk)), measured, model),
+    )
+
+
+def _difference(noise: tuple[float, float, float]) -> Callable[..., tuple[FloatArray, Any, Any]]:
     """Differences over noise: rates and attitudes at the log's times, accelerations as means over one of its steps."""
-    rows = np.arange(1, (len(state) - FINER // 2) // FINER)
-    after = state[FINER * rows - 1, 1:]  # state k is that after step k; forces of step k come before it
-    force = predicted.data[:, 3:6]
-    mean = sum(force[FINER * rows + k] for k in range(-(FINER // 2), FINER // 2)) / FINER
-    data = np.hstack([after[:, 10:13], mean, after[:, 3:7]])
-    noise = np.repeat(list(NOISE.values()), (3, 3, 4))
-    times, mapping = measured.times[rows], measured.signal_mapping
-    both = [sysid.TimeSeries(times, d, mapping) for d in (data, measured.data[rows])]
-    return (both[1].data - both[0].data) / noise, *both
+    sigma = np.repeat(noise, (3, 3, 4))
+
+    def difference(
+        parameters: Any, predicted: Any, measured: Any, model: Any, return_all: bool, state: FloatArray, **_: Any
+    ) -> tuple[FloatArray, Any, Any]:
+        rows = np.arange(1, (len(state) - FINER // 2) // FINER)
+        after = state[FINER * rows - 1, 1:]  # state k is that after step k; forces of step k come before it
+        force = predicted.data[:, 3:6]
+        mean = sum(force[FINER * rows + k] for k in range(-(FINER // 2), FINER // 2)) / FINER
+        data = np.hstack([after[:, 10:13], mean, after[:, 3:7]])
+        times, mapping = measured.times[rows], measured.signal_mapping
+        both = [sysid.TimeSeries(times, d, mapping) for d in (data, measured.data[rows])]
+        return (both[1].data - both[0].data) / sigma, *both
+
+    return difference

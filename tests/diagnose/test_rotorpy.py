@@ -8,8 +8,9 @@ import pytest
 from quadid.diagnose.pipeline import diagnose
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.vehicle import GRAVITY, Vehicle
-from tests.model.rotorpy_flight import RotorpyFlight, fly, hummingbird
+from studies.rotorpy_flight import RotorpyFlight, fly, hummingbird
 
+pytest.importorskip("rotorpy", reason="pip install rotorpy (extra dev)")
 SECONDS = 30.0
 
 

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from quadid.flight import SensorNoise, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from studies.peers import mujoco_sysid, online, simulated
+from studies.peers import online, simulated
 
 PELICAN = Vehicle.shipped("pelican")
 
 
-def test_mujoco_finds_the_truth_of_a_flight_without_noise() -> None:
+@pytest.mark.parametrize("program", ["mujoco.sysid", "output error"])
+def test_the_truth_of_a_flight_without_noise_is_found(program: str) -> None:
     truth = simulated.body(1)
     numbers = truth.as_dict()
     window = fly(PELICAN, truth, 8.0, 1, noise=SensorNoise().scaled(1e-6)).window
-    guess = {n: p.initial for n, p in simulated.guessed(numbers, 1).parameters.items()}
-    found = mujoco_sysid.identify(window, PELICAN, guess)
+    found, _ = simulated.PROGRAMS[program](window, simulated.guessed(numbers, 1))
     error = found.values - np.log([numbers[n] for n in NOMINAL_NAMES])
     assert np.all(np.abs(error[:5]) < 0.01), "b, d and the inertias"
     assert abs(error[5]) < 0.05, "J_r"

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pytest
 
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -33,8 +32,9 @@ class RotorpyFlight:
 
 def hummingbird(**changes: Any) -> dict[str, Any]:
     """Parameters of RotorPy's Hummingbird with some of them changed."""
-    params = pytest.importorskip("rotorpy.vehicles.hummingbird_params", reason="pip install rotorpy (extra dev)")
-    return {**copy.deepcopy(params.quad_params), **changes}
+    from rotorpy.vehicles.hummingbird_params import quad_params
+
+    return {**copy.deepcopy(quad_params), **changes}
 
 
 def vehicle_of(truth: dict[str, Any]) -> Vehicle:
@@ -53,21 +53,20 @@ def vehicle_of(truth: dict[str, Any]) -> Vehicle:
 
 def fly(truth: dict[str, Any], seconds: float, seed: int, aero: bool = True, reach: float = 1.0) -> RotorpyFlight:
     """Flies between random places `reach` metres around the start; commands are held for `DT`."""
-    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
-    control = pytest.importorskip("rotorpy.controllers.quadrotor_control")
+    from rotorpy.controllers.quadrotor_control import SE3Control
+    from rotorpy.vehicles.multirotor import Multirotor
+
     rng = np.random.default_rng(seed)
     hover = np.sqrt(truth["mass"] * GRAVITY / (4.0 * truth["k_eta"]))
     at: dict[str, Any] = {
         "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3),
         "wind": np.zeros(3), "rotor_speeds": np.full(4, hover),
     }  # fmt: skip
-    flier = multirotor.Multirotor(
-        truth, at, aero=aero, integrator_kwargs={"method": "RK45", "rtol": 1e-8, "atol": 1e-9}
-    )
+    flier = Multirotor(truth, at, aero=aero, integrator_kwargs={"method": "RK45", "rtol": 1e-8, "atol": 1e-9})
     flier.g = GRAVITY
     flier.weight = np.array([0.0, 0.0, -truth["mass"] * GRAVITY])
     # Gains that a lag of 50 ms allows; the shipped ones want motors ten times as fast.
-    pilot, rows = control.SE3Control({**truth, "kp_att": 60.0, "kd_att": 12.0}), round(seconds / DT)
+    pilot, rows = SE3Control({**truth, "kp_att": 60.0, "kd_att": 12.0}), round(seconds / DT)
     turns, sizes = rng.uniform(0.5, 3.0, (3, 4)), reach * rng.uniform(0.3, 0.6, (3, 4)) * [1.0, 1.0, 0.6, 0.5]
     command, state, between = np.empty((rows, 4)), [], [np.zeros(3)]
     for k in range(rows):
