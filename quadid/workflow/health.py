@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError
-from quadid.workflow.loading import (
-    Cut,
-    Log,
-    as_vehicle,
-    check_conventions,
-    first_imu_time,
-    open_recording,
-    parse_cut,
-)
+from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording, parse_cut
 from quadid.workflow.outcome import Outcome
 
 if TYPE_CHECKING:
     from quadid.health.changes import Health
-    from quadid.health.trims import FlightTrim
     from quadid.report.text_table import TextTable
     from quadid.report.verdict import Verdict
     from quadid.vehicle import Vehicle
@@ -100,6 +91,7 @@ def health(
         NotIdentifiableError: too little steady flight.
     """
     from quadid.health.changes import assess
+    from quadid.health.trims import flight_trim
 
     described = as_vehicle(vehicle)
     tested, healthy = _several(logs), _several(baseline)
@@ -108,7 +100,7 @@ def health(
         raise LogError(f"no {missing}", "one log or more of each", "name healthy flights with --baseline")
     warnings: list[str] = []
     opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
-    trims = [[_trim(recording, described) for recording in part] for part in opened]
+    trims = [[flight_trim(recording, described) for recording in part] for part in opened]
     _distinct(*opened)
     found = assess(trims[0], trims[1], described)
     if len(trims[1]) < 3:
@@ -136,28 +128,7 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
         recording = open_recording(cut.path, preset, vehicle.columns)
     doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut)
     warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]
-    return _part(recording, cut)
-
-
-def _part(recording: Recording, cut: Cut) -> Recording:
-    """The part of a recording between the limits of `cut`."""
-    if cut.start is None and cut.stop is None:
-        return recording
-    zero = first_imu_time(recording)
-    low = zero + (cut.start if cut.start is not None else -float("inf"))
-    high = zero + (cut.stop if cut.stop is not None else float("inf"))
-    channels = {}
-    for name, channel in recording.channels.items():
-        kept = (channel.t >= low) & (channel.t <= high)
-        if kept.any():
-            channels[name] = replace(channel, t=channel.t[kept], values=channel.values[kept])
-    return replace(recording, channels=channels)
-
-
-def _trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
-    from quadid.health.trims import flight_trim
-
-    return flight_trim(recording, vehicle)
+    return cut.of(recording)
 
 
 def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid.errors import LogError, QuadidError
+from quadid.errors import QuadidError
 from quadid.workflow.loading import (
     LONGEST,
     Log,
     as_vehicle,
-    first_imu_time,
     flown_parts,
     open_recording,
     parse_cut,
@@ -80,28 +79,11 @@ def inspect(
     if whole is None:
         named = {} if described is None else described.columns
         whole = open_recording(cut.path, preset, {**named, **(columns or {})})
-    recording = _part(whole, cut.start, cut.stop)
+    recording = cut.of(whole)
     rows = () if described is None else _excitation(recording, described)
     found = inspect_recording(recording, described, rows)
     use = flown_parts(whole, described, cut)
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
-
-
-def _part(recording: Recording, start: float | None, stop: float | None) -> Recording:
-    """Cuts all channels to seconds after the first IMU sample."""
-    if start is None and stop is None:
-        return recording
-    zero = first_imu_time(recording)
-    low = -float("inf") if start is None else zero + start
-    high = float("inf") if stop is None else zero + stop
-    channels = {}
-    for name, channel in recording.channels.items():
-        inside = (channel.t >= low) & (channel.t <= high)
-        if inside.any():
-            channels[name] = replace(channel, t=channel.t[inside], values=channel.values[inside])
-    if not channels:
-        raise LogError(f"{recording.name}: nothing between {start} and {stop} s", "a span inside the log")
-    return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
 
 
 def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any], ...]:

@@ -34,6 +34,27 @@ class Cut:
     stop: float | None = None
     checked: bool = True
 
+    def span(self, recording: Recording) -> tuple[float, float]:
+        """First and last time of the part [s], in the time of the recording; infinite for open ends."""
+        zero = first_imu_time(recording)
+        low = -math.inf if self.start is None else zero + self.start
+        return low, math.inf if self.stop is None else zero + self.stop
+
+    def of(self, recording: Recording) -> Recording:
+        """The part of a recording; raises LogError where that is empty."""
+        if self.start is None and self.stop is None:
+            return recording
+        low, high = self.span(recording)
+        inside = {name: (c.t >= low) & (c.t <= high) for name, c in recording.channels.items()}
+        channels = {
+            name: replace(c, t=c.t[inside[name]], values=c.values[inside[name]])
+            for name, c in recording.channels.items()
+            if inside[name].any()
+        }
+        if not channels:
+            raise LogError(f"{recording.name}: nothing between {self.start} and {self.stop} s", "a span inside the log")
+        return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
 
 @dataclass(frozen=True)
 class Log:

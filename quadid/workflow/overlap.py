@@ -16,7 +16,7 @@ from quadid.proof import MOST_FLIGHTS, FittedFlight
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import Vehicle
-from quadid.workflow.loading import Log, first_imu_time
+from quadid.workflow.loading import Log
 
 Marks = NDArray[np.uint64]
 
@@ -134,9 +134,7 @@ def gyro(log: Log) -> tuple[FloatArray, FloatArray]:
     channel = log.recording.channels.get("gyro")
     if channel is None:
         return np.zeros(0), np.zeros((0, 3))
-    zero = first_imu_time(log.recording)
-    low = -math.inf if log.cut.start is None else zero + log.cut.start
-    high = math.inf if log.cut.stop is None else zero + log.cut.stop
+    low, high = log.cut.span(log.recording)
     used = (channel.t >= low) & (channel.t <= high) & np.isfinite(channel.values).all(axis=1)
     return channel.t[used], channel.values[used]
 

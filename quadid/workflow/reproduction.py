@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from quadid.window import Window
     from quadid.workflow.progress import Advance
 
-    FloatArray = FloatArray
-
 VEHICLE = "pelican"
 EFFECTS = {
     "motor_lag": {"tau": 0.035},

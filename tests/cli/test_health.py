@@ -52,3 +52,9 @@ def test_one_baseline_is_said_to_be_few(data_dir: Path) -> None:
     done = quadid.health(paths(data_dir, "motor_145"), paths(data_dir, "motor_144"), vehicle="crazyflie")
     assert any("1 baseline flight" in text for text in done.warnings)
     assert done.result["verdict"] == "unchanged"
+
+
+def test_a_span_outside_the_log_is_named(data_dir: Path) -> None:
+    late, healthy = paths(data_dir, "motor_145", "motor_144")
+    with pytest.raises(LogError, match="nothing between 5000.0 and 6000.0 s"):
+        quadid.health(f"{late}@5000:6000", healthy, vehicle="crazyflie")
