@@ -66,24 +66,26 @@ def compare(
 
 def show(result: JsonDict, quiet: bool) -> None:
     """Prints the table for people."""
-    from rich.table import Table
-
     from quadid.report.result_tables import number
-    from quadid_cli import terminal
+    from quadid.report.text_table import Column, TextTable
+    from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
-    table = Table(title="Methods on the same data (error over 1 s stretches, 1 = noise floor)")
-    columns = ("method", "train", *result["validate"], "paper's MSE", "evaluations", "seconds", "failed", "remark")
-    for heading in columns:
-        table.add_column(heading, justify="left" if heading in ("method", "remark") else "right")
+    columns = (
+        Column("method"), *(Column(name, right=True) for name in ("train", *result["validate"])),
+        Column("paper's MSE", right=True, rank=1), Column("evaluations", right=True), Column("seconds", right=True),
+        Column("failed", right=True), Column("remark", rank=2),
+    )  # fmt: skip
+    rows = []
     for m in result["methods"]:
         held = m["mse"]["validate"] or [None] * len(result["validate"])
-        table.add_row(
+        rows.append((
             m["name"], number(m["mse"]["train"]), *(number(v) for v in held),
             number(None if m["mse_paper"] is None else m["mse_paper"]["train"]), str(m["evaluations"]),
             number(m["seconds"], 3), f"{m['failures']}/{m['runs']}", m.get("note", m.get("stop", "")),
-        )  # fmt: skip
-    console.print(table)
+        ))  # fmt: skip
+    title = "Methods on the same data (error over 1 s of simulation, 1 = noise floor)"
+    tables.print_tables(console, [TextTable(title, columns, tuple(rows))])
     console.print(
         f"failed: runs that ended above 1.01 times the lowest cost of all; at most {result['budget']} simulations a run"
     )

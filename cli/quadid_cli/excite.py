@@ -84,25 +84,19 @@ def excite(
 
 def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
-    from rich.table import Table
-
     from quadid.experiment import BLOCK
-    from quadid_cli import terminal
+    from quadid.report.text_table import Column, TextTable
+    from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
-    table = Table(title=f"Relative 95 % half-width (±) before and after {result['seconds']:g} s")
-    for name in ("parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"):
-        table.add_column(name, justify="left" if name == "parameter" else "right")
-    for p in result["parameters"]:
-        table.add_row(p["name"], *(percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")))
-    console.print(table)
-    moves = Table(title=f"Manoeuvre: movements of {BLOCK:g} s")
-    moves.add_column("times", justify="right")
-    for name in ("movement", "amplitude (rms)"):
-        moves.add_column(name)
+    columns = ("now", "gentle flight", "manoeuvre", "one axis at a time")
+    rows = tuple((p["name"], *(percent(p[name.replace(" ", "_")]) for name in columns)) for p in result["parameters"])
+    heads = (Column("parameter"), *(Column(name, right=True) for name in columns))
+    title = f"Relative 95 % half-width (±) before and after {result['seconds']:g} s"
+    tables.print_tables(console, [TextTable(title, heads, rows)])
+    console.print(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms")
     for name, amplitudes, times in grouped(result["movements"]):
-        moves.add_row(str(times), name, amplitudes)
-    console.print(moves)
+        console.print(f"  {times} times {name}: {amplitudes}")
     peak = result["peak"]
     room, e = result["room"], result["envelope"]
     console.print(

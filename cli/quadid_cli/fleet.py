@@ -122,25 +122,24 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints counts, vehicles, reasons of failures, and where the files are."""
-    from rich.table import Table
-    from rich.text import Text
-
     from quadid.report.fleet_page import fleet_verdict
     from quadid.report.result_tables import number
+    from quadid.report.text_table import Column, TextTable
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
-    table = Table(title="Vehicles")
-    for heading in ("vehicle", "logs", "answers", "parameter", "median", "unit", "spread"):
-        table.add_column(heading, justify="right" if heading in ("logs", "answers", "median", "spread") else "left")
+    rows = []
     for unit in result["units"]:
         for i, p in enumerate(unit["parameters"] or [None]):
-            head = (Text(unit["unit"]), str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
+            head = (unit["unit"], str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
             tail = ("", "", "", "") if p is None else (
                 p["parameter"], number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
             )  # fmt: skip
-            table.add_row(*head, *tail)
-    console.print(table)
+            rows.append((*head, *tail))
+    right = ("logs", "answers", "median", "spread")
+    heads = ("vehicle", "logs", "answers", "parameter", "median", "unit", "spread")
+    columns = tuple(Column(name, right=name in right) for name in heads)
+    tables.print_tables(console, [TextTable("Vehicles", columns, tuple(rows))])
     tables.print_verdict(console, fleet_verdict(result, result["health"]))
     for reason in result["reasons"][:10]:
         console.print(f"{reason['logs']} {reason['status']}: {reason['reason']}", soft_wrap=True)

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from quadid.report.result_tables import number
+from quadid.report.text_table import Column, TextTable
 from quadid_cli.options import JsonTarget, shipped_names
 
 
@@ -60,52 +61,46 @@ def history(
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints sets, estimates and events."""
     from quadid_cli import terminal
+    from quadid_cli.tables import print_tables
 
     console = terminal.console(quiet=quiet)
     if not result["sets"]:
         others = ", ".join(v["name"] for v in result["vehicles"]) or "none"
         console.print(f"no sets of '{result['vehicle']}' yet; vehicles in this history: {others}", markup=False)
     else:
-        console.print(_story(result["sets"], f"Parameter sets of {result['vehicle']}"))
-        console.print(_values(result["sets"]))
+        story = _story(result["sets"], f"Parameter sets of {result['vehicle']}")
+        print_tables(console, [story, _values(result["sets"])])
+        for item in result["sets"]:
+            console.print(f"set {item['sequence']}: {item['reason']}", markup=False)
     for item in result["candidates"]:
         console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}", markup=False)
     for item in result["events"]:
         console.print(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}", markup=False)
 
 
-def _story(sets: Sequence[dict[str, Any]], title: str) -> Any:
-    """When, by whom, from which data and why."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title)
-    for heading in ("set", "when", "state", "by", "data [s]", "error"):
-        table.add_column(heading, no_wrap=True, justify="right" if heading in ("set", "data [s]", "error") else "left")
-    table.add_column("why", overflow="fold")
-    for item in sets:
-        span = (item["stop"] or 0.0) - (item["start"] or 0.0)
-        table.add_row(
-            str(item["sequence"]), _when(item["wall"]), item["state"], Text(item["approved_by"]), f"{span:.0f}",
-            number(item["mse"], 3), Text(item["reason"]),
-        )  # fmt: skip
-    return table
+def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
+    """When, by whom and from which data."""
+    columns = (
+        Column("set", right=True), Column("when"), Column("state"), Column("by"), Column("data [s]", right=True),
+        Column("error", right=True),
+    )  # fmt: skip
+    rows = tuple(
+        (str(item["sequence"]), _when(item["wall"]), item["state"], item["approved_by"],
+         f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}", number(item["mse"], 3))
+        for item in sets
+    )  # fmt: skip
+    return TextTable(title, columns, rows)
 
 
-def _values(sets: Sequence[dict[str, Any]]) -> Any:
+def _values(sets: Sequence[dict[str, Any]]) -> TextTable:
     """The parameters of every set, with units."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title="Values")
-    table.add_column("set", justify="right")
     shown = sets[-1]["parameters"][:6]
-    for p in shown:
-        table.add_column(Text(f"{p['name']}\n[{p['unit']}]"), justify="right", no_wrap=True)
+    columns = (Column("set", right=True), *(Column(f"{p['name']} [{p['unit']}]", right=True) for p in shown))
+    rows = []
     for item in sets:
         values = {p["name"]: p["value"] for p in item["parameters"]}
-        table.add_row(str(item["sequence"]), *(number(values.get(p["name"])) for p in shown))
-    return table
+        rows.append((str(item["sequence"]), *(number(values.get(p["name"])) for p in shown)))
+    return TextTable("Values", columns, tuple(rows))
 
 
 def _when(wall: float) -> str:

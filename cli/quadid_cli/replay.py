@@ -236,27 +236,21 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints what was published, refused and found."""
-    from quadid_cli import terminal
+    from quadid.report.result_tables import parameter_table
+    from quadid_cli import tables, terminal
 
     console = terminal.console(quiet=quiet)
     for event in result["events"]:
         if event["level"] != "info" or event["kind"] == "accepted":
             console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", markup=False, soft_wrap=True)
     for check, count in result["refused"].items():
-        console.print(f"refused by {check}: {count} estimates", markup=False)
+        console.print(f"{count} estimates not published: {check.replace('_', ' ')}", markup=False)
     if not result["published"]:
         status = result["status"]
         console.print(f"nothing published: {status['phase']}: {status['reason']}", markup=False, soft_wrap=True)
         return
-    from rich.table import Table
-
     last = result["published"][-1]
-    table = Table(title=f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
-    for heading in ("parameter", "value", "95 % interval", "unit", "status"):
-        table.add_column(heading)
-    for p in last["parameters"]:
-        low, high = p["ci95"]
-        table.add_row(p["name"], f"{p['value']:.5g}", f"{low:.5g} .. {high:.5g}", p["unit"], p["status"])
-    console.print(table)
+    console.print(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
+    tables.print_tables(console, [parameter_table(last["parameters"])])
     if "out" in result:
         console.print(f"Written: {result['out']}", markup=False, soft_wrap=True)

@@ -119,16 +119,13 @@ def write(done: Reproduced, result: JsonDict, folder: Path) -> list[str]:
 
 def show(result: JsonDict, quiet: bool) -> None:
     """Prints the tables and where the files are."""
-    from rich.table import Table
-
     from quadid.report.paper_tables import all_tables
-    from quadid_cli import terminal
+    from quadid.report.text_table import Column, TextTable
+    from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
     for table in all_tables(result):
-        drawn = Table(*table.head, title=table.title)
-        for row in table.rows:
-            drawn.add_row(*row)
-        console.print(drawn)
+        columns = tuple(Column(head, right=i > 0) for i, head in enumerate(table.head))
+        tables.print_tables(console, [TextTable(table.title, columns, tuple(tuple(row) for row in table.rows))])
     for path in result["files"][-2:]:
         console.print(path, soft_wrap=True)

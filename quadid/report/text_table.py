@@ -1,4 +1,4 @@
-"""Tables as text that fits a width: columns that matter less go, values are never cut."""
+"""Tables as text that fits a width: columns that matter less go, more columns stand below, values are never cut."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class TextTable:
 
     def lines(self, width: int) -> list[tuple[Cell, ...]]:
         """Lines of pieces with their tones, for a terminal of `width` columns."""
-        kept = self._fitting(width)
-        widths = [self._width(i) for i in kept]
-        shown = [self.columns[i] for i in kept]
         out: list[tuple[Cell, ...]] = [(Cell(line, "title"),) for line in _folded(self.title, width)]
-        out.append(tuple(Cell(_put(c.heading, w, c.right), "head") for c, w in zip(shown, widths, strict=True)))
-        for row in self.rows:
-            cells = [_cell(row[i]) for i in kept]
-            put = zip(cells, shown, widths, strict=True)
-            out.append(tuple(Cell(_put(cell.text, w, c.right), cell.tone) for cell, c, w in put))
+        for kept in self._blocks(width):
+            widths = [self._width(i) for i in kept]
+            shown = [self.columns[i] for i in kept]
+            out.append(tuple(Cell(_put(c.heading, w, c.right), "head") for c, w in zip(shown, widths, strict=True)))
+            for row in self.rows:
+                cells = [_cell(row[i]) for i in kept]
+                put = zip(cells, shown, widths, strict=True)
+                out.append(tuple(Cell(_put(cell.text, w, c.right), cell.tone) for cell, c, w in put))
         return out
 
     def text(self, width: int = 80) -> str:
@@ -67,13 +67,29 @@ class TextTable:
         )
         return f"<table><caption>{escape(self.title)}</caption><tr>{head}</tr>{body}</table>"
 
+    def _blocks(self, width: int) -> list[list[int]]:
+        """Columns that stand beside each other: those kept, below each other where the width does not hold them.
+
+        The first column, which names the rows, begins every block.
+        """
+        kept = self._fitting(width)
+        blocks = [kept[:1]]
+        for i in kept[1:]:
+            if len(blocks[-1]) > 1 and self._wide([*blocks[-1], i]) > width:
+                blocks.append(kept[:1])
+            blocks[-1] = [*blocks[-1], i]
+        return blocks
+
     def _fitting(self, width: int) -> list[int]:
         """Indices of the columns that fit `width`, those of rank 0 in any case."""
         kept = list(range(len(self.columns)))
         going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
-        while going and sum(self._width(i) for i in kept) + len(SPACE) * (len(kept) - 1) > width:
+        while going and self._wide(kept) > width:
             kept.remove(going.pop(0))
         return kept
+
+    def _wide(self, columns: Sequence[int]) -> int:
+        return sum(self._width(i) for i in columns) + len(SPACE) * (len(columns) - 1)
 
     def _width(self, i: int) -> int:
         return max(len(self.columns[i].heading), *(len(_cell(row[i]).text) for row in self.rows), 0)
