@@ -11,7 +11,7 @@ from typing import Any
 
 from quadid_replay.boot_clock import BootClock
 from quadid_replay.motors import ardupilot_motor_outputs
-from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_stamp
+from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
 
 from quadid.window import Sample
 from quadid_node.chooser import Chooser
@@ -70,11 +70,11 @@ class MavlinkDecoder:
             return
         if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
             return
-        readings = READERS[name](message)
+        readings = [r for r in READERS[name](message) if r.known]
         if not readings:
             return
         clock = self._boot_clock
-        boot = boot_stamp(message, clock.newest)
+        boot = boot_stamp(float(boot_seconds(message)), name == "SERVO_OUTPUT_RAW", clock.newest)
         placed = clock.unstamped(readings, received) if boot is None else clock.stamped(readings, boot, received)
         for waited, t in placed:
             if t is not None:

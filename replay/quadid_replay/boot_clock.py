@@ -13,7 +13,8 @@ T = TypeVar("T")
 
 FARTHEST = 1.0
 """A message that comes more than this [s] after the last stamped one has no known time."""
-_MOST_WAITING = 4096
+MOST_WAITING = 4096
+"""Messages without a stamp that wait for one; more are given up."""
 
 
 class Placed(NamedTuple, Generic[T]):
@@ -48,7 +49,7 @@ class BootClock(Generic[T]):
 
     def unstamped(self, item: T, received: float) -> list[Placed[T]]:
         """Takes a message without a stamp; returns messages that have waited too long for a stamped one."""
-        early = self._release(None) if len(self._waiting) >= _MOST_WAITING else []
+        early = self._release(None) if len(self._waiting) >= MOST_WAITING else []
         self._waiting.append((item, received))
         return early
 

@@ -102,11 +102,20 @@ class LogClock:
         out = np.array([np.nan if t is None else t for t in mapped], dtype=np.float64)
         return out, np.isfinite(out)
 
+    def in_order(self, raw: FloatArray) -> FloatArray:
+        """Maps stamps as `time` does one by one; NaN where refused."""
+        plain = self.plain_times(raw)
+        if plain is not None:
+            return plain
+        times = [self.time(stamp) for stamp in raw.tolist()]
+        return np.array([np.nan if t is None else t for t in times], dtype=np.float64)
+
     def plain_times(self, raw: FloatArray) -> FloatArray | None:
         """Maps stamps as `time` does one by one; None, and nothing has changed, unless all follow without a step."""
-        if self._newest is None or self._suspects or not len(raw) or not np.isfinite(raw).all():
+        if self._suspects or not len(raw) or not np.isfinite(raw).all():
             return None
-        newest = np.maximum.accumulate(np.concatenate([[self._newest], raw]))
+        first = raw[0] if self._newest is None else self._newest
+        newest = np.maximum.accumulate(np.concatenate([[first], raw]))
         before = newest[:-1]
         if not np.all((before - STEP_BACK < raw) & (raw < before + STEP_AHEAD)):
             return None

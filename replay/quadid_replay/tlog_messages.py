@@ -5,36 +5,43 @@ MAVLink bodies are FRD and worlds NED, as the core's; only units differ (mG, mra
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from quadid.types import FloatArray
 from quadid_replay.clocks import WrapCounter
 from quadid_replay.frames import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import RPM
 
 MILLI = 1e-3
-_SERVO_TURN = 2.0**32 * 1e-6
+SERVO_TURN = 2.0**32 * 1e-6
 """SERVO_OUTPUT_RAW counts microseconds in 32 bits: [s] until it starts over."""
+ZERO_IS_BOOT = 1.0
+"""A stamp of zero farther than this [s] from the newest one stands for unknown."""
 _UNIX_US = 1e14
 """Stamps above this [us] count from the UNIX epoch."""
+_NO_VOLTAGE = 65535
 
 
 class Reading(NamedTuple):
-    """Values of one signal.
+    """Values of one signal, of one message or of many alike.
 
     Attributes:
         signal: channel name, or a name of the reader's own (``esc``, ``servo``, ``actuator``).
-        values: in core units.
+        values: a number a column, or an array of shape (n,); in core units.
         source: message name.
         place: first column, for signals that come in several messages.
+        known: whether the message tells the signal.
     """
 
     signal: str
-    values: Sequence[float]
+    values: Sequence[Any]
     source: str
-    place: int = 0
+    place: Any = 0
+    known: Any = True
 
 
 def _imu(m: Any, rate: float, force: float, name: str) -> list[Reading]:
@@ -45,17 +52,22 @@ def _imu(m: Any, rate: float, force: float, name: str) -> list[Reading]:
 
 
 def _highres_imu(m: Any) -> list[Reading]:
-    readings = _imu(m, 1.0, 1.0, "HIGHRES_IMU")
     updated = (0x38, 0x07)  # bits of fields_updated: gyro, accel
     return [
-        r for r, bits in zip(readings, updated, strict=True) if m.fields_updated & bits == bits or not m.fields_updated
+        r._replace(known=(m.fields_updated & bits == bits) | (m.fields_updated == 0))
+        for r, bits in zip(_imu(m, 1.0, 1.0, "HIGHRES_IMU"), updated, strict=True)
     ]
 
 
+def _turned(turn: Callable[[FloatArray], FloatArray], columns: Sequence[Any]) -> tuple[Any, ...]:
+    """Columns of what `turn` makes of rows."""
+    rows = np.stack([np.asarray(c, dtype=np.float64) for c in columns], axis=-1)
+    return tuple(turn(rows[None])[0]) if rows.ndim == 1 else tuple(turn(rows).T)
+
+
 def _attitude(m: Any) -> list[Reading]:
-    q = from_euler(np.array([[m.roll, m.pitch, m.yaw]]))[0]
     return [
-        Reading("attitude", [float(v) for v in q], "ATTITUDE"),
+        Reading("attitude", _turned(from_euler, (m.roll, m.pitch, m.yaw)), "ATTITUDE"),
         Reading("gyro", (m.rollspeed, m.pitchspeed, m.yawspeed), "ATTITUDE (filtered on board)"),
     ]
 
@@ -68,8 +80,7 @@ def _attitude_quaternion(m: Any) -> list[Reading]:
 
 
 def _attitude_target(m: Any) -> list[Reading]:
-    angles = to_euler(np.array([m.q], dtype=np.float64))[0]
-    return [Reading("attitude_reference", (*(float(a) for a in angles), m.thrust), "ATTITUDE_TARGET")]
+    return [Reading("attitude_reference", (*_turned(to_euler, m.q), m.thrust), "ATTITUDE_TARGET")]
 
 
 def _local_position(m: Any) -> list[Reading]:
@@ -80,23 +91,22 @@ def _local_position(m: Any) -> list[Reading]:
 
 
 def _servo_output(m: Any) -> list[Reading]:
-    if m.port:
-        return []
-    return [Reading("servo", [float(getattr(m, f"servo{i}_raw", 0)) for i in range(1, 17)], "SERVO_OUTPUT_RAW")]
+    outputs = [getattr(m, f"servo{i}_raw", 0) for i in range(1, 17)]
+    return [Reading("servo", outputs, "SERVO_OUTPUT_RAW", known=m.port == 0)]
 
 
 def _battery_status(m: Any) -> list[Reading]:
-    cells = [v for v in m.voltages if v not in (0, 65535)]
-    return [Reading("battery", (sum(cells) * MILLI,), "BATTERY_STATUS")] if m.id == 0 and cells else []
+    millivolts = sum(v * ((v != 0) & (v != _NO_VOLTAGE)) for v in m.voltages)
+    known = (m.id == 0) & (millivolts > 0)
+    return [Reading("battery", (millivolts * MILLI,), "BATTERY_STATUS", known=known)]
 
 
 def _system_status(m: Any) -> list[Reading]:
-    if m.voltage_battery in (0, 65535):
-        return []
-    return [Reading("battery", (m.voltage_battery * MILLI,), "SYS_STATUS")]
+    known = (m.voltage_battery != 0) & (m.voltage_battery != _NO_VOLTAGE)
+    return [Reading("battery", (m.voltage_battery * MILLI,), "SYS_STATUS", known=known)]
 
 
-def _escs(m: Any, place: int, name: str) -> list[Reading]:
+def _escs(m: Any, place: Any, name: str) -> list[Reading]:
     return [Reading("esc", [abs(rpm) * RPM for rpm in m.rpm], name, place)]
 
 
@@ -119,7 +129,7 @@ READERS: dict[str, Callable[[Any], list[Reading]]] = {
     "BATTERY_STATUS": _battery_status,
     "SYS_STATUS": _system_status,
 }
-"""Messages with measurements, each with the function that reads it."""
+"""Messages with measurements, each with the function that reads one, or many whose fields are arrays."""
 
 STATE_MESSAGES = ("HEARTBEAT", "PARAM_VALUE", "SYSTEM_TIME", "ESC_INFO")
 """Messages about the vehicle and its clock."""
@@ -136,34 +146,32 @@ PREFERENCE: dict[str, tuple[str, ...]] = {
 """Which message a channel is taken from; a later one only when it comes twice as fast."""
 
 
-def boot_seconds(m: Any) -> float | None:
-    """Returns the message's own stamp [s] since boot, or None when it has none or counts UNIX time."""
+def boot_seconds(m: Any) -> Any:
+    """Returns the messages' own stamps [s] since boot, NaN where they have none or count UNIX time."""
     stamp = getattr(m, "time_boot_ms", None)
     if stamp is not None:
-        return float(stamp) * MILLI
+        return stamp * MILLI
     stamp = getattr(m, "time_usec", None)
-    if stamp is None or stamp > _UNIX_US:
-        return None
-    return float(stamp) * 1e-6
+    return math.nan if stamp is None else np.where(stamp > _UNIX_US, math.nan, stamp * 1e-6)
 
 
-def boot_stamp(m: Any, newest: float | None) -> float | None:
-    """Returns the message's own stamp [s] since boot, with whole turns of a 32-bit counter added; None without one.
+def unix_seconds(m: Any) -> Any:
+    """Returns the messages' own stamps as UNIX time [s], NaN where they do not count that."""
+    stamp = getattr(m, "time_usec", None)
+    return math.nan if stamp is None else np.where(stamp > _UNIX_US, stamp * 1e-6, math.nan)
+
+
+def boot_stamp(raw: float, servo: bool, newest: float | None) -> float | None:
+    """Returns a message's own stamp [s] since boot, with whole turns of a 32-bit counter added; None without one.
 
     Args:
-        m: a message.
+        raw: what `boot_seconds` says.
+        servo: it is SERVO_OUTPUT_RAW, whose counter has 32 bits.
         newest: newest stamp known of this vehicle [s].
     """
-    boot = boot_seconds(m)
-    if newest is None or boot is None:
-        return boot
-    raw = boot
-    if m.get_type() == "SERVO_OUTPUT_RAW":
-        boot = WrapCounter(_SERVO_TURN).unwrap_near(raw, newest)
-    return None if raw == 0.0 and abs(boot - newest) > 1.0 else boot  # zero stands for unknown
-
-
-def unix_seconds(m: Any) -> float | None:
-    """Returns the message's own stamp as UNIX time [s], or None when it does not count that."""
-    stamp = getattr(m, "time_usec", None)
-    return float(stamp) * 1e-6 if stamp is not None and stamp > _UNIX_US else None
+    if math.isnan(raw):
+        return None
+    if newest is None:
+        return raw
+    boot = WrapCounter(SERVO_TURN).unwrap_near(raw, newest) if servo else raw
+    return None if raw == 0.0 and abs(boot - newest) > ZERO_IS_BOOT else boot

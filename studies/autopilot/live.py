@@ -11,7 +11,7 @@ import threading
 import time
 from pathlib import Path
 
-from quadid_replay.mavlink_frames import FrameCount, iterate_frames
+from quadid_replay.mavlink_frames import read_frames
 
 from studies.autopilot.flights import Outcome
 
@@ -79,11 +79,9 @@ def _listen(served: subprocess.Popen[str], said: list[str], ready: threading.Eve
 
 def _send(log: Path, wire: socket.socket, port: int, seconds: float) -> None:
     """Sends every frame when it came, counted from the first; what is asked of the vehicle finds no ear."""
-    begin = first = None
-    for frame in iterate_frames(log, FrameCount()):
-        if begin is None or first is None:
-            begin, first = time.monotonic(), frame.received
-        if frame.received - first > seconds:
+    frames, begin = read_frames(log), time.monotonic()
+    for k, due in enumerate(frames.received - frames.received[:1]):
+        if due > seconds:
             return
-        time.sleep(max(begin + frame.received - first - time.monotonic(), 0.0))
-        wire.sendto(bytes(frame.data), ("127.0.0.1", port))
+        time.sleep(max(begin + due - time.monotonic(), 0.0))
+        wire.sendto(frames.frame(k), ("127.0.0.1", port))
