@@ -22,6 +22,7 @@ class QuadidError(Exception):
     exit_code = 2
 
     def __init__(self, found: str, allowed: str = "", fix: str = "") -> None:
+        fix = "" if allowed and fix == _one_of(allowed) else fix  # what is allowed is said once
         self.found, self.allowed, self.fix = found, allowed, fix
         parts = [found]
         if allowed:
@@ -56,5 +57,9 @@ class NotIdentifiableError(QuadidError):
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Returns ``did you mean 'x'?`` for the valid name closest to `name`, or the list of valid names."""
     options = list(valid)
-    close = difflib.get_close_matches(name, options, n=1, cutoff=0.4)
-    return f"did you mean '{close[0]}'?" if close else "use one of " + ", ".join(options)
+    close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else _one_of(", ".join(options))
+
+
+def _one_of(options: str) -> str:
+    return f"use one of {options}"

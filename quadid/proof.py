@@ -51,5 +51,6 @@ class Proof(BaseModel):
     def lacking(self) -> str:
         """Why the values are not proven; empty when they are."""
         if self.verdict == "poor":
-            return "the fit was red" + (f", error {self.error:.3g} (noise floor 1)" if self.error else "")
+            error = f": error {self.error:.3g} times the noise variance on an unseen flight" if self.error else ""
+            return f"its fit was judged poor{error}"
         return "" if self.unseen else "no flight was predicted that was not fitted"

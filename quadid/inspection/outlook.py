@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from quadid.inspection.findings import ChannelFacts, Missing, Outlook
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotor_signal import SLOWEST_RATE
@@ -58,11 +60,10 @@ def _one(log_format: str, channel: str, rate: float | None, why: str) -> list[Mi
     how = _HOW[channel].get(log_format, "log it")
     if rate is None:
         return [Missing(channel, why, how)]
-    if not rate >= INERTIA_RATE:
-        return [
-            Missing(channel, f"{rate:.3g} Hz is too slow for inertias, which need {INERTIA_RATE:g} Hz or more", how)
-        ]
-    return []
+    if rate >= INERTIA_RATE:
+        return []
+    slow = "one sample is too little" if math.isnan(rate) else f"{rate:.3g} Hz is too slow"
+    return [Missing(channel, f"{slow} for inertias, which need {INERTIA_RATE:g} Hz or more", how)]
 
 
 def parameter_outlook(facts: tuple[ChannelFacts, ...]) -> tuple[Outlook, ...]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.errors import QuadidError
+from quadid.errors import LogError, QuadidError
 from quadid.mounting import in_body_axes
 from quadid.online.channel_buffer import ChannelBuffer
 from quadid.online.clock import StreamClock
@@ -35,6 +35,7 @@ BLOCK = 20
 HISTORY = 2.0
 """Past samples kept [s]: rates and gaps are judged from them."""
 _LARGE = 1e150
+_COUNT = " values instead of "
 MOST_SAMPLES = 400_000
 """A channel holds no more samples than this; a flood beyond is dropped and counted."""
 
@@ -114,7 +115,7 @@ class Resampler:
             self.faults["unknown channel"] += 1
             return
         if len(values) != columns:
-            self.faults[f"{name}: {len(values)} values instead of {columns}"] += 1
+            self.faults[f"{name}: {len(values)}{_COUNT}{columns}"] += 1
             return
         if not math.isfinite(sum(values)):
             self.faults[f"{name}: not finite"] += 1
@@ -270,6 +271,12 @@ class Resampler:
     def _rotor_signal(self, recording: Recording, at: FloatArray, arrived: Mapping[str, int]) -> RotorSignal:
         """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
         told = arrived["rotor_speed"] or arrived["motor_command"]
+        misfit = next(
+            (f for f in self.faults if f.startswith(("rotor_speed: ", "motor_command: ")) and _COUNT in f), ""
+        )
+        if misfit and not told:
+            wanted = f"{len(self._vehicle.rotors)}, the rotors of '{self._vehicle.name}'"
+            raise LogError(f"{recording.name}: {misfit}", wanted, "choose the vehicle file that belongs to these data")
         if told or not self._reconstruction.known or not arrived["attitude_reference"]:
             return rotor_signal(recording, self._vehicle)
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step

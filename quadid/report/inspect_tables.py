@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from quadid.inspection import Inspection
+from quadid.report.result_tables import number
 from quadid.report.text_table import Cell, Column, TextTable, Tone
 from quadid.report.words import parameter_name
 from quadid.sanitise import LONGEST_LINE, plain
@@ -25,7 +26,7 @@ def channel_table(found: Inspection) -> TextTable:
     rows = tuple(
         (
             f.name,
-            f"{f.rate:.4g}",
+            number(f.rate),
             str(f.count),
             f"{f.first:.1f}-{f.last:.1f}",
             str(f.gaps),

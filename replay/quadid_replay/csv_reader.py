@@ -186,7 +186,9 @@ def _table(path: Path, width: int, delimiter: str) -> tuple[FloatArray, list[str
         rows.frombytes(np.ascontiguousarray(block).tobytes())
     notes = []
     if bad:
-        notes.append(f"{len(bad)} lines with missing or unreadable cells dropped (first: line {bad[0]})")
+        notes.append(
+            f"{len(bad)} line{'s' * (len(bad) > 1)} with missing or unreadable cells dropped (first: line {bad[0]})"
+        )
     if cut:
         notes.append("the last line is cut short: dropped")
     return np.frombuffer(rows, dtype=np.float64).reshape(-1, width), notes

@@ -138,6 +138,9 @@ def _no_topic(path: Path, bag: Bag, preset: str, notes: list[str]) -> LogError:
     found = ", ".join(f"{t.name} [{type_name(t.type) or t.unread or unread}]" for t in list(bag.topics.values())[:5])
     damage = plain("; ".join([*bag.damage(), *notes[:4]]), 600)
     reason = f" ({damage})" if damage else ""
+    if damage and not bag.topics:
+        fix = "copy it again; `mcap recover` may save a part of an MCAP file"
+        return LogError(f"{path.name}: nothing in it can be read{reason}", "a whole log", fix)
     return LogError(
         f"{path.name}: no topic to read with preset '{preset}' among: {found or 'none'}{reason}",
         "topics of types " + ", ".join(list(TYPES)[:6]) + " …",

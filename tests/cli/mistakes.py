@@ -219,7 +219,7 @@ MISTAKES = (
     Mistake("a port of 99999", lambda p: ("serve", "--vehicle", "pelican", "--mavlink", "udpin:0.0.0.0:99999"), "port"),
     Mistake("a command misspelt", lambda p: ("identfy", p.log), "identify|No such command"),
     Mistake(
-        "a red fit exported",
+        "a poor fit exported",
         lambda p: ("export", "--vehicle", p.vehicle(proof={"verdict": "poor"}), "--format", "px4"),
         "--anyway",
     ),

@@ -55,6 +55,12 @@ def test_a_truncated_log_is_used_as_far_as_it_goes(inside: Cli, flights: Flights
     assert "cut.csv" in run.err
 
 
+def test_what_is_allowed_is_said_once(inside: Cli, flights: Flights) -> None:
+    line = one_line(inside("compare", flights.train, "--vehicle", "pelican", "--method", "magic"), 2)
+    assert line.count("l_shade") == 1
+    assert "fix" not in line
+
+
 @pytest.mark.parametrize("kept", [60, 2000, 100_000])
 def test_a_truncated_log_with_nothing_left(inside: Cli, flights: Flights, tmp_path: Path, kept: int) -> None:
     cut = tmp_path / "cut.mcap"

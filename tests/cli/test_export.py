@@ -210,7 +210,10 @@ def test_what_nothing_proves_is_asked_about_and_says_so_at_its_top(
     vehicle: Vehicle, inside: Cli, tmp_path: Path
 ) -> None:
     red = Proof(verdict="poor", unseen=("other.mcap",), error=48.8)
-    for proof, why in ((red, "the fit was red, error 48.8"), (Proof(verdict="fair"), "no flight was predicted")):
+    for proof, why in (
+        (red, "its fit was judged poor: error 48.8 times"),
+        (Proof(verdict="fair"), "no flight was predicted"),
+    ):
         file = vehicle.model_copy(update={"proof": proof}).save(tmp_path / "fitted.yaml")
         line = one_line(inside("export", "--vehicle", file, "--format", "px4", "--out", tmp_path), 2)
         assert why in line

@@ -84,3 +84,14 @@ def test_control_characters_of_a_log_do_not_reach_the_terminal(
     write_csv(path, Recording(recording.name, "csv", recording.channels))
     assert run(monkeypatch, str(path)) == 0
     assert "\x1b" not in capsys.readouterr().out
+
+
+def test_a_single_sample_has_no_rate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "one.csv").write_text("t,p,q,r\n0,0,0,0\n0.02,x,0,0\n", encoding="utf-8")
+    assert run(monkeypatch, str(tmp_path / "one.csv")) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "nan" not in out
+    assert "one sample is too little" in out
+    assert "1 line with missing" in out
