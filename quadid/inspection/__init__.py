@@ -11,6 +11,7 @@ from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, M
 from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
+from quadid.inspection.position import position_checks
 from quadid.inspection.rotor_checks import rotor_speed_check
 from quadid.inspection.rotor_timing import rotor_timing_check
 from quadid.inspection.timing import channel_facts, timing_checks
@@ -46,7 +47,7 @@ def inspect(
     turned = recording if vehicle is None else in_body_axes(recording, vehicle)
     spans = flying_spans(turned, vehicle)
     checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
-    checks += [gravity_check(turned, spans), gyro_check(turned), velocity_check(turned)]
+    checks += [gravity_check(turned, spans), gyro_check(turned), velocity_check(turned), *position_checks(recording)]
     if vehicle is not None:
         checks += _against_vehicle(turned, vehicle, spans, lagged_motion(recording, vehicle, spans))
     return Inspection(

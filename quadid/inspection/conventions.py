@@ -216,8 +216,8 @@ def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
 
 def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
-    keep = _usable_steps(t, gyro.t)
-    mean = np.diff(_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
+    keep = usable_steps(t, gyro.t)
+    mean = np.diff(running_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
     return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
 
 
@@ -228,13 +228,13 @@ def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tup
     force = rotated(q, accel.values) + np.array([0.0, 0.0, GRAVITY])
     stride = max(1, round(0.2 / sample_period(velocity.t)))
     t, speed = velocity.t[::stride], velocity.values[::stride]
-    keep = _usable_steps(t, accel.t) & _usable_steps(t, attitude.t)
+    keep = usable_steps(t, accel.t) & usable_steps(t, attitude.t)
     world = Channel("accel", accel.t, force)
-    derived = np.diff(_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
+    derived = np.diff(running_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
     return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
 
 
-def _usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
+def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
     """Tells which steps of `t` have no gap, neither in `t` nor in the other channel's times."""
     steps = np.diff(t)
     longest = GAP * sample_period(other)
@@ -245,7 +245,7 @@ def _usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
     return np.asarray(inside & ~spoiled & (steps < GAP * np.median(steps)))
 
 
-def _integral(channel: Channel, at: FloatArray) -> FloatArray:
+def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
     """Running integral (trapezoidal) of a channel, read at times `at`, shape (m, columns)."""
     area = 0.5 * (channel.values[1:] + channel.values[:-1]) * np.diff(channel.t)[:, None]
     total = np.concatenate([np.zeros((1, area.shape[1])), np.cumsum(area, axis=0)])

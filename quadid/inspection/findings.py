@@ -67,8 +67,8 @@ class Check:
     """One question put to the data.
 
     Attributes:
-        name: what was asked: gravity, gyro_attitude, velocity_attitude, rotor_speed, hover, motor_order, rotor_timing,
-            geometry, mass, clock, timing.
+        name: what was asked: gravity, gyro_attitude, velocity_attitude, position_velocity, rotor_speed, hover,
+            motor_order, rotor_timing, geometry, mass, clock, timing.
         verdict: the answer.
         message: one sentence with numbers and units.
         fix: what to do, empty when nothing.

@@ -124,6 +124,49 @@ def test_velocity_in_enu_beside_an_attitude_in_ned(clean: Recording) -> None:
     assert "x = y, y = x" in found.message
 
 
+def with_position(recording: Recording, factor: tuple[float, float, float], shuffle: bool = False) -> Recording:
+    """The flight with its own path as position, and a velocity that is `factor` times the change of it."""
+    speed = recording.channels["velocity"]
+    step = 0.5 * (speed.values[1:] + speed.values[:-1]) * np.diff(speed.t)[:, None]
+    path = np.cumsum(np.vstack([np.zeros(3), step]), axis=0)[:, [1, 0, 2] if shuffle else [0, 1, 2]]
+    both = {
+        "position": replace(speed, name="position", values=path),
+        "velocity": replace(speed, values=speed.values * factor),
+    }
+    return replace(recording, channels={**recording.channels, **both})
+
+
+def test_a_velocity_that_is_the_change_of_position_is_said_to_be(clean: Recording) -> None:
+    found = check(inspect(with_position(clean, (1.0, 1.0, 1.0))), "position_velocity")
+    assert found.verdict is Verdict.OK
+    assert found.numbers["scale horizontally"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_horizontal_velocity_larger_than_the_change_of_position_is_a_finding(clean: Recording) -> None:
+    """As the estimator on board of Crazyflies has it, by 8 %; the vertical one is right."""
+    recording = with_position(clean, (1.08, 1.08, 1.0))
+    found = check(inspect(recording), "position_velocity")
+    assert found.verdict is Verdict.WARNING
+    assert "8.0% larger horizontally" in found.message
+    assert "vertically than" not in found.message
+    assert found.numbers["scale horizontally"] == pytest.approx(1.08, abs=1e-3)
+
+
+def test_a_position_in_enu_beside_a_velocity_in_ned(clean: Recording) -> None:
+    found = check(inspect(with_position(clean, (1.0, 1.0, 1.0), shuffle=True)), "position_velocity")
+    assert found.verdict is Verdict.WARNING
+    assert "x = y, y = x" in found.message
+
+
+def test_recorded_crazyflies_have_a_velocity_that_is_too_large_horizontally(data_dir: Path) -> None:
+    for log in ("nanodrone/random_run1.csv", "brushed/jana00.csv", "crazyflie_rpm/figure8_22.csv"):
+        found = check(inspect(open_log(data_dir / log)), "position_velocity")
+        assert found.verdict is Verdict.WARNING
+        assert 1.05 < found.numbers["scale horizontally"] < 1.11
+    right = check(inspect(open_log(data_dir / "nanobench" / "B2_circle_fast_rep1.csv")), "position_velocity")
+    assert right.verdict is Verdict.OK
+
+
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1), (1, 2, 3, 0)])
 def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...], happened: Happened) -> None:
     swapped = changed(clean, "rotor_speed", lambda v: v[:, order])
