@@ -81,6 +81,11 @@ class SetScore:
     series: Series
 
 
+_INFINITE = np.errstate(over="ignore", invalid="ignore")
+"""A simulation that runs away overflows to infinity or NaN, which is its score and needs no warning."""
+
+
+@_INFINITE
 def mse_score(
     windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel | None = None
 ) -> SetScore:
@@ -145,6 +150,7 @@ class Tally:
         return float(np.sum(weight * np.nan_to_num(ratio)) / weight.sum())
 
 
+@_INFINITE
 def tallied(shooting: Shooting, theta: FloatArray, lin: Linearised | None = None, known: int | None = None) -> Tally:
     """The tally of `theta` on a problem; `known` channels at most have a known noise, all by default."""
     lin = settle_states(shooting, theta) if lin is None else lin
@@ -184,6 +190,7 @@ def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> Noise
     return replace(noise, white=white, slow=slow, shape=shape)
 
 
+@_INFINITE
 def settle_states(
     shooting: Shooting, theta: FloatArray, names: Sequence[str] = (), states: InitialStates | None = None
 ) -> Linearised:
@@ -262,28 +269,20 @@ def _errors(measured: FloatArray, simulated: FloatArray) -> tuple[float, float]:
 
 
 def _series(shooting: Shooting, lin: Linearised) -> Series:
-    t, measured, simulated = [], [], []
-    place = 0
+    parts, place = [], 0
     for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
         rows = (segments.starts[:, None] + np.arange(segments.length)).ravel()
         part = slice(place, place + len(segments.starts))
         residual = lin.residuals[part].reshape(len(rows), -1)
         place += len(segments.starts)
-        y, q = _outputs(rollout.measured[rows], shooting.channels)
+        known = rollout.measured[rows]
+        y = np.concatenate([known[:, :3], np.zeros((len(rows), 3)), known[:, 7:]], axis=1)[:, : shooting.channels]
         y_sim = y + residual
-        y[:, _ATTITUDE], y_sim[:, _ATTITUDE] = _angles(q, residual[:, _ATTITUDE])
+        y[:, _ATTITUDE], y_sim[:, _ATTITUDE] = _angles(known[:, 3:7], residual[:, _ATTITUDE])
         absent = ~rollout.valid[rows][:, : shooting.channels]
         y[absent] = y_sim[absent] = np.nan
-        t.append(rollout.window.t[rows])
-        measured.append(y)
-        simulated.append(y_sim)
-    return Series(np.concatenate(t), np.concatenate(measured), np.concatenate(simulated))
-
-
-def _outputs(rows: FloatArray, channels: int) -> tuple[FloatArray, FloatArray]:
-    """Measured rows (n, channels + 1) as channels, with a place left for the attitude, and the quaternions (n, 4)."""
-    y = np.concatenate([rows[:, :3], np.zeros((len(rows), 3)), rows[:, 7:]], axis=1)[:, :channels]
-    return np.ascontiguousarray(y), rows[:, 3:7]
+        parts.append((rollout.window.t[rows], y, y_sim))
+    return Series(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -47,6 +47,14 @@ def test_a_wrong_inertia_shows_on_its_axis(flight: Flight) -> None:
     assert wrong["r"] == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("growth", [10.0, 40.0])
+def test_a_simulation_that_runs_away_scores_infinity_without_a_word(flight: Flight, growth: float) -> None:
+    theta = true_theta(flight)
+    theta[Layout(PELICAN).entry("rate_damping.l_p").index] = -growth
+    assert mse_score([flight.window], PELICAN, theta, true_noise()).mse == np.inf
+
+
 def test_fit_percent_is_the_contracts_formula(flight: Flight) -> None:
     score = mse_score([flight.window], PELICAN, Layout(PELICAN).initial(PELICAN), true_noise())
     y, y_sim = score.series.measured[:, 1], score.series.simulated[:, 1]
