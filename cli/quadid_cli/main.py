@@ -10,10 +10,10 @@ import importlib
 import importlib.util
 import os
 import sys
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from quadid_node.working_folder import refusal
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
@@ -138,10 +138,6 @@ BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 core itself: more threads than one only wait for each other, on a busy machine for most of the time."""
 
 
-NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""numba reads this file of the folder we stand in, and takes machine code from where it says."""
-
-
 def app_main() -> int:
     """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer."""
     if sys.stderr is None:  # closed by the shell: what is written to it goes nowhere
@@ -149,9 +145,9 @@ def app_main() -> int:
     if sys.stdout is None:
         print("quadid: stdout is closed; fix: send it to a file, or to /dev/null", file=sys.stderr)
         return 2
-    if NUMBA_SETTINGS.exists():
-        what = f"{NUMBA_SETTINGS} in this folder would change what is computed, and run code from where it says"
-        print(f"quadid: {what}; fix: stand in another folder, or remove it", file=sys.stderr)
+    refused = refusal()
+    if refused is not None:
+        print(f"quadid: {refused}", file=sys.stderr)
         return 2
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")

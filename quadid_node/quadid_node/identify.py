@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from quadid_node.stopping import Stop, end_middleware
 from quadid_node.transport import without_shared_memory
+from quadid_node.working_folder import refusal
 
 if TYPE_CHECKING:
     from quadid_node.node import IdentifyNode
@@ -42,7 +43,11 @@ class Starter:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the node; returns the exit code: 0 done, 2 bad parameters."""
+    """Runs the node; returns the exit code: 0 done, 2 bad parameters, or a folder to run nothing in."""
+    refused = refusal()
+    if refused is not None:
+        print(f"identify: {refused}", file=sys.stderr)  # noqa: T201 - a command's last word
+        return 2
     code = _run(args, Stop(nothing_open=True))
     end_middleware()
     return code

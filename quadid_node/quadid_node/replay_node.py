@@ -4,92 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Callable
-from io import BytesIO
-from typing import Any
 
-import rclpy
-from quadid_replay import TopicWriter, open_log
-from quadid_replay.mcap_writer import write_recording
-from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
-
-from quadid.errors import QuadidError
-from quadid.window import Recording
-from quadid_node.convert import message_class
-from quadid_node.playback import base_seconds
 from quadid_node.stopping import Stop, end_middleware
-from quadid_node.transport import without_shared_memory
-
-QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-_CHECK_EVERY = 0.1
-_TOPICS = {
-    "imu": ("sensor_msgs/Imu", ("gyro", "accel")),
-    "attitude": ("geometry_msgs/QuaternionStamped", ("attitude",)),
-    "rotor_speeds": ("sensor_msgs/JointState", ("rotor_speed",)),
-    "motor_command": ("quadid_msgs/MotorCommand", ("motor_command",)),
-    "command": ("quadid_msgs/AttitudeCommand", ("attitude_reference",)),
-    "odom": ("nav_msgs/Odometry", ("velocity", "position")),
-    "battery": ("sensor_msgs/BatteryState", ("battery",)),
-}
-
-
-class Stopped(Exception):  # noqa: N818 - a signal asked for it, nothing is wrong
-    """A signal asked to stop."""
-
-
-class TopicPlayer(TopicWriter):
-    """Publishes what a `TopicWriter` would write, each message when its time has come."""
-
-    def __init__(self, node: Node, speed: float, stop: Callable[[], bool]) -> None:
-        """Publishes through `node` until `stop` says so, at `speed` times the log's pace; 0: as fast as possible."""
-        super().__init__(BytesIO())
-        self._node, self._speed, self._stop = node, speed, stop
-        self._publishers: dict[str, Any] = {}
-        self._begin: tuple[float, int] | None = None
-        self.count = 0
-
-    def announce(self, recording: Recording, wait: float) -> None:
-        """Makes the publishers and gives subscribers `wait` seconds to find them."""
-        for topic, (kind, channels) in _TOPICS.items():
-            if any(c in recording.channels for c in channels):
-                self._publisher(topic, kind)
-        time.sleep(wait)
-
-    def write_cdr(self, topic: str, kind: str, data: bytes, stamp_ns: int) -> None:
-        """Waits for the message's time and publishes it."""
-        self._wait(stamp_ns)
-        self._publisher(topic, kind).publish(data)
-        self.count += 1
-
-    def _publisher(self, topic: str, kind: str) -> Any:
-        if topic not in self._publishers:
-            self._publishers[topic] = self._node.create_publisher(message_class(kind), topic, QOS)
-        return self._publishers[topic]
-
-    def _wait(self, stamp_ns: int) -> None:
-        now = time.monotonic()
-        if self._begin is None:
-            self._begin = (now, stamp_ns)
-        due = self._begin[0] + ((stamp_ns - self._begin[1]) * 1e-9 / self._speed if self._speed > 0.0 else 0.0)
-        while True:
-            if self._stop():
-                raise Stopped
-            left = due - time.monotonic()
-            if left <= 0.0:
-                return
-            time.sleep(min(left, _CHECK_EVERY))
-
-
-def epoch_of(recording: Recording, stamps: str) -> int:
-    """Nanoseconds to add to recording time: the log's own UNIX time, or such that the log begins now."""
-    if stamps == "log":
-        return base_seconds(recording) * 10**9
-    first = min(float(c.t[0]) for c in recording.channels.values() if len(c.t))
-    return (time.time_ns() // 10**6) * 10**6 - round(first * 1e9)
+from quadid_node.working_folder import refusal
 
 
 def parse(args: list[str]) -> argparse.Namespace:
@@ -104,7 +21,17 @@ def parse(args: list[str]) -> argparse.Namespace:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Plays a log; returns the exit code: 0 done, 2 a log that cannot be read."""
+    """Plays a log; returns the exit code: 0 done, 2 a log that cannot be read, or a folder to run nothing in."""
+    refused = refusal()
+    if refused is not None:
+        print(f"replay: {refused}", file=sys.stderr)  # noqa: T201 - a command's last word
+        return 2
+    from quadid_replay import open_log
+    from rclpy.utilities import remove_ros_args
+
+    from quadid.errors import QuadidError
+    from quadid_node.topic_player import play
+
     given = parse(remove_ros_args(args or sys.argv)[1:])
     stop = Stop()
     try:
@@ -112,27 +39,9 @@ def main(args: list[str] | None = None) -> int:
     except QuadidError as error:
         print(f"replay: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
-    _play(recording, given, args, stop)
+    play(recording, given.speed, given.stamps, given.wait, args, stop)
     end_middleware()
     return 0
-
-
-def _play(recording: Recording, given: argparse.Namespace, args: list[str] | None, stop: Stop) -> None:
-    without_shared_memory()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("quadid_replay")
-    player = TopicPlayer(node, given.speed, stop)
-    try:
-        player.announce(recording, given.wait)
-        write_recording(player, recording, epoch_of(recording, given.stamps))
-        node.get_logger().info(f"{player.count} messages of {recording.name} played")
-        time.sleep(0.5)  # the last ones are still on their way
-    except Stopped:
-        pass
-    finally:
-        stop.ignore_more()
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.faults.evidence import Happened
 
 QUADID = Path(sys.executable).with_name("quadid")
@@ -18,6 +20,17 @@ def test_settings_of_numba_that_lie_in_the_folder_are_refused(tmp_path: Path, ha
     assert ".numba_config.yaml in this folder" in done.stderr
     assert done.stderr.count("\n") == 1
     happened(25, f"a .numba_config.yaml in the folder we stand in: '{done.stderr.strip()[:80]}'")
+
+
+@pytest.mark.parametrize("module", ["identify", "replay_node"])
+def test_so_does_the_ros_node(tmp_path: Path, module: str, happened: Happened) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
+    command = [sys.executable, "-P", "-m", f"quadid_node.{module}", "flight.mcap"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert ".numba_config.yaml in this folder" in done.stderr
+    assert done.stderr.count("\n") == 1
+    happened(25, f"the same before the ROS node's {module}: '{done.stderr.strip()[:80]}'")
 
 
 def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happened: Happened) -> None:
