@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -19,6 +19,9 @@ from studies.ablation.corpus import CLASSES, START, flights
 from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
+SHOWN = 3
+"""Answers that one cell of the table tells."""
+
 
 def told(answer: Answer) -> None:
     """Prints one answer."""
@@ -26,24 +29,31 @@ def told(answer: Answer) -> None:
     print(f"{mark:5s} {answer.variant}: {answer.flight}: {answer.verdict} {list(answer.listed)}", flush=True)
 
 
-def row(variant: Variant, base: Sequence[Answer], answers: Sequence[Answer]) -> str:
-    """One line of the table: what is right, which answers differ from `base`, and how."""
-    judged = [a for a in answers if a.right is not None]
-    changed = [(b, a) for b, a in zip(base, answers, strict=True) if a.differs(b)]
-    better = sum(bool(a.right) and not b.right for b, a in changed if a.right is not None)
-    worse = sum(not a.right and bool(b.right) for b, a in changed if a.right is not None)
-    named = "; ".join(_difference(b, a) for b, a in changed[:4]) + (" …" if len(changed) > 4 else "")
-    seconds = sum(a.seconds for a in answers) / max(sum(a.seconds for a in base), 1e-9)
-    return (
-        f"| {variant.name} | {sum(bool(a.right) for a in judged)} of {len(judged)} | +{better} −{worse} "
-        f"| {len(changed)} | {seconds:.2f} | {named or '–'} |"
-    )
+def row(subject: str, chosen: Sequence[Variant], answers: Mapping[str, Sequence[Answer]]) -> str:
+    """One line of the table: what changes under each change of one rule or number."""
+    base = answers["base"]
+    cells = {}
+    for variant in (v for v in chosen if v.subject == subject):
+        how = variant.name.removeprefix(subject).strip().removeprefix("without " + subject) or "out"
+        cells[how] = _cell(base, answers[variant.name])
+    return f"| {subject} | {' | '.join(cells.get(how, '') for how in ('out', '× 0.5', '× 2'))} |"
 
 
-def _difference(base: Answer, other: Answer) -> str:
-    gone, come = (sorted(set(x.listed) - set(y.listed)) for x, y in ((base, other), (other, base)))
-    words = [*(f"−{n}" for n in gone), *(f"+{n}" for n in come)] or [f"{base.extended:.3g} → {other.extended:.3g}"]
-    return f"{base.flight}: {', '.join(words)}"
+def _cell(base: Sequence[Answer], answers: Sequence[Answer]) -> str:
+    pairs = [(b, a) for b, a in zip(base, answers, strict=True) if b.difference(a)]
+    better = sum(a.right is True and b.right is False for b, a in pairs)
+    worse = sum(a.right is False and b.right is True for b, a in pairs)
+    fits = sum(a.fits for a in answers) / max(sum(b.fits for b in base), 1)
+    told = [f"**+{better} −{worse}**"] if better or worse else []
+    told += [f"{b.flight}: {b.difference(a)}" for b, a in sorted(pairs, key=_weight)[:SHOWN]]
+    told += [f"and {len(pairs) - SHOWN} more"] if len(pairs) > SHOWN else []
+    told += [f"fits × {fits:.2f}"] if abs(fits - 1.0) > 0.03 else []
+    return "; ".join(told) or "–"
+
+
+def _weight(pair: tuple[Answer, Answer]) -> tuple[bool, bool]:
+    base, other = pair
+    return base.right == other.right, (base.verdict, set(base.listed)) == (other.verdict, set(other.listed))
 
 
 def main() -> None:
@@ -69,16 +79,12 @@ def main() -> None:
     todo = [f for f in todo if not named or f.name in named]
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
-    rows: list[str] = []
-    base: list[Answer] = []
-    for variant in chosen:
-        with variant.in_force():
-            answers = run(todo, variant.name, options.cache, options.records, told)
-        base = base or answers
-        rows.append(row(variant, base, answers))
-        print(rows[-1], flush=True)
+    by_flight = [run(flight, chosen, options.cache, options.records, told) for flight in todo]
+    answers = {v.name: [each[i] for each in by_flight] for i, v in enumerate(chosen)}
+    rows = [row(s, chosen, answers) for s in dict.fromkeys(v.subject for v in chosen) if s != "base"]
+    print("\n".join(rows))
     if options.out is not None:
-        (options.out / "ablation.md").write_text(page(rows, base, options), encoding="utf-8")
+        (options.out / "ablation.md").write_text(page(rows, answers["base"], options), encoding="utf-8")
 
 
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
@@ -87,15 +93,15 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
     for name in ("classes", "flights", "only"):
         command += f" --{name} '{getattr(options, name)}'" if getattr(options, name) else ""
     return (
-        f"""# Diagnosis: without each rule, with half and twice each number
+        f"""# Diagnosis: without each rule, without, with half and with twice each number
 
 {len(base)} flights, `{command}`, {datetime.date.today().isoformat()}. Class and number of a campaign case are its seed;
-recorded flights have the seed 0. "Right" counts campaign and independent cases, as the campaign does; +n −n are cases
-that become right or wrong. An answer differs when verdict or names do, or the error on unseen data by more than 1 %.
-Time is that of all flights over that of the method as it is.
+recorded flights have the seed 0. +n −n: cases that become right or wrong; an answer differs in this order: names
+(− no longer, + newly listed), verdict, error on unseen data by more than 1 %, width of an interval by more than 5 %,
+what the rest follows. "Fits" are linearisations asked for, where they change by more than 3 %; – : nothing changes.
 
-| changed | right | | answers that differ | time | which (− no longer, + newly listed) |
-|---|---|---|---|---|---|
+| changed | without | × 0.5 | × 2 |
+|---|---|---|---|
 """
         + "\n".join(rows)
         + "\n"

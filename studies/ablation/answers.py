@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,10 +11,14 @@ from pathlib import Path
 
 from quadid.diagnose import diagnose
 from quadid.errors import QuadidError
-from studies.ablation.corpus import Flight, load
+from studies.ablation.corpus import Flight, Given, load
+from studies.ablation.memory import Memory
+from studies.ablation.variants import Variant
 
 SAME = 0.01
 """Relative change of the error on unseen data below which two answers with equal names count as equal."""
+WIDTH = 0.05
+"""The same for the width of an interval."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,9 @@ class Answer:
         verdict: of the diagnosis, or ``refused``.
         listed: all findings, in order; named: the confident ones.
         right: whether that is what was hidden; None where nobody knows.
-        nominal, extended: error on unseen data; seconds: of computing; numbers: found parameters.
+        nominal, extended: error on unseen data; fits: linearisations asked for.
+        intervals: of the numbers found, 95 %.
+        follows: what the rest follows most, and where.
     """
 
     flight: str
@@ -38,34 +43,47 @@ class Answer:
     right: bool | None
     nominal: float
     extended: float
-    seconds: float
-    numbers: dict[str, float]
+    fits: int
+    intervals: dict[str, tuple[float, float]]
+    follows: str = ""
 
-    def differs(self, other: Answer) -> bool:
-        """Whether verdict or names differ, or the error on unseen data by more than `SAME`."""
-        names = (self.verdict, set(self.listed), set(self.named)) != (
-            other.verdict, set(other.listed), set(other.named),
-        )  # fmt: skip
-        if math.isnan(self.extended) or math.isnan(other.extended):
-            return names
-        return names or abs(self.extended - other.extended) > SAME * max(self.extended, other.extended)
+    def difference(self, other: Answer) -> str:
+        """What an answer has that this one has not, in words; empty where nothing differs.
+
+        Names come before the verdict, that before the error on unseen data, and that before intervals and the rest.
+        """
+        gone, come = (sorted(set(a.listed) - set(b.listed)) for a, b in ((self, other), (other, self)))
+        if gone or come:
+            return ", ".join([*(f"−{n}" for n in gone), *(f"+{n}" for n in come)])
+        if (self.verdict, set(self.named)) != (other.verdict, set(other.named)):
+            return f"{self.verdict}, {len(self.named)} confident → {other.verdict}, {len(other.named)}"
+        if abs(self.extended - other.extended) > SAME * max(self.extended, other.extended):
+            return f"error {self.extended:.3g} → {other.extended:.3g}"
+        for name, (low, high) in self.intervals.items():
+            width, new = high - low, other.intervals[name][1] - other.intervals[name][0]
+            if abs(new - width) > WIDTH * max(width, new):
+                return f"interval of {name} {width:.2g} → {new:.2g}"
+        if self.follows != other.follows:
+            return f"rest follows “{self.follows}” → “{other.follows}”"
+        return ""
 
 
-def ask(flight: Flight, variant: str, cache: Path | None) -> Answer:
+def ask(flight: Flight, given: Given, variant: str, memory: Memory) -> Answer:
     """Diagnoses one flight."""
-    train, held, vehicle = load(flight, cache)
-    began = time.process_time()
+    train, held, vehicle = given
+    memory.asked = 0
     try:
         found, _ = diagnose(train, vehicle, held, seed=0 if flight.case is None else flight.case.seed)
     except QuadidError as error:
-        return Answer(flight.name, variant, f"refused: {error}", (), (), None, math.nan, math.nan, 0.0, {})
-    seconds = time.process_time() - began
+        return Answer(flight.name, variant, f"refused: {error}", (), (), None, math.nan, math.nan, memory.asked, {})
     named = tuple(f.effect for f in found.findings if f.confident)
     listed = tuple(f.effect for f in found.findings)
-    numbers = {f"{f.effect}.{p.name}": p.value for f in found.findings for p in f.parameters}
+    # Of one effect that is found twice, as weak rotors are, the second one counts.
+    intervals = {f"{f.effect}.{p.name}": p.ci95 for f in found.findings for p in f.parameters}
+    follows = next((f"{f.signal} at {f.site.name}" for f in found.remainder.followed), "")
     return Answer(
         flight.name, variant, found.verdict.value, listed, named, _right(flight, found.verdict.value, listed, named),
-        found.validation.nominal, found.validation.extended, seconds, numbers,
+        found.validation.nominal, found.validation.extended, memory.asked, intervals, follows,
     )  # fmt: skip
 
 
@@ -83,19 +101,20 @@ def _right(flight: Flight, verdict: str, listed: Sequence[str], named: Sequence[
 
 
 def run(
-    flights: Sequence[Flight], variant: str, cache: Path | None, records: Path, told: Callable[[Answer], None]
+    flight: Flight, chosen: Sequence[Variant], cache: Path | None, records: Path, told: Callable[[Answer], None]
 ) -> list[Answer]:
-    """Diagnoses all flights that `records` lacks under this variant, and keeps the answers there."""
-    have = {a.flight: a for a in read(records) if a.variant == variant}
-    out = []
-    for flight in flights:
-        answer = have.get(flight.name) or ask(flight, variant, cache)
-        if flight.name not in have:
-            with records.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(answer)) + "\n")
-            told(answer)
-        out.append(answer)
-    return out
+    """Diagnoses one flight under each variant that `records` lacks, and keeps the answers there."""
+    have = {a.variant: a for a in read(records) if a.flight == flight.name}
+    if any(v.name not in have for v in chosen):
+        given, memory = load(flight, cache), Memory()
+        with memory.in_use():
+            for variant in (v for v in chosen if v.name not in have):
+                with variant.in_force():
+                    answer = have[variant.name] = ask(flight, given, variant.name, memory)
+                with records.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(answer)) + "\n")
+                told(answer)
+    return [have[v.name] for v in chosen]
 
 
 def read(records: Path) -> list[Answer]:

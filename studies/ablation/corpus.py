@@ -17,6 +17,8 @@ from studies.campaign import Case, cases, flown
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
 CLASSES = {"single": 25, "later": 5, "null": 4, "pair": 5, "look_alike": 6, "clutter": 4, "outside": 12}
 """Cases of each class of the campaign, numbers from `START`."""
+Given = tuple[list[Window], list[Window], Vehicle]
+"""Windows to diagnose, windows to measure the gain on, and the vehicle."""
 START = 7000
 """No other study and no test draws from here."""
 
@@ -99,7 +101,7 @@ def _independent(folder: str) -> list[Flight]:
     ]  # fmt: skip
 
 
-def load(flight: Flight, cache: Path | None = None) -> tuple[list[Window], list[Window], Vehicle]:
+def load(flight: Flight, cache: Path | None = None) -> Given:
     """Windows to diagnose, windows to measure the gain on, and the vehicle as guessed.
 
     Args:

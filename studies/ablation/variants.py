@@ -1,17 +1,25 @@
-"""What an ablation changes: every number of `quadid.diagnose` halved and doubled, and every rule left out."""
+"""What an ablation changes: every number of `quadid.diagnose` left out, halved and doubled, every rule left out."""
 
 from __future__ import annotations
 
 import importlib
+import math
 import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
 import quadid.diagnose
+from quadid.diagnose.attribution import validate
+from quadid.diagnose.cross_validation import paired_gain
+from quadid.diagnose.hypotheses import candidates
+from quadid.diagnose.log_evidence import RELEVANT
 from quadid.diagnose.model import Model, fit_model
+from quadid.diagnose.pipeline import SHARE_TO_NAME
+from quadid.diagnose.segment_schedule import LINEAR_MISFIT
+from quadid.identify.noise_estimation import flexible_fit
 from quadid.identify.shooting import Shooting
 from studies.ablation.house import measured
 
@@ -24,29 +32,32 @@ class Variant:
     """One change of the method.
 
     Attributes:
-        name: for the page.
-        values: what replaces what, by name of a module's attribute.
+        name: for the page; subject: the rule or number that it changes.
+        values: what replaces what, by name of an attribute of a module, or of a class there (`Class.name`).
     """
 
     name: str
+    subject: str
     values: dict[str, Any]
 
     @contextmanager
     def in_force(self) -> Iterator[None]:
         """Within it every module of the diagnosis that knows one of the names has the other value."""
-        changed: list[tuple[ModuleType, str, Any]] = []
+        changed: list[tuple[Any, str, Any]] = []
         try:
             for module in modules():
-                for name, value in self.values.items():
-                    if hasattr(module, name):
-                        changed.append((module, name, getattr(module, name)))
-                        setattr(module, name, value)
+                for path, value in self.values.items():
+                    owner, _, name = path.rpartition(".")
+                    place = getattr(module, owner, None) if owner else module
+                    if place is not None and hasattr(place, name) and getattr(place, name) is not value:
+                        changed.append((place, name, getattr(place, name)))
+                        setattr(place, name, value)
             if self.values and not changed:
                 raise LookupError(f"no module of quadid.diagnose has {', '.join(self.values)}")
             yield
         finally:
-            for module, name, value in reversed(changed):
-                setattr(module, name, value)
+            for place, name, value in reversed(changed):
+                setattr(place, name, value)
 
 
 def modules() -> list[ModuleType]:
@@ -61,38 +72,40 @@ def numbers() -> dict[str, Any]:
 
 
 def variants() -> list[Variant]:
-    """The method as it is (`base`), without each rule, and with half and twice each number."""
-    out = [Variant("base", {}), *(Variant(f"without {name}", values) for name, values in RULES.items())]
+    """The method as it is (`base`), without each rule, and without, with half and with twice each number."""
+    out = [Variant("base", "base", {}), *(Variant(f"without {name}", name, values) for name, values in RULES.items())]
     for name, value in numbers().items():
-        for factor in (0.5, 2.0):
-            other = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-            other = max(round(other), 1) if name in WHOLE else other
-            out.append(Variant(f"{name} {value} -> {other}", {name: other}))
+        changed = {f"× {factor:g}": _times(name, value, factor) for factor in (0.5, 2.0)}
+        changed |= {"out": OUT[name]} if name in OUT else {}
+        out += [Variant(f"{name} {how}", name, {name: other}) for how, other in changed.items()]
     return out
 
 
-def _nothing(*_: object, **__: object) -> dict[str, str]:
-    return {}
+def _times(name: str, value: Any, factor: float) -> Any:
+    if isinstance(value, tuple):
+        return tuple(factor * v for v in value)
+    return max(round(factor * value), 1) if name in WHOLE else factor * value
+
+
+def _given(value: Any) -> Callable[..., Any]:
+    """A function that gives `value` whatever it is asked."""
+    return lambda *_, **__: value
 
 
 def _none(*_: object, **__: object) -> Iterator[Any]:
     return iter(())
 
 
-def _one(*_: object) -> float:
-    return 1.0
-
-
 def _unpruned(shooting: object, model: Any) -> Any:
     return model
 
 
-def _always(*_: object) -> bool:
-    return True
-
-
 def _same_noise(windows: object, short: Any, model: object) -> Any:
     return short.noise
+
+
+def _own_noise(windows: object, shooting: Shooting, *_: object) -> tuple[Any, None]:
+    return shooting.noise, None
 
 
 def _own_states(shooting: object, model: Any) -> Any:
@@ -103,20 +116,68 @@ def _nominal(shooting: Shooting, *_: object) -> Model:
     return fit_model(shooting, shooting.layout.initial(shooting.vehicle), ())
 
 
-def _no_trial(*_: object) -> None:
-    return None
+def _gains(small: Model, large: Model) -> bool:
+    return paired_gain(small.held_out, large.held_out).total > RELEVANT * small.rows
 
 
-RULES: dict[str, dict[str, Callable[..., Any]]] = {
+def _regains(score: Any, cause: Any, regains: bool) -> bool:
+    return regains and not score.candidate.split and score.candidate.effect != cause.effect
+
+
+def _unpaired(*given: Any) -> Any:
+    return [c for c in candidates(*given) if not c.split]
+
+
+def _unrefined(*given: Any) -> Any:
+    return [c for c in candidates(*given) if not c.refines]
+
+
+def _as_scanned(shooting: object, model: Any, candidate: object) -> Any:
+    return model
+
+
+def _uncontradicted(*given: Any) -> Any:
+    figures, worth = validate(*given)
+    return replace(figures, contradicted=False), worth
+
+
+def _first_guess(*given: Any) -> Any:
+    return flexible_fit(given[0], given[1], given[2][:1], given[3], given[1].noise)
+
+
+RULES: dict[str, dict[str, Any]] = {
     "swaps": {"_swaps": _none},
-    "calibration (Godambe)": {"calibration": _one},
-    "veto on held-out blocks": {"relevant": _always},
-    "impossible numbers": {"impossible_causes": _nothing},
-    "constancy of a bias": {"inconstant_causes": _nothing},
+    "swaps within a family": {"_rivals": _regains},
+    "swap of an impossible cause for a possible one": {"_possible": _given(None)},
+    "impossible numbers": {"impossible_causes": _given({})},
+    "constancy of a bias": {"inconstant_causes": _given({})},
+    "calibration (Godambe)": {"calibration": _given(1.0)},
+    "use on held-out blocks": {"relevant": _given(True)},
+    "use without the best block": {"relevant": _gains},
     "a last pruning": {"pruned": _unpruned},
-    "a possible cause for an impossible one": {"_possible": _no_trial},
     "noise around the causes": {"_noise_around": _same_noise},
+    "memory of the noise": {"with_memory": _own_noise},
     "a start from everything": {"from_everything": _nominal},
+    "two starts of the flexible fit when far": {"flexible_fit": _first_guess},
     "initial states settled first": {"settled_states": _own_states},
+    "what the fit left undone, in scores": {"Everything._unspent": _given(0.0)},
+    "causes that show only in pairs": {"candidates": _unpaired},
+    "optional numbers of a cause": {"candidates": _unrefined},
+    "onset refined": {"_refine_time": _as_scanned},
+    "a look at the longest segments": {"Stage.longest": _given(None)},
+    "longest segments where velocity is found": {"is_long": _given(False)},
+    "clutter in what a cause is worth": {"untidy_names": _given([])},
+    "ordinary sizes last": {"ordinary": _given(False)},
+    "contradiction by validation flights": {"validate": _uncontradicted},
+    "what the rest follows": {"follows": _given(((), ()))},
 }
 """Rules that are functions, and what stands in their place."""
+OUT: dict[str, Any] = {
+    "UNTIDY": 0.0, "FEWEST_BLOCKS": 1, "STEP_SIGMA": 0.0, "TIME_SIGMA": 0.0, "FALSE_ALARM": 1.0, "RELEVANT": 0.0,
+    "FEWEST_SEGMENTS": 1, "NOISE_FELL": 0.0, "SHARE_TO_NAME": 0.0, "SHARE_ALONE": SHARE_TO_NAME,
+    "LEAST_STRUCTURE": 0.0, "LEAST_OF_EXPLAINED": 0.0, "LIKELY_SENSOR": math.inf, "WRONG_SIGN": 0.0, "ERRORS": 0.0,
+    "LEAST_GAIN": 0.0, "LAGS": (), "WAVES": 0, "SMOOTH": 1, "ALARM": math.inf, "CHANGE_ALARM": 0.0,
+    "CHANGE_SHARE": 0.0, "LINEAR_MISFIT": math.inf, "CLEAN_MISFIT": LINEAR_MISFIT, "NEAR": 1.0, "ALIKE": 1.0,
+    "MOST_REFITS": 1000, "MOST_ROUNDS": 1000,
+}  # fmt: skip
+"""What stands for a number that is left out; numbers that have no such value are halved and doubled only."""
