@@ -15,7 +15,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from studies.ablation.answers import Answer, run
-from studies.ablation.corpus import CLASSES, START, flights
+from studies.ablation.corpus import FLIGHTS, flights
 from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
@@ -62,21 +62,14 @@ def main() -> None:
     parser.add_argument("--house", action="store_true", help="print files, lines, named numbers and layers, and end")
     parser.add_argument("--records", type=Path, default=Path("ablation.jsonl"), help="a stopped run goes on from them")
     parser.add_argument("--cache", type=Path, help="folder that keeps flights once flown")
-    parser.add_argument("--kinds", default="campaign,cases,recorded")
-    parser.add_argument("--classes", default="", help="name:count of campaign classes, by commas")
-    parser.add_argument("--flights", default="", help="flights whose name is one of these, by commas")
+    parser.add_argument("--flights", default=",".join(FLIGHTS), help="by commas: single 7000,cases case_012,iris …")
     parser.add_argument("--only", default="", help="variants whose name holds one of these words, by commas")
     parser.add_argument("--out", type=Path, help="folder of the page")
-    parser.add_argument("--start", type=int, default=START, help="number of the first case of each class")
     options = parser.parse_args()
     if options.house:
         print(measured())
         return
-    given = [part.split(":") for part in options.classes.split(",") if part]
-    classes = {name: int(count) for name, count in given} or CLASSES
-    todo = flights(options.kinds.split(","), classes, options.start)
-    named = [n for n in options.flights.split(",") if n]
-    todo = [f for f in todo if not named or f.name in named]
+    todo = flights(options.flights.split(","))
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
     by_flight = [run(flight, chosen, options.cache, options.records, told) for flight in todo]
@@ -89,9 +82,8 @@ def main() -> None:
 
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
     """The result page."""
-    command = f"python -m studies.ablation --records FILE --kinds {options.kinds}"
-    for name in ("classes", "flights", "only"):
-        command += f" --{name} '{getattr(options, name)}'" if getattr(options, name) else ""
+    command = f"python -m studies.ablation --flights '{options.flights}'"
+    command += f" --only '{options.only}'" if options.only else ""
     return (
         f"""# Diagnosis: without each rule, without, with half and with twice each number
 

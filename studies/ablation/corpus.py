@@ -15,12 +15,14 @@ from quadid.workflow.loading import GRID, load_logs, load_vehicle
 from studies.campaign import Case, cases, flown
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
-CLASSES = {"single": 25, "later": 5, "null": 4, "pair": 5, "look_alike": 6, "clutter": 4, "outside": 12}
-"""Cases of each class of the campaign, numbers from `START`."""
+FLIGHTS = (
+    "single 7000", "single 7006", "single 7008", "single 7009", "null 7000", "pair 7001", "look_alike 7000",
+    "look_alike 7003", "outside 7000", "outside 7003", "cases case_012", "cases_hub case_002", "cases_hub case_006",
+    "clutter 7000", "iris",
+)  # fmt: skip
+"""What a run takes where nothing else is asked for: a few of each kind that compute fast."""
 Given = tuple[list[Window], list[Window], Vehicle]
 """Windows to diagnose, windows to measure the gain on, and the vehicle."""
-START = 7000
-"""No other study and no test draws from here."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Flight:
     """One diagnosis to make.
 
     Attributes:
-        name: of the case or the vehicle; kind: ``campaign``, ``cases`` or ``recorded``.
+        name: of the case or the vehicle.
         case: of the campaign.
         train, held: logs below the data folder, each with `@from:to` where cut; vehicle: its file there.
         hidden: what a case hides; None where nobody knows.
@@ -36,7 +38,6 @@ class Flight:
     """
 
     name: str
-    kind: str
     case: Case | None = None
     train: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
@@ -64,28 +65,22 @@ def _recorded() -> list[Flight]:
     for name, vehicle, train, held in _RECORDED:
         folder = vehicle.split("/")[0]
         logs = [tuple(f"{folder}/{log}" for log in names.split()) for names in (train, held)]
-        out.append(Flight(name, "recorded", None, logs[0], logs[1], vehicle))
+        out.append(Flight(name, None, logs[0], logs[1], vehicle))
     return out
 
 
-def flights(kinds: Sequence[str], classes: dict[str, int] | None = None, start: int = START) -> list[Flight]:
-    """All flights of the kinds asked for.
+def flights(names: Sequence[str] = FLIGHTS) -> list[Flight]:
+    """Flights by name: ``single 7000`` (class and number of the campaign), ``cases case_012``, ``iris``."""
+    known = {f.name: f for f in (*_independent("cases"), *_independent("cases_hub"), *_recorded())}
+    return [known[name] if name in known else _hidden(name) for name in names]
 
-    Args:
-        kinds: of ``campaign``, ``cases``, ``recorded``.
-        classes: cases of each class of the campaign, `CLASSES` by default.
-        start: number of the first case of each class.
-    """
-    out: list[Flight] = []
-    if "campaign" in kinds:
-        chosen = [c for group, n in (classes or CLASSES).items() for c in cases(group, n, start)]
-        out += [
-            Flight(f"{c.group} {c.number}", "campaign", c, hidden=c.expected,
-                   clutter=tuple(c.hidden) if c.group == "clutter" else ()) for c in chosen
-        ]  # fmt: skip
-    if "cases" in kinds:
-        out += [f for folder in ("cases", "cases_hub") for f in _independent(folder)]
-    return out + (_recorded() if "recorded" in kinds else [])
+
+def _hidden(name: str) -> Flight:
+    """A case of the campaign."""
+    group, number = name.split()
+    (case,) = cases(group, 1, int(number))
+    clutter = tuple(case.hidden) if group == "clutter" else ()
+    return Flight(name, case, hidden=case.expected, clutter=clutter)
 
 
 def _independent(folder: str) -> list[Flight]:
@@ -93,7 +88,7 @@ def _independent(folder: str) -> list[Flight]:
     answers = json.loads((DATA / folder / "answers.json").read_text(encoding="utf-8"))
     return [
         Flight(
-            f"{folder} {a['case']}", "cases", None, (f"{folder}/{a['case']}/train.csv",),
+            f"{folder} {a['case']}", None, (f"{folder}/{a['case']}/train.csv",),
             (f"{folder}/{a['case']}/validate.csv",), f"{folder}/{a['case']}/vehicle.yaml", tuple(a["effects"]),
             tuple(a["truth"]) if a["kind"] == "clutter" else (),
         )

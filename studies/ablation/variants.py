@@ -23,9 +23,6 @@ from quadid.identify.noise_estimation import flexible_fit
 from quadid.identify.shooting import Shooting
 from studies.ablation.house import measured
 
-WHOLE = ("FEWEST_BLOCKS", "FEWEST_SEGMENTS", "FAR_ITERATIONS", "MOST_ROUNDS", "SMOOTH", "WAVES")
-"""Numbers that count something and stay whole."""
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -75,16 +72,17 @@ def variants() -> list[Variant]:
     """The method as it is (`base`), without each rule, and without, with half and with twice each number."""
     out = [Variant("base", "base", {}), *(Variant(f"without {name}", name, values) for name, values in RULES.items())]
     for name, value in numbers().items():
-        changed = {f"× {factor:g}": _times(name, value, factor) for factor in (0.5, 2.0)}
+        changed = {f"× {factor:g}": _times(value, factor) for factor in (0.5, 2.0)}
         changed |= {"out": OUT[name]} if name in OUT else {}
         out += [Variant(f"{name} {how}", name, {name: other}) for how, other in changed.items()]
     return out
 
 
-def _times(name: str, value: Any, factor: float) -> Any:
+def _times(value: Any, factor: float) -> Any:
+    """A number or tuple of numbers times `factor`; what counts something stays whole."""
     if isinstance(value, tuple):
         return tuple(factor * v for v in value)
-    return max(round(factor * value), 1) if name in WHOLE else factor * value
+    return max(round(factor * value), 1) if isinstance(value, int) else factor * value
 
 
 def _given(value: Any) -> Callable[..., Any]:
