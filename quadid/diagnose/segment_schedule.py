@@ -61,7 +61,7 @@ class Stage:
         longest = 0 if self.model.finds_velocity else self.usual
         for rung in range(longest, self.rung):
             model = self.refitted(rung)
-            if follows(self.schedule[rung], model):
+            if tracks(self.schedule[rung], model):
                 return replace(self, rung=rung, model=model)
         return self if self.rung >= longest else replace(self, rung=longest, model=self.refitted(longest))
 
@@ -70,7 +70,7 @@ class Stage:
         if self.rung == 0 or not is_long(self.schedule[0]):
             return None
         model = self.refitted(0)
-        return replace(self, rung=0, model=model) if follows(self.schedule[0], model) else None
+        return replace(self, rung=0, model=model) if tracks(self.schedule[0], model) else None
 
     @property
     def usual(self) -> int:
@@ -78,6 +78,6 @@ class Stage:
         return next(rung for rung, shooting in enumerate(self.schedule) if not is_long(shooting))
 
 
-def follows(shooting: Shooting, model: Model) -> bool:
+def tracks(shooting: Shooting, model: Model) -> bool:
     """Whether segments are not too long for `model` to decide on them."""
     return model.reduced_chi_square < (CLEAN_MISFIT if is_long(shooting) else LINEAR_MISFIT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -16,9 +17,11 @@ from studies.ablation.variants import modules
 
 FITS = (
     "polish", "settle_states", "flexible_fit", "noise_floor", "residual_noise", "with_memory", "mode_power",
-    "learn_prediction",
+    "learn_prediction", "follows",
 )  # fmt: skip
-"""Functions of `quadid.identify` that the diagnosis calls; no variant changes what they do."""
+"""Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
+NUMBERS = ("quadid.diagnose.residual_regressors", "quadid.diagnose.cross_validation")
+"""… whose answer depends on numbers of these modules, and on nothing else that a variant changes."""
 
 
 class Memory:
@@ -52,7 +55,7 @@ class Memory:
         def answer(*args: Any, **kwargs: Any) -> Any:
             if self._inside:  # of a fit that is remembered as a whole
                 return function(*args, **kwargs)
-            key = self._key((name, args, kwargs))
+            key = self._key((name, args, kwargs, _numbers() if name == "follows" else ()))
             if key not in self._known:
                 self._inside = True
                 try:
@@ -75,6 +78,11 @@ class Memory:
         if id(window) not in self._windows:
             self._windows[id(window)] = (window, hashlib.sha256(pickle.dumps(window)).digest())
         return self._windows[id(window)][1]
+
+
+def _numbers() -> list[tuple[str, Any]]:
+    """Numbers of the modules that the last function of `FITS` rests on, as they are now."""
+    return [(n, v) for m in NUMBERS for n, v in vars(sys.modules[m]).items() if n.isupper()]
 
 
 class _Content(pickle.Pickler):
