@@ -156,7 +156,7 @@ def validate(
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
     if not model.causes:
         return {}
-    model = replace(model, states=settled_states(decisive, model))
+    model = replace(model, lin=replace(model.lin, states=settled_states(decisive, model)))
     return {
         _ALL if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
     }

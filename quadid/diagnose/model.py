@@ -16,22 +16,18 @@ from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance, prior_terms
 from quadid.identify.score import settle_states
-from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.shooting import Free, Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 
 
 @dataclass(frozen=True)
-class Model:
-    """A model fitted to the training data.
+class Model(Polished):
+    """A model fitted to the training data: an optimum, and what is free there.
 
     Attributes:
         causes: candidates it contains.
         free: its free parameters; prior: weak prior on them.
-        theta: full vector at the optimum.
-        lin: linearisation there.
-        cost: deviance with prior.
-        states: initial states that belong to it.
         held_out: deviance of each block under parameters fitted to the others.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
     """
@@ -39,10 +35,6 @@ class Model:
     causes: tuple[Candidate, ...]
     free: Free
     prior: Prior
-    theta: FloatArray
-    lin: Linearised
-    cost: float
-    states: InitialStates
     held_out: FloatArray
     tried: dict[str, float] = field(default_factory=dict)
 
@@ -120,7 +112,9 @@ def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Can
     """Wraps the result of a polish with the default prior, with its held-out deviance."""
     prior = default_prior(shooting, free)
     held_out = held_out_deviance(result.lin, prior.precision, block_labels(result.lin))
-    return Model(causes, free, prior, result.theta, result.lin, result.cost, result.states, held_out)
+    return Model(
+        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, held_out
+    )
 
 
 def settled_states(shooting: Shooting, model: Model) -> InitialStates:

@@ -22,7 +22,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
 from quadid.identify.covariance import parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
-from quadid.identify.gauss_newton import Polished, polish
+from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_memory import with_memory
@@ -109,8 +109,9 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
     ]
-    parameters, moved = possible_moments(_nominal_parameters(decisive, begun.short, search.model, verdict))
-    warnings += [] if moved is None else [moved]
+    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict)
+    parameters, moved = possible_moments(parameters)
+    warnings += [*reasons, *([] if moved is None else [moved])]
     text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
     prediction = None
     if search.model.reduced_chi_square > POOR:
@@ -137,22 +138,28 @@ def _prediction(
     return out
 
 
-def _nominal_parameters(decisive: Shooting, short: Shooting, model: Model, verdict: Verdict) -> tuple[Parameter, ...]:
-    """The nominal six beside the findings, as an identification gives them.
+def _nominal_parameters(
+    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
+    """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
     Where the model misses something, estimates must agree as those of an identification.  Where the cause of the error
     is unknown, so is what it does to them: none is identified.
     """
-    uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
+    uncertain, initial, reasons = model.uncertainty, decisive.layout.initial(decisive.vehicle), ()
     if model.reduced_chi_square > MISFIT:
-        brief = polish(short, model.theta, model.free, model.prior, iterations=8)
-        found = Polished(model.theta, model.lin, model.cost, 0, brief.outcome)
-        uncertain = reliability(decisive, found, model.free, model.prior, brief).widened(uncertain)
+        trust = reliability(
+            decisive, model, model.free, model.prior, polish(short, model.theta, model.free, model.prior, iterations=8)
+        )
+        uncertain, reasons = trust.widened(uncertain), trust.reasons(model.free, uncertain)
     everything = parameter_set(model.free, model.theta, initial, uncertain)
-    nominal = (p for p in everything if p.name in NOMINAL_NAMES)
-    if verdict is not Verdict.UNKNOWN:
-        return tuple(nominal)
-    return tuple(replace(p, status=Status.UNRELIABLE) if p.status is Status.IDENTIFIED else p for p in nominal)
+    nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    if verdict is Verdict.UNKNOWN:
+        doubted = [p for p in nominal if p.status is Status.IDENTIFIED]
+        nominal = tuple(replace(p, status=Status.UNRELIABLE) if p in doubted else p for p in nominal)
+        told = f"{', '.join(p.name for p in doubted)}: not to be used while the cause of the error is unknown"
+        reasons = (*reasons, told) if doubted else reasons
+    return nominal, reasons
 
 
 @dataclass(frozen=True)

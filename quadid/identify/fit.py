@@ -220,7 +220,7 @@ def _finish(
     doubts: tuple[str, ...] = ()
     if polished is not None and short is not None and np.isfinite(polished.cost):
         trust = reliability(shooting, polished, free, prior, short)
-        unc, doubts = trust.widened(unc), trust.reasons(free)
+        unc, doubts = trust.widened(unc), trust.reasons(free, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(

@@ -68,20 +68,25 @@ class Reliability:
     def widened(self, unc: Uncertainty) -> Uncertainty:
         """Intervals that hold what the estimates differ by."""
         grow = np.sqrt(1.0 + (self.widening / np.maximum(unc.sigma, 1e-300)) ** 2)
-        spread = np.full(len(grow), np.inf) if self.missed else np.hypot(self.spread, self.misfit * unc.sigma)
-        return replace(unc, covariance=unc.covariance * np.outer(grow, grow), grown=grow, spread=spread)
+        return replace(unc, covariance=unc.covariance * np.outer(grow, grow), grown=grow, spread=self._counted(unc))
 
-    def reasons(self, free: Free) -> tuple[str, ...]:
-        """Sentences on the parameters whose estimates differ too much."""
+    def _counted(self, unc: Uncertainty) -> FloatArray:
+        """What has to stay below `SPREAD_LIMIT`, shape (P,)."""
+        return np.full(len(self.spread), np.inf) if self.missed else np.hypot(self.spread, self.misfit * unc.sigma)
+
+    def reasons(self, free: Free, unc: Uncertainty) -> tuple[str, ...]:
+        """Sentences on the nominal parameters whose estimates differ too much, with `unc` as it is without that."""
         if self.missed:
             return ("the model misses this flight by so much that its numbers are not to be used",)
-        far = self.spread > SPREAD_LIMIT
         why: dict[str, list[str]] = {}
-        for j in np.flatnonzero(far):
+        for j in np.flatnonzero((self._counted(unc) > SPREAD_LIMIT) & free.is_log):
             k = int(np.argmax(np.abs(self.steps[:, j]))) if len(self.steps) else -1
             close = k < 0 or abs(self.steps[k, j]) < self.spread[j]
-            why.setdefault("in another part of the flight" if close else self.names[k], []).append(free.names[j])
-        return tuple(f"{', '.join(n)}: more than {SPREAD_LIMIT:.0%} different {how}" for how, n in why.items())
+            how = f"different {'in another part of the flight' if close else self.names[k]}"
+            if self.spread[j] <= SPREAD_LIMIT:
+                how = "uncertain, and the model misses something"
+            why.setdefault(how, []).append(free.names[j])
+        return tuple(f"{', '.join(n)}: more than {SPREAD_LIMIT:.0%} {how}" for how, n in why.items())
 
 
 def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, short: Polished) -> Reliability:

@@ -46,3 +46,6 @@ def test_inertias_beside_causes_that_leave_much_are_identified_only_where_estima
         if p.name in IRIS_J:
             inside = p.ci95[0] < IRIS_J[p.name] < p.ci95[1]
             assert inside or p.status is not Status.IDENTIFIED, (p.name, p.value, p.ci95, p.status)
+    doubted = [p.name for p in found.parameters if p.status is Status.UNRELIABLE]
+    assert doubted
+    assert all(any(name in warning for warning in found.warnings) for name in doubted), found.warnings
