@@ -146,7 +146,8 @@ def _nominal_parameters(
     Where the model misses something, estimates must agree as those of an identification.  Where the cause of the error
     is unknown, so is what it does to them: none is identified.
     """
-    uncertain, initial, reasons = model.uncertainty, decisive.layout.initial(decisive.vehicle), ()
+    uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
+    reasons: tuple[str, ...] = ()
     if model.reduced_chi_square > MISFIT:
         trust = reliability(
             decisive, model, model.free, model.prior, polish(short, model.theta, model.free, model.prior, iterations=8)
