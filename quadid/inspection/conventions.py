@@ -55,12 +55,21 @@ class AxisMap(NamedTuple):
 
 
 def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
-    """Finds the signed permutation and scale that explain `target` (n, k) by `source` (n, k) best, k = 2 or 3."""
+    """Finds the signed permutation and scale that explain `target` (n, k) by `source` (n, k) best, k = 2 or 3.
+
+    Axes stay where they are unless one follows another axis, or its own reversed, clearly: what hardly moves is noise,
+    which any axis explains as well as any other.
+    """
     x, y = source - source.mean(axis=0), target - target.mean(axis=0)
     cross, power, total = y.T @ x, np.sum(x**2, axis=0), float(np.sum(y**2))
-    best = AxisMap(tuple(range(x.shape[1])), (1,) * x.shape[1], np.nan, -np.inf)
+    straight = tuple(range(x.shape[1]))
+    clear = cross**2 > _CLEAR * np.outer(np.sum(y**2, axis=0), power)
+    best = AxisMap(straight, (1,) * x.shape[1], np.nan, 0.0)
     for axes in permutations(range(x.shape[1])):
         for signs in product((1, -1), repeat=x.shape[1]):
+            moved = [(i, a) for i, a, s in zip(straight, axes, signs, strict=True) if a != i or s < 0]
+            if moved and not any(clear[place] for place in moved):
+                continue
             gain = sum(s * cross[i, a] for i, (a, s) in enumerate(zip(axes, signs, strict=True)))
             norm = float(sum(power[a] for a in axes))
             if gain > 0.0 and norm > 0.0 and total > 0.0:
@@ -87,12 +96,18 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     values = accel.values[within(accel.t, spans)] if spans else accel.values
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
+    steady = float(np.linalg.norm(np.median(values, axis=0)))
     numbers = {"length": length, "z": z}
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
     for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
-        if 0.7 < length * factor / GRAVITY < 1.6:
+        if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
             fix = f"multiply acceleration by {factor:.6g}"
             return Check("gravity", Verdict.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
+    if spans and steady < 0.3 * GRAVITY:
+        return Check(
+            "gravity", Verdict.ERROR, f"{message}: gravity is missing", "log specific force, not linear acceleration",
+            numbers,
+        )  # fmt: skip
     if not 0.5 < length / GRAVITY < 2.0:
         return Check(
             "gravity", Verdict.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration", numbers
@@ -108,7 +123,21 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
         return Check(
             "gravity", Verdict.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
         )
+    upward = _upward_force(accel, recording.channels.get("attitude"))
+    if upward < -0.5 * length:
+        return Check(
+            "gravity", Verdict.ERROR, f"{message}, but the attitude turns it to point down: its world has z up",
+            "give attitude, velocity and position in NED; ROS' world is east, north, up (ENU)", numbers,
+        )  # fmt: skip
     return Check("gravity", Verdict.OK, message, numbers=numbers)
+
+
+def _upward_force(accel: Channel, attitude: Channel | None) -> float:
+    """Median of what the accelerometer reads against gravity in the attitude's world [m/s^2]; NaN without attitude."""
+    if attitude is None or len(attitude.t) < 2:
+        return float("nan")
+    q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
+    return float(np.median(-rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)[:, 2]))
 
 
 def gyro_check(recording: Recording) -> Check:

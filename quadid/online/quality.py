@@ -7,17 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
+from quadid.inspection.findings import Verdict
 from quadid.model.thrust import ThrustModel
-from quadid.resample import median
 from quadid.saturation import at_limit
-from quadid.turning import turn
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
+from quadid.window import Channel, Recording, Window
 
 STUCK_SECONDS = 1.0
 """A sensor that repeats itself to the bit for longer than this [s] is stuck."""
-DEGREES = 180.0 / np.pi
 THRUST_KNOWN = (0.4, 4.0)
 """Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
 THRUST_GUESSED = (0.2, 5.0)
@@ -82,35 +81,23 @@ def _longest_repeat(rows: FloatArray) -> int:
 
 def _units(window: Window) -> str:
     """Names a wrong unit or frame that would otherwise be fitted into the parameters."""
-    if window.accel is not None and np.isfinite(window.accel).any():
-        mean = np.nanmean(window.accel, axis=0)
-        size = float(np.linalg.norm(mean))
-        if 0.7 < size < 1.3:
-            return f"accelerometer reads {size:.2f} on average: it looks like g, wanted m/s^2"
-        if mean[2] > 0.5 * GRAVITY and size > 0.7 * GRAVITY:
-            return (
-                "accelerometer is upside down: ROS topics want z up (FLU, +9.8 at rest), MAVLink and logs z down "
-                "(FRD, -9.8); on a ROS topic you may have published PX4 frames (FRD)"
-            )
-        if size < 0.3 * GRAVITY:
-            return f"accelerometer reads {size:.1f} m/s^2 on average: gravity is missing, wanted specific force"
-    ratio = _rate_ratio(window)
-    if ratio is not None and 0.5 * DEGREES < ratio < 2.0 * DEGREES:
-        return f"gyro is {ratio:.0f} times what the attitude turns: it looks like deg/s, wanted rad/s"
+    recording, spans = _as_recording(window), ((window.t0, window.t0 + window.dt * len(window)),)
+    for check in (gravity_check(recording, spans), gyro_check(recording), velocity_check(recording)):
+        if check.verdict is Verdict.ERROR:
+            return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
 
-def _rate_ratio(window: Window) -> float | None:
-    """Size of the gyro over that of the attitude's own turning rate; None where the attitude hardly turns."""
-    if window.attitude is None or window.gyro is None:
-        return None
-    q = window.attitude
-    rate = np.linalg.norm(turn(q[:-1], q[1:]), axis=1) / window.dt
-    size = np.linalg.norm(window.gyro[:-1], axis=1)
-    good = np.isfinite(rate) & np.isfinite(size)
-    if np.count_nonzero(good) < 50 or median(rate[good]) < 0.05:
-        return None
-    return float(np.sqrt(np.mean(size[good] ** 2)) / max(np.sqrt(np.mean(rate[good] ** 2)), 1e-9))
+def _as_recording(window: Window) -> Recording:
+    """What was measured, a channel each."""
+    t = window.t0 + window.dt * np.arange(len(window))
+    channels = {}
+    for name in ("gyro", "accel", "attitude", "velocity"):
+        values = getattr(window, name)
+        if values is not None:
+            good = np.isfinite(values).all(axis=1)
+            channels[name] = Channel(name, t[good], values[good])
+    return Recording(window.name, "stream", channels)
 
 
 def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:

@@ -103,12 +103,24 @@ def test_rotor_speeds_in_rpm_are_named() -> None:
 @pytest.mark.parametrize(
     ("name", "factor", "word"),
     [
-        ("accel", np.full(3, 1.0 / GRAVITY), "looks like g"),
-        ("accel", np.array([1.0, -1.0, -1.0]), "you may have published PX4 frames"),
+        ("accel", np.full(3, 1.0 / GRAVITY), "in g"),
+        ("accel", np.array([1.0, -1.0, -1.0]), "z points up (FLU, as ROS has it)"),
         ("accel", np.array([1.0, 1.0, 0.0]), "gravity is missing"),
         ("gyro", np.full(3, 180.0 / np.pi), "deg/s"),
+        ("gyro", np.array([1.0, -1.0, -1.0]), "gyro axes differ from the attitude's: x = x, y = -y, z = -z"),
+        ("attitude", np.array([1.0, 1.0, -1.0, -1.0]), "gyro axes differ from the attitude's: x = x, y = -y, z = -z"),
     ],
 )
 def test_wrong_units_and_frames_are_named(name: str, factor: np.ndarray, word: str) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     assert word in verdict(changed(window, name, getattr(window, name) * factor)).fault
+
+
+def test_an_attitude_in_a_world_with_z_up_is_named() -> None:
+    window = flight(30.0, 3).window.slice(0, 500)
+    assert window.attitude is not None
+    w, x, y, z = window.attitude.T
+    in_enu = np.column_stack([-x - y, w - z, w + z, x - y]) / np.sqrt(2.0)  # half a turn about north-east before it
+    fault = verdict(changed(window, "attitude", in_enu)).fault
+    assert "its world has z up" in fault
+    assert "PX4 has FRD and NED" in fault

@@ -14,7 +14,7 @@ from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
 from quadid.inspection import Check, Inspection, Verdict, inspect, proposed_cuts
 from quadid.inspection.airborne import Spans
-from quadid.inspection.conventions import fit_axes
+from quadid.inspection.conventions import fit_axes, gyro_check
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
@@ -70,6 +70,23 @@ def test_wrong_units_of_the_accelerometer(clean: Recording, factor: float, unit:
     assert unit in gravity.message
     assert gravity.fix
     happened(10, f"accelerometer times {factor:.4g}: '{gravity.message[-40:]}'; fix: {gravity.fix}")
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_axes_that_hardly_turn_are_not_called_swapped(axis: int) -> None:
+    """A flight about one axis alone: what the others read is noise, which any axis explains as well as any other."""
+    rng = np.random.default_rng(axis)
+    t = np.arange(0.0, 20.0, 0.02)
+    gyro = 0.02 * rng.standard_normal((len(t), 3))
+    gyro[:, axis] += 0.6 * np.cos(2.0 * t) + 0.7 * np.cos(7.0 * t)
+    half = 0.15 * np.sin(2.0 * t) + 0.05 * np.sin(7.0 * t)
+    attitude = np.zeros((len(t), 4))
+    attitude[:, 0], attitude[:, 1 + axis] = np.cos(half), np.sin(half)
+    attitude[:, 1:] += 0.002 * rng.standard_normal((len(t), 3))
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    channels = {"gyro": Channel("gyro", t, gyro), "attitude": Channel("attitude", t, attitude)}
+    found = gyro_check(Recording("roll", "csv", channels))
+    assert found.verdict is Verdict.OK, found.message
 
 
 def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording, happened: Happened) -> None:
