@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from quadid.inspection.airborne import Spans, flying_spans, proposed_cuts
-from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
+from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
@@ -47,7 +47,12 @@ def inspect(
     turned = recording if vehicle is None else in_body_axes(recording, vehicle)
     spans = flying_spans(turned, vehicle)
     checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
-    checks += [gravity_check(turned, spans), gyro_check(turned), velocity_check(turned), *position_checks(recording)]
+    checks += [
+        gravity_check(turned, spans),
+        attitude_check(turned),
+        velocity_check(turned),
+        *position_checks(recording),
+    ]
     if vehicle is not None:
         checks += _against_vehicle(turned, vehicle, spans, lagged_motion(recording, vehicle, spans))
     return Inspection(

@@ -123,21 +123,23 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
         return Check(
             "gravity", Verdict.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
         )
-    upward = _upward_force(accel, recording.channels.get("attitude"))
-    if upward < -0.5 * length:
-        return Check(
-            "gravity", Verdict.ERROR, f"{message}, but the attitude turns it to point down: its world has z up",
-            "give attitude, velocity and position in NED; ROS' world is east, north, up (ENU)", numbers,
-        )  # fmt: skip
     return Check("gravity", Verdict.OK, message, numbers=numbers)
 
 
-def _upward_force(accel: Channel, attitude: Channel | None) -> float:
-    """Median of what the accelerometer reads against gravity in the attitude's world [m/s^2]; NaN without attitude."""
-    if attitude is None or len(attitude.t) < 2:
-        return float("nan")
+def attitude_check(recording: Recording) -> Check:
+    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
+    rates = gyro_check(recording)
+    accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
+    if rates.verdict is Verdict.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
+        return rates
     q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
-    return float(np.median(-rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)[:, 2]))
+    down = float(np.median(rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)[:, 2]))
+    if down < 0.5 * GRAVITY:
+        return rates
+    return Check(
+        rates.name, Verdict.ERROR, f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): "
+        "its world has z up", "give attitude, velocity and position in NED; ROS' world is east, north, up (ENU)",
+    )  # fmt: skip
 
 
 def gyro_check(recording: Recording) -> Check:

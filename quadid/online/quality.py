@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.inspection.conventions import gravity_check, gyro_check, velocity_check
+from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import Verdict
 from quadid.model.thrust import ThrustModel
 from quadid.saturation import at_limit
@@ -82,7 +82,7 @@ def _longest_repeat(rows: FloatArray) -> int:
 def _units(window: Window) -> str:
     """Names a wrong unit or frame that would otherwise be fitted into the parameters."""
     recording, spans = _as_recording(window), ((window.t0, window.t0 + window.dt * len(window)),)
-    for check in (gravity_check(recording, spans), gyro_check(recording), velocity_check(recording)):
+    for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
         if check.verdict is Verdict.ERROR:
             return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""

@@ -120,7 +120,7 @@ def test_an_attitude_in_a_world_with_z_up_is_named() -> None:
     window = flight(30.0, 3).window.slice(0, 500)
     assert window.attitude is not None
     w, x, y, z = window.attitude.T
-    in_enu = np.column_stack([-x - y, w - z, w + z, x - y]) / np.sqrt(2.0)  # half a turn about north-east before it
+    in_enu = np.column_stack([-x - y, w + z, w - z, y - x]) / np.sqrt(2.0)  # half a turn about north-east before it
     fault = verdict(changed(window, "attitude", in_enu)).fault
     assert "its world has z up" in fault
     assert "PX4 has FRD and NED" in fault
