@@ -170,7 +170,7 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     measured, derived = _rates(gyro, t[::stride], q[::stride])
     longer = _rates(gyro, t[:: 2 * stride], q[:: 2 * stride])[1]
     if len(longer) < 20:
-        return (measured, derived) if np.max(np.std(derived, axis=0), initial=0.0) >= _MOTION else (longer[:0],) * 2
+        return longer[:0], longer[:0]
     total = np.var(derived, axis=0)
     motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
     if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
