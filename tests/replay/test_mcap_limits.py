@@ -48,7 +48,7 @@ def test_chunks_that_lie_about_their_size_inflate_no_further(
 ) -> None:
     body = zstandard.compress(bytes(50_000_000)) if compression == "zstd" else lz4.frame.compress(bytes(50_000_000))
     chunked(tmp_path / "liar", body, 1000, compression)
-    with pytest.raises(LogError, match="no topic|no usable"):
+    with pytest.raises(LogError, match="nothing in it can be read"):
         open_log(tmp_path / "liar")
     happened(5, f"{compression} chunk of 50 MB that declares 1000 bytes: inflated to 1000 bytes, then refused")
 
