@@ -121,6 +121,7 @@ def _walk(places: IntArray, stops: IntArray, marks: IntArray, size: int) -> tupl
     linked = np.append(places, -1)[following] == stops
     certain = np.flatnonzero((stops <= size) & (linked | (stops >= size)))
     """Frames that another follows: what is looked for after damage."""
+    certain_places = places[certain]
     turns = np.flatnonzero(~linked | (following != np.arange(1, count + 1)))
     run_ends = turns[np.searchsorted(turns, np.arange(count))]
     """The last place of a run that simply goes from each to the next."""
@@ -135,7 +136,7 @@ def _walk(places: IntArray, stops: IntArray, marks: IntArray, size: int) -> tupl
             return _members(runs, count)[:-1], skipped, True
         if offset + _STAMP >= size:
             return _members(runs, count), skipped, offset < size
-        found = int(np.searchsorted(places[certain], offset, side="right"))
+        found = int(np.searchsorted(certain_places, offset, side="right"))
         at = int(certain[found]) if found < len(certain) else -1
         resumed = int(places[at]) if at >= 0 else size
         if 1 + np.searchsorted(marks, resumed) - np.searchsorted(marks, offset, side="right") >= _MOST_FAILURES:

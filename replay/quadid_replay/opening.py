@@ -15,8 +15,6 @@ from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
 
 LARGE = 4 << 20
 """Files of this size [bytes] are read in a child process with limits."""
-_BOUNDED = {"tlog": 8}
-"""Formats whose reading is known to take memory and time only as their size: so many times as large is read here."""
 _STORED = 0.02
 """A large file of which less than this share is stored holds nothing but zeros: its copy was not finished."""
 
@@ -24,8 +22,7 @@ _STORED = 0.02
 def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
 
-    A large one (`LARGE`; of telemetry eight times that) is read in a child process with limited memory and time, see
-    `quadid_replay.reading`.
+    A large one (`LARGE`) is read in a child process with limited memory and time, see `quadid_replay.reading`.
 
     Args:
         path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
@@ -39,10 +36,10 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    kind = _kind(file, columns)
+    _kind(file, columns)
     sizes = [part.stat() for part in _parts(file)]
     size = sum(part.st_size for part in sizes)
-    if size >= LARGE * _BOUNDED.get(kind, 1):
+    if size >= LARGE:
         stored = 512 * sum(part.st_blocks for part in sizes)
         if stored < _STORED * size:
             raise LogError(

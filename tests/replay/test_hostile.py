@@ -52,6 +52,17 @@ def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: byt
     happened(5, f"telemetry log of filler {filler[:2].hex()}: read in linear time")
 
 
+def test_a_telemetry_log_damaged_after_every_other_frame_takes_linear_time(
+    tmp_path: Path, happened: Happened
+) -> None:
+    empty = bytes([0xFE, 0, 0, 1, 1, 0, 0, 0])
+    frames = [struct.pack(">Q", 1_700_000_000_000_000 + k) + empty for k in range(2)]
+    said = opened(tmp_path, tlog() + (b"".join(frames) + b"xx") * 400_000)
+    assert "bytes are damaged and were skipped" in said
+    assert "longer than" not in said
+    happened(5, "telemetry log with 400,000 damaged places: read in linear time")
+
+
 def test_a_ulog_without_sync_takes_linear_time(tmp_path: Path, happened: Happened) -> None:
     bad = struct.pack("<HB", 1, 0xFF)  # records of no known kind, one after the other
     said = opened(tmp_path, seeds("ulog")[0] + bad * (4 << 20))

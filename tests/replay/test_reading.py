@@ -80,17 +80,6 @@ def test_more_time_than_allowed_is_refused_and_errors_are_those_of_the_reader(
     happened(5, "a log that takes longer than its time limit is refused, its reader killed")
 
 
-def test_telemetry_is_read_here_up_to_eight_times_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quadid_replay.reading, "read_in_child", lambda *_: pytest.fail("a child was started"))
-    write_tlog(tmp_path / "log", full_recording(2.0, 50.0))
-    size = (tmp_path / "log").stat().st_size
-    monkeypatch.setattr(quadid_replay.opening, "LARGE", size // 8 + 1)
-    assert open_log(tmp_path / "log").channels
-    monkeypatch.setattr(quadid_replay.opening, "LARGE", size // 8)
-    with pytest.raises(pytest.fail.Exception, match="a child was started"):
-        open_log(tmp_path / "log")
-
-
 def sparse(path: Path, head: bytes, size: int) -> Path:
     path.write_bytes(head)
     os.truncate(path, size)
