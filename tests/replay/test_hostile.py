@@ -52,9 +52,7 @@ def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: byt
     happened(5, f"telemetry log of filler {filler[:2].hex()}: read in linear time")
 
 
-def test_a_telemetry_log_damaged_after_every_other_frame_takes_linear_time(
-    tmp_path: Path, happened: Happened
-) -> None:
+def test_a_telemetry_log_damaged_after_every_other_frame_takes_linear_time(tmp_path: Path, happened: Happened) -> None:
     empty = bytes([0xFE, 0, 0, 1, 1, 0, 0, 0])
     frames = [struct.pack(">Q", 1_700_000_000_000_000 + k) + empty for k in range(2)]
     said = opened(tmp_path, tlog() + (b"".join(frames) + b"xx") * 400_000)
