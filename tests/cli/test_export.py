@@ -167,6 +167,7 @@ def test_full_and_hover_thrust_follow_the_thrust_curve_and_weak_rotors(vehicle: 
     assert values["SIH_T_MAX"] == pytest.approx(3.9 / 4.0 * full)
     hover = 1.3 * GRAVITY / (3.9 * full)
     assert values["MPC_THR_HOVER"] == pytest.approx(hover)
+    assert f'ctrlrange="0 {full:.8g}"' in export(curved, "mujoco", "x")[".mjcf.xml"]
     parameters = export(curved, "ardupilot", "x")[".param"]
     assert float(next(line for line in parameters.splitlines() if "THST_HOVER" in line)[15:]) == pytest.approx(hover)
 

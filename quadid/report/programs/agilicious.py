@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from quadid.errors import ParameterError
-from quadid.report.programs.facts import TO_FLU, Facts
+from quadid.report.programs.facts import TO_FLU, Facts, number
 
 CARRIED = ("cg_offset", "motor_lag", "rotor_drag")
 _PLACES = {"fr": (1, -1), "bl": (-1, 1), "br": (-1, -1), "fl": (1, 1)}
 """Its rotors in its order: signs of x forward and y left."""
 _SPINS = {"fr": 1, "bl": 1, "br": -1, "fl": -1}
 """The sense of rotation that its allocation assumes, in ours: +1 pushes the vehicle about +z of FRD."""
-SHORTEST_LAG = 1e-3
 
 
 def agilicious(facts: Facts) -> str:
@@ -30,9 +29,7 @@ def agilicious(facts: Facts) -> str:
             "front right and back left counterclockwise from above, the others clockwise",
             "change the allocation in Agilicious, or export to another form",
         )
-    arms = facts.arms @ TO_FLU
-    fastest = facts.max_speed if facts.max_speed is not None else 2.0 * facts.hover_speed
-    origin = "rotor speed at full command" if facts.max_speed is not None else "assumed: twice the hover speed"
+    arms, (fastest, origin) = facts.arms_flu, facts.fastest
     b = float(facts.thrust.mean())
     m = facts.vehicle.mass
     rows = [("mass", _number(m), "kg")]
@@ -41,7 +38,7 @@ def agilicious(facts: Facts) -> str:
         ("inertia", _row(facts.inertia.diagonal()), "kg m^2"),
         ("motor_omega_min", "0.0", "rad/s"),
         ("motor_omega_max", _number(fastest), f"rad/s, {origin}"),
-        ("motor_tau", _number(max(facts.effect("motor_lag", "tau"), SHORTEST_LAG)), "s"),
+        ("motor_tau", _number(facts.lag), "s"),
         ("thrust_map", _row((b, 0.0, 0.0)), "N over (rad/s)^2, rad/s, 1"),
         ("kappa", _number(facts.torque_per_thrust), "m, torque over thrust"),
         ("thrust_min", "0.0", "N, each rotor"),
@@ -70,7 +67,7 @@ def _rotor(facts: Facts, signs: tuple[int, int]) -> int:
 
 def _number(value: float) -> str:
     """A number that every YAML reader takes for one: 2.0e-05, since 2e-05 is text to YAML 1.1."""
-    mantissa, e, exponent = f"{float(value) + 0.0:.8g}".partition("e")
+    mantissa, e, exponent = number(value).partition("e")
     return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"
 
 

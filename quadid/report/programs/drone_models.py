@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from quadid.errors import ParameterError
-from quadid.report.programs.facts import TO_FLU, Facts
-from quadid.report.programs.rotorpy import SHORTEST_LAG
+from quadid.report.programs.facts import Facts, matrix
 from quadid.vehicle import GRAVITY
 
 CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "axial_inflow")
@@ -29,10 +28,8 @@ def drone_models(facts: Facts) -> str:
         raise ParameterError(
             f"{len(facts.vehicle.rotors)} rotors", "four, which drone-models takes for granted", "use rotorpy or mujoco"
         )
-    arms, m = facts.arms @ TO_FLU, facts.vehicle.mass
+    arms, m, up, down = facts.arms_flu, facts.vehicle.mass, facts.lag, facts.lag_down
     b, d = facts.value("b") * _PER_RPM**2, facts.value("d") * _PER_RPM**2
-    up = max(facts.effect("motor_lag", "tau"), SHORTEST_LAG)
-    down = facts.effect("motor_lag", "tau_down") or up
     # A rotor of spin +1 pushes the vehicle about +z of FRD, which is -z of FLU.
     mixing = np.array([arms[:, 1], -arms[:, 0], [-r.spin * facts.vehicle.arm for r in facts.vehicle.rotors]])
     drag = (facts.effect("rotor_drag", "k_x"), facts.effect("rotor_drag", "k_y"), facts.effect("axial_inflow", "k_z"))
@@ -42,22 +39,18 @@ def drone_models(facts: Facts) -> str:
         f"#   J_r = {facts.value('J_r'):.6g} kg m^2 is left out: version 0.1 gives gyroscopic torque a wrong sign",
         "", f"[{_bare(facts.vehicle.name)}]", f"gravity_vec = [0.0, 0.0, {-GRAVITY}]  # m/s^2",
         f"mass = {m:.8g}  # kg", f"L = {facts.vehicle.arm:.8g}  # m",
-        f"J = {_rows(TO_FLU @ facts.inertia @ TO_FLU)}  # kg m^2",
+        f"J = {matrix(facts.inertia_flu)}  # kg m^2",
         f"rpm2thrust = [0.0, 0.0, {b:.8g}]  # N/rpm^2", f"rpm2torque = [0.0, 0.0, {d:.8g}]  # N m/rpm^2",
         f"thrust2torque = {facts.torque_per_thrust:.8g}  # m",
         f"rotor_dyn_coef = [{1.0 / up:.8g}, 0.0, {1.0 / down:.8g}, 0.0]  # 1/s, 1/s/rpm",
         f"rotor_dyn_coef_simple = {1.0 / up:.8g}  # 1/s", f"thrust_dyn_coef = {1.0 / up:.8g}  # 1/s",
-        f"mixing_matrix = {_rows(mixing / facts.vehicle.arm)}",
-        f"drag_matrix = {_rows(np.diag([-m * k for k in drag]))}  # N s/m, at hover speed",
+        f"mixing_matrix = {matrix(mixing / facts.vehicle.arm)}",
+        f"drag_matrix = {matrix(np.diag([-m * k for k in drag]))}  # N s/m, at hover speed",
         "prop_inertia = 0.0  # kg m^2, see above", "thrust_min = 0.0  # N",
     ]  # fmt: skip
     if facts.max_speed is not None:
         lines.append(f"thrust_max = {facts.value('b') * facts.max_speed**2:.8g}  # N, at full command")
     return "\n".join(lines) + "\n"
-
-
-def _rows(matrix: np.ndarray) -> str:
-    return "[" + ", ".join(f"[{', '.join(f'{float(v) + 0.0:.8g}' for v in row)}]" for row in matrix) + "]"
 
 
 def _bare(name: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +19,25 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 TO_FLU = np.diag([1.0, -1.0, -1.0])
 """Turns body FRD into body FLU (its own inverse)."""
+SHORTEST_LAG = 1e-3
+"""Programs divide by the time constant of the motors [s]."""
+TENSOR = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+"""Entries of an inertia tensor as SDF and URDF call them."""
+
+
+def number(value: float) -> str:
+    """A number with eight digits, never minus zero."""
+    return f"{float(value) + 0.0:.8g}"
+
+
+def row(values: Iterable[float], separator: str = ", ") -> str:
+    """Numbers beside each other."""
+    return separator.join(map(number, values))
+
+
+def matrix(values: FloatArray) -> str:
+    """A matrix as Python and TOML read it."""
+    return "[" + ", ".join(f"[{row(line)}]" for line in values) + "]"
 
 
 @dataclass(frozen=True)
@@ -82,6 +103,38 @@ class Facts:
         return self.hover_speed * len(self.vehicle.rotors)
 
     @property
+    def arms_flu(self) -> FloatArray:
+        """Rotor positions from the CG, FLU [m], shape (rotors, 3)."""
+        return np.asarray(self.arms @ TO_FLU)
+
+    @property
+    def inertia_flu(self) -> FloatArray:
+        """Inertia tensor about the CG, FLU [kg m^2], shape (3, 3)."""
+        return np.asarray(TO_FLU @ self.inertia @ TO_FLU)
+
+    @property
+    def lag(self) -> float:
+        """Time constant of a rotor that speeds up [s], for programs that divide by it."""
+        return max(self.effect("motor_lag", "tau"), SHORTEST_LAG)
+
+    @property
+    def lag_down(self) -> float:
+        """Time constant of a rotor that slows down [s]."""
+        return self.effect("motor_lag", "tau_down") or self.lag
+
+    @property
+    def mean_drag(self) -> float:
+        """Rotor drag, mean of forward and sideways [1/s]."""
+        return 0.5 * (self.effect("rotor_drag", "k_x") + self.effect("rotor_drag", "k_y"))
+
+    @property
+    def fastest(self) -> tuple[float, str]:
+        """Rotor speed at full command [rad/s], for programs that need one, and where it comes from."""
+        if self.max_speed is None:
+            return 2.0 * self.hover_speed, "assumed: twice the hover speed"
+        return self.max_speed, "rotor speed at full command"
+
+    @property
     def max_speed(self) -> float | None:
         """Rotor speed at full command [rad/s], where the vehicle file knows it."""
         return self.vehicle.command.max_speed
@@ -123,3 +176,7 @@ class Facts:
         if left:
             lines.append(f"Effects that have no place here: {', '.join(left)}")
         return [plain(line, LONGEST_LINE) for line in lines]
+
+    def xml_comment(self, used: tuple[str, ...]) -> str:
+        """The header inside an XML comment, which two hyphens would end."""
+        return "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in self.header(used))

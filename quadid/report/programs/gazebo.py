@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from quadid.report.programs.facts import TO_FLU, Facts
+from quadid.report.programs.facts import TENSOR, Facts, number
 
 CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "weak_rotor")
 ROTOR_MASS = 1e-3
 """Share of the mass that each rotor link gets; taken off the body, so that the whole vehicle keeps mass and inertia."""
-SHORTEST_LAG = 1e-3
 
 
 def gazebo(facts: Facts) -> str:
@@ -22,9 +20,7 @@ def gazebo(facts: Facts) -> str:
     ``rotorDragCoefficient |omega| v``; hence ``rotorDragCoefficient = m k / sum(omega_hover)``.
     """
     name = escape(facts.vehicle.name)
-    arms = facts.arms @ TO_FLU
-    # Two hyphens would end the comment.
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
+    arms, comments = facts.arms_flu, facts.xml_comment(CARRIED)
     rotors = "".join(_rotor(facts, i, arm) for i, arm in enumerate(arms))
     plugins = "".join(_plugin(facts, i) for i in range(len(arms)))
     body, mass = _body_inertia(facts, arms)
@@ -40,7 +36,7 @@ def gazebo(facts: Facts) -> str:
 def _body_inertia(facts: Facts, arms: np.ndarray) -> tuple[np.ndarray, float]:
     """Inertia and mass of the body without its rotor links, FLU."""
     part = ROTOR_MASS * facts.vehicle.mass
-    body = TO_FLU @ facts.inertia @ TO_FLU
+    body = facts.inertia_flu
     for arm in arms:
         body = body - part * (arm @ arm * np.eye(3) - np.outer(arm, arm)) - np.diag(_disc(facts))
     return body, facts.vehicle.mass - part * len(arms)
@@ -53,8 +49,7 @@ def _disc(facts: Facts) -> tuple[float, float, float]:
 
 
 def _tensor(inertia: np.ndarray, indent: int) -> str:
-    names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
-    inner = "".join(f"{' ' * (indent + 2)}<{n}>{float(inertia[i, j]) + 0.0:.8g}</{n}>\n" for n, i, j in names)
+    inner = "".join(f"{' ' * (indent + 2)}<{n}>{number(inertia[i, j])}</{n}>\n" for n, i, j in TENSOR)
     return f"{' ' * indent}<inertia>\n{inner}{' ' * indent}</inertia>\n"
 
 
@@ -72,22 +67,19 @@ def _rotor(facts: Facts, i: int, arm: np.ndarray) -> str:
 def _plugin(facts: Facts, i: int) -> str:
     # Spin +1 turns about -z of FRD, up: counterclockwise seen from above.
     turning = "ccw" if facts.vehicle.rotors[i].spin > 0 else "cw"
-    lag = max(facts.effect("motor_lag", "tau"), SHORTEST_LAG)
-    drag = 0.5 * (facts.effect("rotor_drag", "k_x") + facts.effect("rotor_drag", "k_y"))
-    fastest = facts.max_speed if facts.max_speed is not None else 2.0 * facts.hover_speed
     entries = {
         "robotNamespace": "@NAME@",
         "jointName": f"rotor_{i}_joint",
         "linkName": f"rotor_{i}",
         "turningDirection": turning,
-        "timeConstantUp": f"{lag:.6g}",
-        "timeConstantDown": f"{lag:.6g}",
-        "maxRotVelocity": f"{fastest:.6g}",
+        "timeConstantUp": f"{facts.lag:.6g}",
+        "timeConstantDown": f"{facts.lag:.6g}",
+        "maxRotVelocity": f"{facts.fastest[0]:.6g}",
         "motorConstant": f"{float(facts.thrust[i]):.8g}",
         "momentConstant": f"{facts.torque_per_thrust:.8g}",
         "commandSubTopic": "command/motor_speed",
         "actuator_number": str(i),
-        "rotorDragCoefficient": f"{facts.vehicle.mass * drag / facts.hover_speeds:.8g}",
+        "rotorDragCoefficient": f"{facts.vehicle.mass * facts.mean_drag / facts.hover_speeds:.8g}",
         "rollingMomentCoefficient": "0",
         "rotorVelocitySlowdownSim": "10",
         "motorType": "velocity",

@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.report.programs.facts import TO_FLU, Facts
-from quadid.report.programs.rotorpy import SHORTEST_LAG
+from quadid.report.programs.facts import Facts, matrix
 
 CARRIED = ("cg_offset", "product_of_inertia", "motor_lag")
 
@@ -18,11 +17,8 @@ def isaac_lab(facts: Facts) -> str:
 
     An interval of a value that was not fitted has no width: what nobody measured is not drawn at random.
     """
-    b, arms = facts.value("b"), facts.arms @ TO_FLU
-    fastest = facts.max_speed if facts.max_speed is not None else 2.0 * facts.hover_speed
+    b, arms, fastest = facts.value("b"), facts.arms_flu, facts.fastest[0]
     origin = "at full command" if facts.max_speed is not None else "assumed: at twice the hover speed"
-    up = max(facts.effect("motor_lag", "tau"), SHORTEST_LAG)
-    down = facts.effect("motor_lag", "tau_down") or up
     # A rotor of spin +1 pushes the vehicle about +z of FRD, which is -z of FLU.
     twist = [-rotor.spin for rotor in facts.vehicle.rotors]
     n = len(arms)
@@ -31,7 +27,6 @@ def isaac_lab(facts: Facts) -> str:
     )
     mass = facts.vehicle.mass
     spread = Z95 * facts.vehicle.mass_sigma
-    inertia = TO_FLU @ facts.inertia @ TO_FLU
     lines = [f"# {line}" for line in facts.header(CARRIED)]
     lines += [
         "# Ranges are 95 % intervals, to randomise over; equal ends: not measured, or known exactly.", "",
@@ -39,15 +34,16 @@ def isaac_lab(facts: Facts) -> str:
         "    dt=0.005,  # [s] set it to your physics step",
         f"    thrust_range=(0.0, {b * fastest**2:.8g}),  # [N] {origin}",
         f"    thrust_const_range={_pair(*_interval(facts, 'b', (2.0 * math.pi) ** 2))},  # [N s^2]",
-        f"    tau_inc_range={_pair(up, up)},  # [s]", f"    tau_dec_range={_pair(down, down)},  # [s]",
+        f"    tau_inc_range={_pair(facts.lag, facts.lag)},  # [s]",
+        f"    tau_dec_range={_pair(facts.lag_down, facts.lag_down)},  # [s]",
         f"    torque_to_thrust_ratio={facts.torque_per_thrust:.8g},  # [m]",
         f"    thruster_names_expr={[f'rotor_{i + 1}' for i in range(n)]!r},  # frames of `--format urdf`", ")", "",
         "# For MultirotorCfg: force and torque about the CG of unit thrusts, (6, rotors), and the turning sense.",
-        f"ALLOCATION_MATRIX = {_rows(allocation)}", f"ROTOR_DIRECTIONS = {twist!r}", "",
+        f"ALLOCATION_MATRIX = {matrix(allocation)}", f"ROTOR_DIRECTIONS = {twist!r}", "",
         "# For randomisation events: mass [kg], J_xx, J_yy, J_zz and the inertia tensor [kg m^2].",
         f"MASS_RANGE = {_pair(mass - spread, mass + spread)}",
         *(f"{name.upper()}_RANGE = {_pair(*_interval(facts, name))}" for name in ("J_xx", "J_yy", "J_zz")),
-        f"INERTIA = {_rows(inertia)}",
+        f"INERTIA = {matrix(facts.inertia_flu)}",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
@@ -61,7 +57,3 @@ def _interval(facts: Facts, name: str, scale: float = 1.0) -> tuple[float, float
 
 def _pair(low: float, high: float) -> str:
     return f"({low:.8g}, {high:.8g})"
-
-
-def _rows(matrix: np.ndarray) -> str:
-    return "[" + ", ".join(f"[{', '.join(f'{float(v) + 0.0:.8g}' for v in row)}]" for row in matrix) + "]"

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from xml.sax.saxutils import quoteattr
 
-import numpy as np
-
-from quadid.report.programs.facts import TO_FLU, Facts
+from quadid.report.programs.facts import Facts, number, row
 
 CARRIED = ("cg_offset", "product_of_inertia", "weak_rotor")
 
@@ -18,12 +15,9 @@ def mujoco(facts: Facts) -> str:
     Thrust is b omega^2 (`weak_rotor` taken off), drag torque d / b times thrust.  The limit of the control is the
     thrust at full command where the full rotor speed is known.
     """
-    # Two hyphens would end the comment.
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
-    inertia = TO_FLU @ facts.inertia @ TO_FLU
-    full = " ".join(f"{float(inertia[i, j]) + 0.0:.8g}" for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
-    arms = facts.arms @ TO_FLU
-    sites = "".join(f'      <site name="rotor_{i + 1}" pos="{_numbers(arm)}"/>\n' for i, arm in enumerate(arms))
+    comments, inertia, arms = facts.xml_comment(CARRIED), facts.inertia_flu, facts.arms_flu
+    full = row((inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))), " ")
+    sites = "".join(f'      <site name="rotor_{i + 1}" pos="{row(arm, " ")}"/>\n' for i, arm in enumerate(arms))
     actuators = "".join(_actuator(facts, i) for i in range(len(arms)))
     return (
         f"<!--\n{comments}\n  The origin is the centre of gravity; body axes forward, left, up.\n"
@@ -39,10 +33,6 @@ def _actuator(facts: Facts, i: int) -> str:
     # Spin +1 turns about -z of FRD and pushes the vehicle about +z of FRD, -z of FLU.
     twist = -facts.vehicle.rotors[i].spin * facts.torque_per_thrust
     limit = ""
-    if facts.max_speed is not None:
-        limit = f' ctrllimited="true" ctrlrange="0 {float(facts.thrust[i]) * facts.max_speed**2:.8g}"'
+    if facts.full_thrust is not None:
+        limit = f' ctrllimited="true" ctrlrange="0 {number(facts.full_thrust[i])}"'
     return f'    <motor name="rotor_{i + 1}" site="rotor_{i + 1}" gear="0 0 1 0 0 {twist:.8g}"{limit}/>\n'
-
-
-def _numbers(vector: np.ndarray) -> str:
-    return " ".join(f"{float(v) + 0.0:.8g}" for v in vector)

@@ -65,7 +65,7 @@ def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
             ("SIH_Q_MAX", facts.torque_per_thrust * float(np.mean(facts.thrust)) * facts.max_speed**2),
         ]
     if "rotor_drag" in facts.vehicle.effects:
-        rows.append(("SIH_KDV", facts.vehicle.mass * 0.5 * (k("rotor_drag", "k_x") + k("rotor_drag", "k_y"))))
+        rows.append(("SIH_KDV", facts.vehicle.mass * facts.mean_drag))
     if "rate_damping" in facts.vehicle.effects:
         rows.append(
             ("SIH_KDW", 0.5 * (float(j[0, 0]) * k("rate_damping", "l_p") + float(j[1, 1]) * k("rate_damping", "m_q")))
@@ -79,7 +79,7 @@ def _drag_fusion(facts: Facts) -> list[tuple[str, float]]:
     """Drag of EKF2: momentum drag of the propellers [1/s], ballistic coefficients [kg/m^2]; only what was fitted."""
     rows = []
     if "rotor_drag" in facts.vehicle.effects:
-        rows.append(("EKF2_MCOEF", 0.5 * (facts.effect("rotor_drag", "k_x") + facts.effect("rotor_drag", "k_y"))))
+        rows.append(("EKF2_MCOEF", facts.mean_drag))
     c = facts.effect("parasitic_drag", "c")
     if c > 0.0:
         rows += [(f"EKF2_BCOEF_{axis}", 0.5 * AIR_DENSITY / c) for axis in "XY"]

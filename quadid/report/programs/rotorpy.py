@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quadid.report.programs.facts import TO_FLU, Facts
+from quadid.report.programs.facts import TO_FLU, Facts, number, row
 
 CARRIED = (
     "cg_offset",
@@ -13,8 +13,6 @@ CARRIED = (
     "parasitic_drag",
     "imu_lever_arm",
 )
-SHORTEST_LAG = 1e-3
-"""RotorPy divides by the motor time constant [s]."""
 
 
 def rotorpy(facts: Facts) -> str:
@@ -24,13 +22,11 @@ def rotorpy(facts: Facts) -> str:
     ``k_d = m k / sum(omega_hover)``; parasitic drag ``c_D = m c``.
     """
     m = facts.vehicle.mass
-    inertia = TO_FLU @ facts.inertia @ TO_FLU
-    drag = 0.5 * (facts.effect("rotor_drag", "k_x") + facts.effect("rotor_drag", "k_y"))
+    inertia = facts.inertia_flu
     parasitic = m * facts.effect("parasitic_drag", "c")
-    fastest = facts.max_speed if facts.max_speed is not None else 2.0 * facts.hover_speed
-    origin = "rotor speed at full command" if facts.max_speed is not None else "assumed: twice the hover speed"
+    fastest, origin = facts.fastest
     imu = TO_FLU @ [facts.effect("imu_lever_arm", k) for k in "xyz"]
-    positions = [f'        "r{i + 1}": np.array([{_row(arm)}]),' for i, arm in enumerate(facts.arms @ TO_FLU)]
+    positions = [f'        "r{i + 1}": np.array([{row(arm)}]),' for i, arm in enumerate(facts.arms_flu)]
     # A rotor of spin +1 pushes the vehicle about +z of FRD, which is -z of FLU.
     directions = ", ".join(str(-rotor.spin) for rotor in facts.vehicle.rotors)
     entries = [
@@ -38,15 +34,15 @@ def rotorpy(facts: Facts) -> str:
         ("Izz", inertia[2, 2], "kg m^2"), ("Ixy", inertia[0, 1], "kg m^2"), ("Iyz", inertia[1, 2], "kg m^2"),
         ("Ixz", inertia[0, 2], "kg m^2"), ("c_Dx", parasitic, "N/(m/s)^2"), ("c_Dy", parasitic, "N/(m/s)^2"),
         ("c_Dz", parasitic, "N/(m/s)^2"), ("k_eta", facts.value("b"), "N/(rad/s)^2"),
-        ("k_m", facts.value("d"), "N m/(rad/s)^2"), ("k_d", m * drag / facts.hover_speeds, "kg/rad"),
+        ("k_m", facts.value("d"), "N m/(rad/s)^2"), ("k_d", m * facts.mean_drag / facts.hover_speeds, "kg/rad"),
         ("k_z", m * facts.effect("axial_inflow", "k_z") / facts.hover_speeds, "kg/rad"), ("k_h", 0.0, "kg/m"),
-        ("k_flap", 0.0, "kg m/rad"), ("tau_m", max(facts.effect("motor_lag", "tau"), SHORTEST_LAG), "s"),
+        ("k_flap", 0.0, "kg m/rad"), ("tau_m", facts.lag, "s"),
         ("rotor_speed_min", 0.0, "rad/s"), ("rotor_speed_max", fastest, f"rad/s, {origin}"),
         ("motor_noise_std", 0.0, "rad/s"),
     ]  # fmt: skip
     lines = [f"# {line}" for line in facts.header(CARRIED)]
     lines += ["", "import numpy as np", "", "quad_params = {"]
-    lines += [f'    "{name}": {_number(value)},  # {unit}' for name, value, unit in entries]
+    lines += [f'    "{name}": {number(value)},  # {unit}' for name, value, unit in entries]
     lines += [
         f'    "num_rotors": {len(facts.vehicle.rotors)},',
         '    "rotor_pos": {  # from the CG, FLU [m]',
@@ -54,13 +50,5 @@ def rotorpy(facts: Facts) -> str:
         "    },",
     ]
     lines.append(f'    "rotor_directions": np.array([{directions}]),')
-    lines.append(f'    "rI": np.array([{_row(imu)}]),  # IMU, FLU [m]')
+    lines.append(f'    "rI": np.array([{row(imu)}]),  # IMU, FLU [m]')
     return "\n".join([*lines, "}"]) + "\n"
-
-
-def _number(value: float) -> str:
-    return f"{float(value) + 0.0:.8g}"
-
-
-def _row(values: object) -> str:
-    return ", ".join(_number(v) for v in values)  # type: ignore[attr-defined]

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from xml.sax.saxutils import quoteattr
 
-from quadid.report.programs.facts import TO_FLU, Facts
+from quadid.report.programs.facts import TENSOR, Facts, number, row
 
 CARRIED = ("cg_offset", "product_of_inertia")
 
 
 def urdf(facts: Facts) -> str:
     """Returns the URDF of one body with a massless frame at every rotor; thrust is named in the comment only."""
-    comments = "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in facts.header(CARRIED))
-    inertia = TO_FLU @ facts.inertia @ TO_FLU
-    names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
-    tensor = " ".join(f'{n}="{float(inertia[i, j]) + 0.0:.8g}"' for n, i, j in names)
+    comments, inertia = facts.xml_comment(CARRIED), facts.inertia_flu
+    tensor = " ".join(f'{n}="{number(inertia[i, j])}"' for n, i, j in TENSOR)
     rotors = "".join(
         f'  <link name="rotor_{i + 1}"/>\n  <joint name="rotor_{i + 1}_joint" type="fixed">\n'
         f'    <parent link="base_link"/>\n    <child link="rotor_{i + 1}"/>\n'
-        f'    <origin xyz="{" ".join(f"{float(v) + 0.0:.8g}" for v in arm)}" rpy="0 0 0"/>\n  </joint>\n'
-        for i, arm in enumerate(facts.arms @ TO_FLU)
+        f'    <origin xyz="{row(arm, " ")}" rpy="0 0 0"/>\n  </joint>\n'
+        for i, arm in enumerate(facts.arms_flu)
     )
     return (
         f'<?xml version="1.0"?>\n<!--\n{comments}\n'
