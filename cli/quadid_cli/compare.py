@@ -19,7 +19,7 @@ def compare(
     validate: options.Validate = None,
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", metavar="NAME", help="Only this method; may be given again. Default: all ten."),
+        typer.Option("--method", metavar="NAME", help="Only this method; repeatable. Default: all ten."),
     ] = None,
     seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Runs of each random method.")] = 3,
     budget: Annotated[

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def fleet(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder of logs, told by content; one vehicle a folder.")
+        Path, typer.Argument(metavar="DIR", help="Folder of logs, formats auto-detected; one vehicle a folder.")
     ],
     vehicle: Annotated[
         str | None,

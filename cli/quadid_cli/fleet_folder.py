@@ -28,7 +28,7 @@ class Found:
 def find_jobs(
     root: Path, default: str | None, rate: float, seed: int, diagnose: bool, leave_out: Path | None = None
 ) -> Found:
-    """Lists all logs below `root`, told by content.
+    """Lists all logs below `root`, recognised by content.
 
     The vehicle of a log is described by the nearest ``vehicle.yaml`` in its folder or above it, up to `root`, else by
     `default`.  A vehicle of the fleet is a folder: logs of one folder belong to the same one.

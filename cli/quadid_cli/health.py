@@ -10,7 +10,7 @@ import typer
 from quadid_cli.options import JsonTarget, Logs, OutFolder, Preset, ReportFile, Unchecked, VehicleName
 
 Baseline = Annotated[
-    list[str], typer.Option("--baseline", metavar="LOG", help="A healthy flight of this vehicle; may be given again.")
+    list[str], typer.Option("--baseline", metavar="LOG", help="A healthy flight of this vehicle; repeatable.")
 ]
 
 

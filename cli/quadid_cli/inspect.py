@@ -19,7 +19,7 @@ def inspect(
         str,
         typer.Argument(
             metavar="LOG",
-            help="A flight log: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, told by content. LOG@76:216: a span.",
+            help="A flight log: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, format auto-detected. LOG@76:216: a span.",
         ),
     ],
     vehicle: Annotated[

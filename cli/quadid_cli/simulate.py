@@ -31,7 +31,7 @@ def simulate(
             "--effect",
             metavar="NAME[:KEY=VALUE,...]",
             help="Hidden effect, as rotor_drag:k_x=0.3,k_y=0.3; without values it is drawn at a realistic size. "
-            "May be given again.",
+            "Repeatable.",
         ),
     ] = None,
     profile: Annotated[

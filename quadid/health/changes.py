@@ -89,7 +89,7 @@ class Health:
         verdict: unchanged, changed or unknown.
         changes: the most probable explanation; without confidence where the verdict is unchanged.
         score: how far the flights are from healthy ones, in standard deviations of these.
-        p_value: chance that healthy flights speak for a change as much.
+        p_value: chance that a healthy flight looks as changed.
         trim: of the flights in question, shape (4,), see `trims.AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.

@@ -205,10 +205,10 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
         if 0.75 < fit.scale / scale < 1.33:
             return Check(
-                "gyro_attitude", Verdict.ERROR, f"{what} (attitude moves {fit.scale:.3g} times as fast)",
+                "gyro_attitude", Verdict.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})",
                 "convert to radians", numbers,
             )  # fmt: skip
-    message = f"attitude moves {fit.scale:.3g} times as fast as the gyro says (R^2 {fit.r2:.2f})"
+    message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
     verdict = Verdict.OK if 0.85 < fit.scale < 1.15 else Verdict.WARNING
     return Check(
         "gyro_attitude", verdict, message, "" if verdict is Verdict.OK else "check scales and filters", numbers

@@ -39,7 +39,7 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         return Check("hover", Verdict.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
     inside = within(signal.t, spans)
     if not inside.any():
-        return Check("hover", Verdict.UNKNOWN, "the vehicle does not fly in this log, as far as the rotors tell")
+        return Check("hover", Verdict.UNKNOWN, "no flight in this log, by its rotor speeds")
     speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
     guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))
     needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
@@ -92,11 +92,11 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
         return error.found
     rate = 1.0 / float(np.median(np.diff(signal.t)))
     if rate < _LEAST_RATE:
-        return f"rotor signal at {rate:.3g} Hz is too slow to tell the motor order"
+        return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
     lagged = [_quick_motion(windows, acted, lag) for lag in range(_LAGS)]
-    return lagged if len(lagged[0][0]) >= 100 else "too little flight to tell the motor order"
+    return lagged if len(lagged[0][0]) >= 100 else "too little flight to check the motor order"
 
 
 def _quick_motion(windows: list[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +124,7 @@ def _quick_motion(windows: list[Window], thrust: list[FloatArray], lag: int) -> 
 def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     rotors = len(vehicle.rotors)
     if float(np.max(np.std(lagged[0][1], axis=0))) < 0.05:
-        return Check("motor_order", Verdict.UNKNOWN, "too little rotation to tell the motor order")
+        return Check("motor_order", Verdict.UNKNOWN, "too little rotation to check the motor order")
     scores = {
         order: max((_correlations(squares[:, order], motion, vehicle) for squares, motion in lagged), key=np.mean)
         for order in _orders(rotors)

@@ -93,8 +93,8 @@ def _next_steps(result: JsonDict) -> tuple[str, ...]:
         for effect, advice in ((e, EFFECTS[e].advice) for e in named)
     ]
     if result["verdict"] in ("partly_explained", "unknown"):
-        where = ", ".join(result["unexplained"]) or "no single channel"
-        out.append(f"What remains unexplained sits in: {where}. A flight that excites it more may tell it apart.")
+        where = f"is in {', '.join(result['unexplained'])}" if result["unexplained"] else "is spread over all channels"
+        out.append(f"The unexplained error {where}: a livelier flight (`quadid excite`) may show its cause.")
     if result["findings"]:
         out.append("The extended vehicle file works with every other command, for example `quadid score`.")
     else:

@@ -58,7 +58,7 @@ def health_verdict(result: JsonDict) -> Verdict:
     """Judges a result of the form ``quadid.health/1``."""
     verdict, changes = result["verdict"], result["changes"]
     n = len(result["baseline"])
-    chance = f"Healthy flights speak for a change as much with probability {result['p_value']:.2g}"
+    chance = f"Chance that a healthy flight looks as changed: {result['p_value']:.2g}"
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
     details = [f"{chance} ({against})."]
     if verdict == "unchanged":

@@ -293,7 +293,7 @@ def flown_parts(recording: Recording, vehicle: Vehicle | None, cut: Cut) -> list
 
 def trimming(parts: Sequence[str]) -> str:
     """The proposal of `flown_parts` as a sentence; empty without one."""
-    return f"the log stands on the ground, too, which counts as flight: use {' '.join(parts)}" if parts else ""
+    return f"the log includes time on the ground, which would count as flight: use {' '.join(parts)}" if parts else ""
 
 
 def first_imu_time(recording: Recording) -> float:

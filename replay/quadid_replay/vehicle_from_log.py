@@ -48,7 +48,7 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     channel, notes = rotor_channel(recording, None)
     if frame is None:
         raise LogError(
-            f"{recording.name}: tells no airframe",
+            f"{recording.name}: no parameters that describe the airframe",
             "a log with the autopilot's parameters: ArduPilot FRAME_CLASS and FRAME_TYPE, PX4 CA_ROTOR*",
             "write the file by hand: docs/new-vehicle.md",
         )

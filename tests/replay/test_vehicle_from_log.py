@@ -60,7 +60,7 @@ def test_px4_tells_its_geometry_whole(data_dir: Path) -> None:
 
 
 def test_a_log_without_an_airframe_is_refused(data_dir: Path) -> None:
-    with pytest.raises(LogError, match="tells no airframe"):
+    with pytest.raises(LogError, match="no parameters that describe the airframe"):
         vehicle_text(open_log(data_dir / "iris" / "sideways.csv"), "mine")
     assert frame_of({"CA_ROTOR_COUNT": 4.0}, 0.2) is None
     assert frame_of({"FRAME_CLASS": float("nan")}, 0.2) is None

@@ -217,7 +217,7 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
         "95 % interval 1.9 to 2.2",
         "32 % without motor lag",
         "command delay (1.3)",
-        "sits in: p",
+        "error is in p",
     ):
         assert expected in reader.text
     assert len(reader.scripts) == 3
