@@ -38,7 +38,7 @@ class NumpyObjective:
         """Prepares a set of this length; all its segments, or at most about `most` spread evenly."""
         vehicle, window = Vehicle.shipped("pelican"), flight(seconds)
         whole = Shooting.cut([window], vehicle, SWARM_SECONDS)
-        self.vehicle, self.shooting = vehicle, whole.thinned(1 if most is None else -(-whole.count // most))
+        self.vehicle, self.shooting = vehicle, whole if most is None else whole.at_most(most)
         s = self.shooting
         self.theta, self.free = s.layout.initial(vehicle), s.free(NOMINAL_NAMES)
         self.ours = projected_cost(s, self.theta, self.free, s.count)

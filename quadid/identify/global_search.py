@@ -71,7 +71,7 @@ def projected_cost(shooting: Shooting, theta: FloatArray, free: Free, most: int)
         A function of parameter vectors (m, size) giving costs (m,).
     """
     n_pre, k = shooting.start_of(theta, free)
-    few = shooting.thinned(-(-shooting.count // most))
+    few = shooting.at_most(most)
     sigma = np.sqrt(few.noise.variance)
     jobs = []
     for i, (rollout, segments, start) in enumerate(zip(few.rollouts, few.segments, few.starts(n_pre).x0, strict=True)):

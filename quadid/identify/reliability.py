@@ -165,7 +165,7 @@ def _with_causes(
     problem: Shooting, found: Polished, free: Free, prior: Prior
 ) -> Iterator[tuple[str, FloatArray, float]]:
     """Name, scaled step of the parameters, and cost per row of the model with each cause that the residual asks for."""
-    places = problem.places(max(-(-problem.count // MOST_SEGMENTS), 1))
+    places = problem.places(MOST_SEGMENTS)
     few = problem.taking(places)
     states = found.states.taking(places)
     asked = _asked_for(few, found.theta, states, free) if np.isfinite(found.cost) else []

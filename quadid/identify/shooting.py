@@ -132,8 +132,9 @@ class Shooting:
         """The same problem on other data."""
         return Shooting.cut(windows, self.vehicle, self.seconds, self.noise, self.layout)
 
-    def places(self, every: int) -> list[IndexArray]:
-        """Every n-th segment of each window, the first included."""
+    def places(self, most: int) -> list[IndexArray]:
+        """Every n-th segment of each window, the first included: about `most` of all at most."""
+        every = max(-(-self.count // most), 1)
         return [np.arange(0, len(s.starts), every) for s in self.segments]
 
     def taking(self, kept: Sequence[IndexArray]) -> Shooting:
@@ -154,13 +155,9 @@ class Shooting:
         ends = np.cumsum([len(s.starts) for s in self.segments])
         return [k + end - len(s.starts) for k, end, s in zip(kept, ends, self.segments, strict=True)]
 
-    def thinned(self, every: int) -> Shooting:
-        """The same problem on every n-th segment of each window, the first included."""
-        return self.taking(self.places(every))
-
     def at_most(self, most: int) -> Shooting:
         """The same problem on at most about `most` segments, spread evenly."""
-        return self.thinned(max(-(-self.count // most), 1))
+        return self.taking(self.places(most))
 
     def between(self) -> Shooting:
         """The same problem cut half a segment later, so that borders lie where the middle of segments was.
@@ -222,10 +219,8 @@ class Shooting:
         """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""
         m = 1 + k + len(free.entries)
         thetas = np.repeat(theta[None], m, axis=0)
-        dx = np.zeros((m, 12))
-        steps = np.empty(m - 1)
-        steps[:k] = _TANGENT_STEP[:k]
-        dx[1 + np.arange(k), np.arange(k)] = _TANGENT_STEP[:k]
+        dx, steps = np.zeros((m, 12)), np.empty(m - 1)
+        dx[1 + np.arange(k), np.arange(k)] = steps[:k] = _TANGENT_STEP[:k]
         scale = free.jacobian(theta)
         for j, e in enumerate(free.entries):
             # Step inwards at an upper bound, so that no lane leaves the allowed range.

@@ -17,8 +17,6 @@ OPTIMIZERS = (
     "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
     "pso_algorithm_1",
 )  # fmt: skip
-SHORTEST = 1.5
-"""Shortest window that holds one segment of a fit, with its lead [s]."""
 BUDGET = 4000
 """Simulations of the data that any search but the standard one may spend."""
 
@@ -31,10 +29,12 @@ def check_optimizer(name: str) -> None:
 
 def check_length(windows: Sequence[Window]) -> None:
     """Raises NotIdentifiableError unless at least one window is long enough to be fitted and scored."""
+    from quadid.identify.fit import LEAST_SECONDS
+
     longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
-    if longest < SHORTEST:
+    if longest < LEAST_SECONDS:
         raise NotIdentifiableError(
-            f"the longest stretch of usable data is {longest:.3g} s", f"at least {SHORTEST:g} s without gaps",
+            f"the longest stretch of usable data is {longest:.3g} s", f"at least {LEAST_SECONDS:g} s without gaps",
             "use a longer flight, or a wider span of it",
         )  # fmt: skip
 

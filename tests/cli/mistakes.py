@@ -179,7 +179,7 @@ MISTAKES = (
     Mistake("a log cut at its beginning", fit(lambda p: p.bytes("cut.mcap", p.mcap.read_bytes()[:3000])), "cut.mcap"),
     Mistake("a span outside the log", fit(lambda p: f"{p.log}@50:60"), "nothing"),
     Mistake("a span backwards", fit(lambda p: f"{p.log}@9:3"), "swap"),
-    Mistake("a second of flight", fit(lambda p: f"{p.log}@3:4.2"), "1.5 s", 3),
+    Mistake("a second of flight", fit(lambda p: f"{p.log}@3:4.8"), "2 s", 3),
     Mistake("never off the ground", fit(lambda p: p.still()), "rotor|hover|say nothing|fly", 3, vague=True),
     Mistake(
         "the fitted log as validation", lambda p: (*fit(lambda p: p.log)(p), "--validate", p.log), "proves nothing"

@@ -193,8 +193,8 @@ def test_revolutions_a_minute_for_radians_a_second(inside: Cli, flights: Flights
 
 def test_too_short_a_flight(inside: Cli, flights: Flights, tmp_path: Path) -> None:
     for command in ("identify", "diagnose"):
-        run = inside(command, f"{flights.unseen}@3:4.2", "--vehicle", "pelican", "--out", tmp_path)
-        assert "at least 1.5 s" in one_line(run, 3)
+        run = inside(command, f"{flights.unseen}@3:4.8", "--vehicle", "pelican", "--out", tmp_path)
+        assert "at least 2 s" in one_line(run, 3)
 
 
 def test_flu_for_frd(inside: Cli, flights: Flights, tmp_path: Path) -> None:

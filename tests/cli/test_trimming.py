@@ -45,7 +45,9 @@ def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> Non
 
 def test_a_log_in_use_says_so_once(standing: Path) -> None:
     whole = [w for w in quadid.load(standing, vehicle="pelican").warnings if "ground" in w]
-    assert whole == ["standing.csv: the log includes time on the ground, which would count as flight: use standing.csv@11:30"]
+    assert whole == [
+        "standing.csv: the log includes time on the ground, which would count as flight: use standing.csv@11:30"
+    ]
     assert not [w for w in quadid.load(f"{standing}@11:30", vehicle="pelican").warnings if "ground" in w]
 
 
