@@ -110,6 +110,11 @@ def matching_rows(t: FloatArray, at: FloatArray, step: float) -> IndexArray | No
     return index if bool(np.all(near)) else None
 
 
+def linear(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
+    """Values (n, columns) of times t (n,) at other times (m,), by straight lines; beyond the ends the last value."""
+    return np.column_stack([np.interp(at, t, column) for column in values.T])
+
+
 def interpolate(t: FloatArray, values: FloatArray, at: FloatArray, smooth: bool) -> FloatArray:
     """Interpolates one stretch at times inside it.
 
@@ -125,8 +130,7 @@ def interpolate(t: FloatArray, values: FloatArray, at: FloatArray, smooth: bool)
     if smooth and len(t) >= 4:
         out[inside] = _hermite(t, values, at[inside])
     else:
-        for column in range(values.shape[1]):
-            out[inside, column] = np.interp(at[inside], t, values[:, column])
+        out[inside] = linear(t, values, at[inside])
     return out
 
 

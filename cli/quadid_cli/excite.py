@@ -85,13 +85,14 @@ def excite(
 def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
     from quadid.experiment import BLOCK
+    from quadid.report.manoeuvres.plan import half_width
     from quadid.report.text_table import Column, TextTable
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
-    columns = ("now", "gentle flight", "manoeuvre", "one axis at a time")
-    rows = tuple((p["name"], *(percent(p[name.replace(" ", "_")]) for name in columns)) for p in result["parameters"])
-    heads = (Column("parameter"), *(Column(name, right=True) for name in columns))
+    keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
+    rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in result["parameters"])
+    heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
     title = f"Relative 95 % half-width (±) before and after {result['seconds']:g} s"
     tables.print_tables(console, [TextTable(title, heads, rows)])
     console.print(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms")
@@ -119,11 +120,6 @@ def grouped(movements: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int]
     """Movements that follow each other alike as one: name, amplitudes, how many times."""
     each = [(m["name"], ", ".join(amplitude(a, v) for a, v in m["amplitudes"].items())) for m in movements]
     return [(*move, len(list(same))) for move, same in groupby(each)]
-
-
-def percent(half: float) -> str:
-    """A relative half-width for people."""
-    return "unknown" if half > 2.0 else f"± {100.0 * half:.3g} %"
 
 
 def amplitude(axis: str, value: float) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from quadid.errors import NotIdentifiableError
 from quadid.inspection.airborne import flying_spans
-from quadid.resample import sample_period
+from quadid.resample import linear, sample_period
 from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -149,7 +149,7 @@ def _motion(recording: Recording, vehicle: Vehicle, edges: FloatArray) -> tuple[
         told = "motion from in-plane force"
     gyro = recording.channels.get("gyro")
     if gyro is not None and len(gyro.t) > 1:
-        turned = _at(gyro, edges + BLOCK) - _at(gyro, edges)
+        turned = _gained(gyro, edges)
         inertia = np.array([vehicle.parameters[f"J_{a}{a}"].initial for a in "xyz"])
         yaw_arm = vehicle.parameters["d"].initial / vehicle.parameters["b"].initial
         authority = vehicle.mass * GRAVITY * np.array([vehicle.arm, vehicle.arm, yaw_arm])
@@ -163,20 +163,21 @@ def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
     if velocity is not None and len(velocity.t) > 1:
         means, _ = _block_means(velocity.t, velocity.values, edges)
     elif position is not None and len(position.t) > 1:
-        means = (_at(position, edges + BLOCK) - _at(position, edges)) / BLOCK
+        means = _gained(position, edges) / BLOCK
     else:
         return None
     attitude = recording.channels.get("attitude")
     if attitude is not None and len(attitude.t) > 1:
-        w, x, y, z = _at(attitude, edges + 0.5 * BLOCK).T
+        w, x, y, z = linear(attitude.t, attitude.values, edges + 0.5 * BLOCK).T
         heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         c, s = np.cos(heading), np.sin(heading)
         means = np.column_stack([c * means[:, 0] + s * means[:, 1], c * means[:, 1] - s * means[:, 0], means[:, 2]])
     return means
 
 
-def _at(channel: Channel, t: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(t, channel.t, column) for column in channel.values.T])
+def _gained(channel: Channel, edges: FloatArray) -> FloatArray:
+    """By how much a channel grows over each block, shape (blocks, columns)."""
+    return linear(channel.t, channel.values, edges + BLOCK) - linear(channel.t, channel.values, edges)
 
 
 def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray]:

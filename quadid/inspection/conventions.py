@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
-from quadid.resample import sample_period
+from quadid.resample import linear, sample_period
 from quadid.resampling_plan import GAP
 from quadid.turning import conjugate, rotated, turn
 from quadid.types import BoolArray, FloatArray
@@ -254,7 +254,7 @@ def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, Flo
 
 def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
     """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
-    q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
+    q = linear(attitude.t, attitude.values, accel.t)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     force = rotated(q, accel.values) + np.array([0.0, 0.0, GRAVITY])
     stride = max(1, round(0.2 / sample_period(velocity.t)))
@@ -280,4 +280,4 @@ def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
     """Running integral (trapezoidal) of a channel, read at times `at`, shape (m, columns)."""
     area = 0.5 * (channel.values[1:] + channel.values[:-1]) * np.diff(channel.t)[:, None]
     total = np.concatenate([np.zeros((1, area.shape[1])), np.cumsum(area, axis=0)])
-    return np.column_stack([np.interp(at, channel.t, c) for c in total.T])
+    return linear(channel.t, total, at)

@@ -13,7 +13,7 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, Verdict
-from quadid.resample import moving_mean, sample_period
+from quadid.resample import linear, moving_mean, sample_period
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -100,8 +100,8 @@ def _blocks(spans: Spans) -> list[FloatArray]:
 
 def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray) -> list[_Peak]:
     place = vehicle.rotor_positions
-    rates = np.column_stack([np.interp(at, gyro.t, c) for c in gyro.values[:, :2].T])
-    squares = np.column_stack([np.interp(at, signal.t, c) for c in (signal.values**2).T])
+    rates = linear(gyro.t, gyro.values[:, :2], at)
+    squares = linear(signal.t, signal.values**2, at)
     width = max(3, round(2.5 * max(sample_period(signal.t), sample_period(gyro.t)) / _STEP) | 1)
     motion = _quick(np.gradient(rates, _STEP, axis=0), width)
     torque = _quick(squares @ np.column_stack([-place[:, 1], place[:, 0]]), width)

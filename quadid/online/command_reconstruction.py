@@ -22,6 +22,7 @@ import numpy as np
 from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
 from quadid.errors import LogError
 from quadid.online.channel_buffer import ChannelBuffer
+from quadid.resample import linear
 from quadid.resampling_plan import GAP
 from quadid.rotation import continuous_sign
 from quadid.rotor_signal import RotorSignal
@@ -131,7 +132,7 @@ class CommandReconstruction:
         commands = np.empty((len(at), len(self._mixer)))
         stabilise_rows(
             self._gains, self._mixer, np.ascontiguousarray(reference.values[held]), _turned(attitude, at),
-            _between(gyro, at), np.repeat(np.diff(t) / runs, runs), self._integral, commands,
+            linear(gyro.t, gyro.values, at), np.repeat(np.diff(t) / runs, runs), self._integral, commands,
         )  # fmt: skip
         return np.asarray(commands.reshape(len(t) - 1, runs, -1).mean(axis=1))
 
@@ -171,11 +172,7 @@ def _oldest(buffer: ChannelBuffer) -> float:
     return min(OLDEST, GAP * float(np.median(np.diff(buffer.t)))) if len(buffer.t) > 1 else OLDEST
 
 
-def _between(buffer: ChannelBuffer, at: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(at, buffer.t, column) for column in buffer.values.T])
-
-
 def _turned(buffer: ChannelBuffer, at: FloatArray) -> FloatArray:
     """Attitudes at times, quaternions, by straight lines between neighbours of the same sign."""
-    out = np.column_stack([np.interp(at, buffer.t, column) for column in continuous_sign(buffer.values).T])
+    out = linear(buffer.t, continuous_sign(buffer.values), at)
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))

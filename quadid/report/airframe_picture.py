@@ -33,7 +33,7 @@ def airframe_picture(
     scale = (0.5 * _SIZE - _MARGIN) / max(abs(c) for r in vehicle.rotors for c in r.position[:2])
     centre = 0.5 * _SIZE
     places = [(centre + scale * r.position[1], centre - scale * r.position[0]) for r in vehicle.rotors]
-    weak = {int(_value(c, "rotor")) - 1: c for c in changes if c["effect"] == "weak_rotor"}
+    weak = {int(change_value(c, "rotor")) - 1: c for c in changes if c["effect"] == "weak_rotor"}
     parts = [
         Markup(
             '<svg class="airframe" viewBox="0 0 {0:.0f} {0:.0f}" role="img" aria-label="Airframe from above, nose up">'
@@ -50,7 +50,8 @@ def airframe_picture(
     return str(Markup("").join(parts))
 
 
-def _value(change: JsonDict, name: str) -> float:
+def change_value(change: JsonDict, name: str) -> float:
+    """A number of a change."""
     return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
 
 
@@ -75,7 +76,7 @@ def _rotor(j: int, x: float, y: float, more: float, weak: JsonDict | None, centr
     if weak is not None:
         below = y + _DISC + _LARGEST + 12.0 if y > centre else y - _DISC - _LARGEST - 2.0
         low, high = next(p["ci95"] for p in weak["parameters"] if p["name"] == "loss")
-        words = f"loss {100.0 * _value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
+        words = f"loss {100.0 * change_value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
         out.append(_text(x, below, words.replace("-", "−"), "loss" + kind))
     return Markup("").join(out)
 
@@ -93,7 +94,7 @@ def _shift(changes: Sequence[JsonDict], centre: float, scale: float) -> Sequence
     found = [c for c in changes if c["effect"] == "cg_offset"]
     if not found:
         return ()
-    ahead, right = (_value(found[0], axis) for axis in "xy")
+    ahead, right = (change_value(found[0], axis) for axis in "xy")
     x, y = centre + _SHIFT * scale * right, centre - _SHIFT * scale * ahead
     words = f"CG {1e3 * (ahead**2 + right**2) ** 0.5:.1f} mm"
     return (

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from quadid.report.manoeuvres.plan import half_width
 from quadid.report.page import render
 from quadid.report.parts import axis, figure, rows_of, section, trace
 from quadid.window import Window
@@ -24,7 +25,7 @@ def excite_html(result: JsonDict, window: Window) -> str:
         window: the manoeuvre as flown in simulation.
     """
     gained = [
-        [p["name"], *(_percent(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time"))]
+        [p["name"], *(half_width(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time"))]
         for p in result["parameters"]
     ]
     each = [
@@ -69,10 +70,6 @@ def _limits(result: JsonDict) -> list[list[str]]:
         ["tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"],
         ["battery", "–", f"{e['battery_percent']:g} % left"],
     ]
-
-
-def _percent(half: float) -> str:
-    return "unknown" if half > 2.0 else f"± {100.0 * half:.3g} %"
 
 
 def _amplitude(axis: str, value: float) -> str:

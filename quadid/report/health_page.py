@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from quadid.report.airframe_picture import change_value
 from quadid.report.parts import axis, figure, rows_of, section
 from quadid.report.text_table import Cell, Column, TextTable
 from quadid.report.verdict import Level, Verdict
@@ -29,19 +30,15 @@ _STEPS = {
 }
 
 
-def _number(change: JsonDict, name: str) -> float:
-    return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
-
-
 def change_words(change: JsonDict) -> str:
     """A change in a few words: ``rotor 3: 21 % less thrust``."""
     effect = change["effect"]
     if effect == "weak_rotor":
-        return f"rotor {_number(change, 'rotor'):.0f}: {100.0 * _number(change, 'loss'):.0f} % less thrust"
+        return f"rotor {change_value(change, 'rotor'):.0f}: {100.0 * change_value(change, 'loss'):.0f} % less thrust"
     if effect == "cg_offset":
-        shift = [1e3 * _number(change, axis) for axis in "xy"]
+        shift = [1e3 * change_value(change, axis) for axis in "xy"]
         return f"centre of gravity moved by {shift[0]:+.1f} mm (forward) and {shift[1]:+.1f} mm (right)"
-    fraction = 100.0 * _number(change, "fraction")
+    fraction = 100.0 * change_value(change, "fraction")
     return (
         f"{_WORDS[effect]}: {fraction:+.0f} %" if effect == "mass_change" else f"{_WORDS[effect]}: {-fraction:+.0f} %"
     )
@@ -80,7 +77,7 @@ def health_verdict(result: JsonDict) -> Verdict:
 
 def _step(change: JsonDict) -> str:
     text = _STEPS[change["effect"]]
-    return text.format(rotor=f"{_number(change, 'rotor'):.0f}") if "{rotor}" in text else text
+    return text.format(rotor=f"{change_value(change, 'rotor'):.0f}") if "{rotor}" in text else text
 
 
 def change_table(changes: Sequence[JsonDict]) -> TextTable:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.proof import MOST_FLIGHTS, FittedFlight
+from quadid.resample import linear
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import Vehicle
@@ -122,7 +123,7 @@ def same_flight(train: Log, held: Log) -> float:
     common = float(np.ptp(t[inside])) if inside.any() else 0.0
     if common < SHORTEST:
         return 0.0
-    again = np.column_stack([np.interp(t[inside], s, a[:, i]) for i in range(3)])
+    again = linear(s, a, t[inside])
     here = b[inside] - b[inside].mean(axis=0)
     again = again - again.mean(axis=0)
     size = math.sqrt(float(np.sum(here**2)) * float(np.sum(again**2)))

@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from quadid.errors import LogError
+from quadid.resample import linear
 from quadid.turning import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.window import Channel, Recording
@@ -174,7 +175,7 @@ def _odometry(writer: TopicWriter, recording: Recording, epoch: int) -> list[_Se
     rows[:, 6] = 1.0
     world = np.full((len(t), 3), np.nan) if velocity is None else flip_world(velocity)
     if attitude is not None:
-        q = np.column_stack([np.interp(t, attitude.t, c) for c in attitude.values.T])
+        q = linear(attitude.t, attitude.values, t)
         q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
         rows[:, 3:7] = q[:, [1, 2, 3, 0]]
         world = rotated(conjugate(q), world)

@@ -10,6 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from quadid.health.trims import trim_directions
 from quadid.inspection.airborne import flying_spans
+from quadid.resample import linear
 from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.window import Recording
@@ -70,7 +71,7 @@ def thrust_in_motion(recording: Recording) -> float:
     rotors, (t, force) = rotor_signal(recording, CRAZYFLIE), _vertical(recording)
     count = min(len(rotors.t), len(t))
     band = butter(3, _BAND, "band", fs=1.0 / float(np.median(np.diff(t))), output="sos")
-    load = np.column_stack([np.interp(t[:count] - _LAG, rotors.t, w**2) for w in rotors.values.T])
+    load = linear(rotors.t, rotors.values**2, t[:count] - _LAG)
     inside = _steady(t[:count], recording)
     x, y = sosfiltfilt(band, load, axis=0)[inside], sosfiltfilt(band, force[:count])[inside]
     each = np.linalg.lstsq(x, y, rcond=None)[0]

@@ -17,6 +17,7 @@ from scipy.signal import lfilter, savgol_filter
 import quadid
 from quadid.identify.open_loop import mean_errors, no_change
 from quadid.model.layout import Layout
+from quadid.resample import linear
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
@@ -55,7 +56,7 @@ def signals(recording: Recording, begin: float, end: float) -> Signals:
     t = np.arange(max(begin, c["gyro"].t[0]), min(end, *(v.t[-1] for v in c.values())), 1.0 / RATE)
 
     def on_grid(name: str) -> FloatArray:
-        return np.column_stack([np.interp(t, c[name].t, column) for column in c[name].values.T])
+        return linear(c[name].t, c[name].values, t)
 
     return Signals(t, on_grid("motor_command"), on_grid("gyro"), on_grid("accel")[:, 2])
 

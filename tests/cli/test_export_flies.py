@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from quadid.errors import ParameterError
 from quadid.model.simulate import simulate as fly_file
 from quadid.report.programs import export
-from quadid.report.programs.rotorpy import SHORTEST_LAG
+from quadid.report.programs.facts import SHORTEST_LAG
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.model.simulate import held, simulate, state
