@@ -29,7 +29,7 @@ PIECES = {
     "four rotors, held input": "rotors_step(u, slope, k, True, False, geometry, 0.02, rot, s)",
     "four rotors, delayed input": "rotors_step(u, slope, k, True, True, geometry, 0.02, rot, s)",
     "residual": "compare(0, 0, k, measured, scale, s, out)",
-    "sum and projection": "_collect(0, k, basis, out, total, inside, 9)",
+    "sum and projection": "collect(0, k, basis, out, total, inside, 9)",
     "IMU filter": "step_filter(0.02, s); use_filter(s)",
     "AHRS tilt error": "step_tilt_error(0.02, s); tilt_attitude(s)",
     "attitude delay, lanes alike": "remember_attitude(k, s, past); _look_up(k, k, 0.02, past, s); _turn_back(0.02, s)",

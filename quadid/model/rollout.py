@@ -20,9 +20,9 @@ from quadid.model.kernel import Flight
 from quadid.model.layout import places, residual_terms
 from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
 from quadid.model.recent import Recent
-from quadid.model.rollout_kernel import N_TANGENT, roll_segments
+from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
-from quadid.model.rows import ALL_MOMENTS, N_STATE
+from quadid.model.rows import ALL_MOMENTS, MAX_TANGENTS, N_STATE
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.model.supply import relative_voltage
@@ -243,7 +243,7 @@ class Rollout:
         blocks = -(-m // LANES)
         th = np.empty((blocks * LANES, theta.shape[1]))
         th[:m], th[m:] = theta, theta[-1]
-        offsets = np.zeros((blocks * LANES, N_TANGENT))
+        offsets = np.zeros((blocks * LANES, MAX_TANGENTS))
         if dx is not None:
             offsets[:m] = dx
         return [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]

@@ -19,6 +19,7 @@ from quadid.model.body_kernel import (
     step_rare,
     step_solid,
 )
+from quadid.model.compare_kernel import collect, compare, compare_motion, settle
 from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core, step_core_shared
 from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
@@ -28,18 +29,16 @@ from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
-    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, MAX_TANGENTS, N_ROWS, N_STATE, ROTOR, S_FX, X_P,
+    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, N_ROWS, N_STATE, ROTOR, S_FX, X_P,
     X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 from quadid.model.sensor_kernel import (
-    compare, compare_motion, delay_attitude, distort_imu, remember_attitude, sensor_constants,
-    start_filter, step_filter, step_tilt_error, tilt_attitude, use_filter,
+    delay_attitude, distort_imu, remember_attitude, sensor_constants, start_filter, step_filter, step_tilt_error,
+    tilt_attitude, use_filter,
 )  # fmt: skip
 
 # isort: on
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit, lane_kernel
-
-N_TANGENT = MAX_TANGENTS
 
 
 @nb.njit(**jit)
@@ -74,70 +73,6 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
-
-
-@nb.njit(**jit)
-def _collect(
-    seg: int, row: int, basis: FloatArray, r: FloatArray, total: FloatArray, inside: FloatArray, channels: int
-) -> None:
-    """Adds the weighted residuals of a sample to their sum of squares and to their components along the basis.
-
-    Args:
-        seg: segment.
-        row: its scored row.
-        basis: (segments, length * channels, directions).
-        r: weighted residuals (1, 1, channels * LANES).
-        total: sum of squares (LANES,), added to.
-        inside: components (directions, LANES), added to.
-        channels: 9, 12 or 15.
-    """
-    lane_kernel()
-    at = row * channels
-    for lane in range(LANES):
-        r0, r1, r2 = r[0, 0, lane], r[0, 0, LANES + lane], r[0, 0, 2 * LANES + lane]
-        r3, r4, r5 = r[0, 0, 3 * LANES + lane], r[0, 0, 4 * LANES + lane], r[0, 0, 5 * LANES + lane]
-        r6, r7, r8 = r[0, 0, 6 * LANES + lane], r[0, 0, 7 * LANES + lane], r[0, 0, 8 * LANES + lane]
-        total[lane] += r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3 + r4 * r4 + r5 * r5 + r6 * r6 + r7 * r7 + r8 * r8
-    for j in range(basis.shape[2]):
-        b0, b1, b2 = basis[seg, at, j], basis[seg, at + 1, j], basis[seg, at + 2, j]
-        b3, b4, b5 = basis[seg, at + 3, j], basis[seg, at + 4, j], basis[seg, at + 5, j]
-        b6, b7, b8 = basis[seg, at + 6, j], basis[seg, at + 7, j], basis[seg, at + 8, j]
-        for lane in range(LANES):
-            rate = b0 * r[0, 0, lane] + b1 * r[0, 0, LANES + lane] + b2 * r[0, 0, 2 * LANES + lane]
-            turn = b3 * r[0, 0, 3 * LANES + lane] + b4 * r[0, 0, 4 * LANES + lane] + b5 * r[0, 0, 5 * LANES + lane]
-            push = b6 * r[0, 0, 6 * LANES + lane] + b7 * r[0, 0, 7 * LANES + lane] + b8 * r[0, 0, 8 * LANES + lane]
-            inside[j, lane] += rate + turn + push
-    if channels > 9:
-        for lane in range(LANES):
-            r0, r1, r2 = r[0, 0, 9 * LANES + lane], r[0, 0, 10 * LANES + lane], r[0, 0, 11 * LANES + lane]
-            total[lane] += r0 * r0 + r1 * r1 + r2 * r2
-        for j in range(basis.shape[2]):
-            b0, b1, b2 = basis[seg, at + 9, j], basis[seg, at + 10, j], basis[seg, at + 11, j]
-            for lane in range(LANES):
-                r0, r1, r2 = r[0, 0, 9 * LANES + lane], r[0, 0, 10 * LANES + lane], r[0, 0, 11 * LANES + lane]
-                inside[j, lane] += b0 * r0 + b1 * r1 + b2 * r2
-    if channels > 12:
-        for lane in range(LANES):
-            r0, r1, r2 = r[0, 0, 12 * LANES + lane], r[0, 0, 13 * LANES + lane], r[0, 0, 14 * LANES + lane]
-            total[lane] += r0 * r0 + r1 * r1 + r2 * r2
-        for j in range(basis.shape[2]):
-            b0, b1, b2 = basis[seg, at + 12, j], basis[seg, at + 13, j], basis[seg, at + 14, j]
-            for lane in range(LANES):
-                r0, r1, r2 = r[0, 0, 12 * LANES + lane], r[0, 0, 13 * LANES + lane], r[0, 0, 14 * LANES + lane]
-                inside[j, lane] += b0 * r0 + b1 * r1 + b2 * r2
-
-
-@nb.njit(**jit)
-def _settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
-    """Adds a segment's cost, sum of squares less squared components, to `cost` (LANES,); empties the sums."""
-    lane_kernel()
-    for lane in range(LANES):
-        cost[lane] += total[lane]
-        total[lane] = 0.0
-    for j in range(len(inside)):
-        for lane in range(LANES):
-            cost[lane] -= inside[j, lane] * inside[j, lane]
-            inside[j, lane] = 0.0
 
 
 @nb.njit(**jit)
@@ -228,9 +163,9 @@ def _march(
                     distort_imu(s)
                 compare(at, row, k, measured, scale, s, out)
                 if sums:
-                    _collect(seg, i - n_pre, basis, out, total, inside, channels)
+                    collect(seg, i - n_pre, basis, out, total, inside, channels)
         if sums:
-            _settle(total, inside, cost)
+            settle(total, inside, cost)
         else:
             for c in range(N_STATE):
                 for lane in range(LANES):
@@ -267,7 +202,7 @@ def _roll_segments(
         channels: 9, 12 with velocity, 15 with position too.
         n_seg: scored rows a segment.
         sums: add up the cost of the residuals instead of writing them.
-        basis: see `_collect`; read for sums.
+        basis: see `collect`; read for sums.
         out: residuals (segments, n_seg, channels * LANES), written; for sums work space (1, 1, channels * LANES).
         ends: states one step after the last scored row (segments, 13, LANES), written unless for sums.
         cost: (LANES,), added to for sums.

@@ -1,6 +1,7 @@
 """What the sensors make of the motion, for many parameter vectors at once: IMU filter, AHRS, errors of the IMU.
 
-The rows S_* hold what reaches the sensors at one sample; each stage works on them in place, `compare` ends the chain.
+The rows S_* hold what reaches the sensors at one sample; each stage works on them in place, and
+`compare_kernel.compare` ends the chain.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from quadid.model.rows import (
     C_AB, C_AHRS, C_ATT_DELAY, C_EC, C_EC2, C_ES, C_ES2, C_GB, C_GS, C_KAPPA, C_R, C_SIGMA, D_H, D_P, D_P0, D_Q,
     D_Q0, D_QW, D_QX, D_QY, D_QZ, D_R, D_R0, E_QW, E_QX, E_QY, E_QZ, F1_X, F2_X, G_BEND, G_DF, G_DW, G_F, G_F0,
     G_FM, G_W, G_W0, N_QW, N_QX, N_QY, N_QZ, S_BENDX, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R,
-    X_N, X_P, X_QW, X_QX, X_QY, X_QZ, X_VN,
+    X_P, X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 
 # isort: on
@@ -268,54 +269,3 @@ def distort_imu(s: FloatArray) -> None:
         s[S_FX + lane] = r00 * x + r01 * y + r02 * z + s[C_AB + lane]
         s[S_FY + lane] = r10 * x + r11 * y + r12 * z + s[C_AB + Y1 + lane]
         s[S_FZ + lane] = r20 * x + r21 * y + r22 * z + s[C_AB + Y2 + lane]
-
-
-# Rows are written out one by one below: a short loop over them would be unrolled first and then never be vectorised.
-
-
-@nb.njit(**jit)
-def compare(
-    seg: int, row: int, k: int, measured: FloatArray, scale: FloatArray, s: FloatArray, out: FloatArray
-) -> None:
-    """Writes predicted minus measured of sample k: gyro, attitude (body rotation vector), specific force.
-
-    Args:
-        seg: place in `out`.
-        row: place in `out`.
-        k: row of `measured` and `scale`.
-        measured: (n, 16): gyro 3, quaternion 4, accel 3, velocity 3, position 3.
-        scale: (n, channels), factor on each residual.
-        s: rows.
-        out: (segments, rows, channels * LANES); the first nine channels are written.
-    """
-    lane_kernel()
-    m0, m1, m2, m3 = measured[k, 3], measured[k, 4], measured[k, 5], measured[k, 6]
-    for lane in range(LANES):
-        out[seg, row, lane] = scale[k, 0] * (s[S_P + lane] - measured[k, 0])
-        out[seg, row, LANES + lane] = scale[k, 1] * (s[S_Q + lane] - measured[k, 1])
-        out[seg, row, 2 * LANES + lane] = scale[k, 2] * (s[S_R + lane] - measured[k, 2])
-        q0, q1, q2, q3 = s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane]
-        sign = 2.0 if m0 * q0 + m1 * q1 + m2 * q2 + m3 * q3 >= 0.0 else -2.0
-        out[seg, row, 3 * LANES + lane] = scale[k, 3] * sign * (m0 * q1 - m1 * q0 - m2 * q3 + m3 * q2)
-        out[seg, row, 4 * LANES + lane] = scale[k, 4] * sign * (m0 * q2 + m1 * q3 - m2 * q0 - m3 * q1)
-        out[seg, row, 5 * LANES + lane] = scale[k, 5] * sign * (m0 * q3 - m1 * q2 + m2 * q1 - m3 * q0)
-        out[seg, row, 6 * LANES + lane] = scale[k, 6] * (s[S_FX + lane] - measured[k, 7])
-        out[seg, row, 7 * LANES + lane] = scale[k, 7] * (s[S_FY + lane] - measured[k, 8])
-        out[seg, row, 8 * LANES + lane] = scale[k, 8] * (s[S_FZ + lane] - measured[k, 9])
-
-
-@nb.njit(**jit)
-def compare_motion(
-    seg: int, row: int, k: int, measured: FloatArray, scale: FloatArray, s: FloatArray, out: FloatArray
-) -> None:
-    """Writes predicted minus measured velocity and, with 15 channels, position at sample k; before the step."""
-    lane_kernel()
-    for lane in range(LANES):
-        out[seg, row, 9 * LANES + lane] = scale[k, 9] * (s[X_VN + lane] - measured[k, 10])
-        out[seg, row, 10 * LANES + lane] = scale[k, 10] * (s[X_VN + Y1 + lane] - measured[k, 11])
-        out[seg, row, 11 * LANES + lane] = scale[k, 11] * (s[X_VN + Y2 + lane] - measured[k, 12])
-    if scale.shape[1] > 12:
-        for lane in range(LANES):
-            out[seg, row, 12 * LANES + lane] = scale[k, 12] * (s[X_N + lane] - measured[k, 13])
-            out[seg, row, 13 * LANES + lane] = scale[k, 13] * (s[X_N + Y1 + lane] - measured[k, 14])
-            out[seg, row, 14 * LANES + lane] = scale[k, 14] * (s[X_N + Y2 + lane] - measured[k, 15])
