@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import os
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from quadid.errors import QuadidError
@@ -24,8 +28,12 @@ _QUIET = {
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms and at itself each 20 ms, which nobody here sees."""
 
-STARTING = 30.0
-"""Time that a worker may take to start [s]."""
+STARTING = 180.0
+"""Time that a worker may take to start [s]: when none lives for so long, there is no cluster."""
+ANSWER = 10.0
+"""Time that a scheduler may take to answer [s]."""
+_LOOK = 2.0
+"""A worker lives when it is there at two looks, so far apart [s]."""
 
 
 class ClusterError(QuadidError):
@@ -43,7 +51,7 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
         memory: that one worker may take before it is restarted and its log given up, for example ``2GiB``.
 
     Raises:
-        ClusterError: nothing answers at the address.
+        ClusterError: nothing answers at the address, or no worker can start.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -56,7 +64,7 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
     with dask.config.set({**settings, **_QUIET}):
         if address is not None:
             try:
-                client = Client(address, timeout="10s", set_as_default=False)
+                client = Client(address, timeout=ANSWER, set_as_default=False)
             except (OSError, TimeoutError, ValueError) as error:
                 raise ClusterError(
                     f"no Dask scheduler answers at {address}", "an address such as tcp://10.0.0.1:8786",
@@ -65,22 +73,45 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
             with client:
                 yield client
             return
-        count = workers or os.cpu_count() or 1
-        own = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, memory_limit=memory, dashboard_address=None,
-            host="127.0.0.1", silence_logs=logging.CRITICAL,
-        )  # fmt: skip
-        with own, Client(own, set_as_default=False) as client:
-            yield client
-            # Dask cannot close a cluster while the worker that replaces a dead one starts.
-            with contextlib.suppress(TimeoutError):
-                client.wait_for_workers(count, timeout=STARTING)
+        count, others = workers or os.cpu_count() or 1, set(multiprocessing.active_children())
+        try:
+            own = LocalCluster(
+                n_workers=count, threads_per_worker=1, processes=True, memory_limit=memory, dashboard_address=None,
+                host="127.0.0.1", silence_logs=logging.CRITICAL, death_timeout=STARTING,
+            )  # fmt: skip
+        except (RuntimeError, OSError, TimeoutError) as error:
+            raise _no_worker(f"their processes end at once or not within {STARTING:g} s") from error
+        try:
+            with Client(own, set_as_default=False) as client:
+                yield client
+        finally:
+            _close(own, others)
+
+
+def _close(own: Any, others: set[BaseProcess]) -> None:
+    """Ends an embedded cluster and its processes; `others` are children of this process that it did not start.
+
+    Dask cannot close a cluster while the worker that replaces a dead one starts, and fails; its process is then killed,
+    and it can.
+    """
+    from distributed.core import Status
+
+    try:
+        own.close(timeout=STARTING)
+    except (AssertionError, TimeoutError):
+        for child in set(multiprocessing.active_children()) - others:
+            child.kill()
+        own.status = Status.failed  # is closed once more
+        own.close(timeout=STARTING)
 
 
 def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = identify_one) -> Iterator[Row]:
     """Runs `work` on all jobs and yields one row of each as it is ready, whichever workers die on the way.
 
     A log whose workers die `ATTEMPTS` times, the last time with nothing else in them, costs that log only.
+
+    Raises:
+        ClusterError: no worker lives for `STARTING` seconds.
     """
     threads = sum(client.nthreads().values())
     if threads == 0:
@@ -122,24 +153,44 @@ def _stream(
     client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int
 ) -> Iterator[tuple[Any, Job]]:  # fmt: skip
     """Ended futures with their jobs, in the order in which they end; at most `ahead` are handed out."""
-    from distributed import as_completed
-
     waiting = iter(jobs)
-    running = as_completed(loop=client.loop)
-    by_key: dict[str, Job] = {}
+    ended: SimpleQueue[Any] = SimpleQueue()
+    running: dict[str, Job] = {}
 
     def hand_out(job: Job) -> None:
         future = client.submit(work, job, pure=False, retries=0)
-        by_key[future.key] = job
-        running.add(future)
+        running[future.key] = job
+        future.add_done_callback(ended.put)
 
     for _, job in zip(range(ahead), waiting, strict=False):
         hand_out(job)
-    for future in running:
-        yield future, by_key.pop(future.key)
+    while running:
+        future = _next_of(ended, client)
+        yield future, running.pop(future.key)
         following = next(waiting, None)
         if following is not None:
             hand_out(following)
+
+
+def _next_of(ended: SimpleQueue[Any], client: Any) -> Any:
+    """The next future that ends."""
+    lived, before = time.monotonic(), set[str]()
+    while True:
+        with contextlib.suppress(Empty):
+            return ended.get(timeout=_LOOK)
+        there = set(client.sync(client.scheduler.ncores_running))
+        if there & before:
+            lived = time.monotonic()
+        elif time.monotonic() - lived > STARTING:
+            raise _no_worker(f"none lived for {_LOOK:g} s in the last {STARTING:g} s")
+        before = there
+
+
+def _no_worker(how: str) -> ClusterError:
+    return ClusterError(
+        f"no worker can start: {how}", "at least one worker with memory for one log",
+        "give more memory with --memory, or fewer --workers; what is done is kept",
+    )  # fmt: skip
 
 
 def _lost(job: Job) -> Row:

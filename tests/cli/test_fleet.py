@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import random
 import shutil
@@ -11,8 +12,10 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
+import dask
 import pyarrow.parquet as pq
 import pytest
+from quadid_cli import fleet_cluster
 from quadid_cli.fleet_cluster import ClusterError, cluster, results
 from quadid_cli.fleet_folder import find_jobs
 from quadid_cli.fleet_store import open_store
@@ -165,6 +168,23 @@ def test_workers_killed_at_random_lose_no_log_and_do_none_twice(tmp_path: Path) 
     assert len(finished) - len(jobs) <= 4
 
 
+@pytest.mark.parametrize(("setting", "memory"), [("no_such_module", "1GiB"), (None, "30MiB")], ids=["dead", "starved"])
+def test_workers_that_cannot_start_are_an_error_and_leave_nothing_behind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, setting: str | None, memory: str
+) -> None:
+    """Their processes end at once, or are ended for their memory as soon as they live, again and again."""
+    monkeypatch.setattr(fleet_cluster, "STARTING", 5.0)
+    others = set(multiprocessing.active_children())
+    jobs = [Job(str(tmp_path), f"flight{i}", "alpha", "", 0, 0, "", 50.0, 1, False) for i in range(3)]
+    with (
+        dask.config.set({"distributed.worker.preload": [setting] if setting else []}),
+        pytest.raises(ClusterError, match=r"no worker can start.*--memory"),
+        cluster(None, 1, memory) as client,
+    ):
+        list(results(client, jobs))
+    assert set(multiprocessing.active_children()) <= others
+
+
 def test_a_cluster_that_is_already_there(folder: Path) -> None:
     from distributed import LocalCluster
 
@@ -178,7 +198,8 @@ def test_a_cluster_that_is_already_there(folder: Path) -> None:
     assert len(rows) == 2
 
 
-def test_what_cannot_start_says_why(inside: Cli, folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_start_says_why(inside: Cli, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_cluster, "ANSWER", 0.5)
     one_line(inside("fleet", tmp_path / "absent", "--vehicle", "pelican", "--out", tmp_path), 2)
     (tmp_path / "bare").mkdir()
     with pytest.raises(LogError, match="no flight log below"):
