@@ -1,0 +1,1 @@
+"""When is a particle swarm worth it?"""
