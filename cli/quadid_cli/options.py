@@ -90,7 +90,10 @@ def reader(
     columns: Sequence[str] | None,
 ) -> Callable[[Sequence[str]], list[Log]]:  # fmt: skip
     """What reads the logs of a command whose options these are; see `quadid.workflow.loading.load`."""
-    from quadid.workflow.loading import load_logs, parse_columns
+    from quadid.workflow.loading import load, parse_columns
 
     named = parse_columns(columns or [])
-    return lambda logs: load_logs(logs, vehicle, rate, start, stop, preset, unchecked, named)
+    return lambda logs: [
+        load(text, vehicle, rate=rate, start=start, stop=stop, preset=preset, unchecked=unchecked, columns=named)
+        for text in logs
+    ]

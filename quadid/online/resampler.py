@@ -271,13 +271,11 @@ class Resampler:
     def _rotor_signal(self, recording: Recording, at: FloatArray, arrived: Mapping[str, int]) -> RotorSignal:
         """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
         told = arrived["rotor_speed"] or arrived["motor_command"]
-        misfit = next(
-            (f for f in self.faults if f.startswith(("rotor_speed: ", "motor_command: ")) and _COUNT in f), ""
-        )
-        if misfit and not told:
-            wanted = f"{len(self._vehicle.rotors)}, the rotors of '{self._vehicle.name}'"
-            raise LogError(f"{recording.name}: {misfit}", wanted, "choose the vehicle file that belongs to these data")
         if told or not self._reconstruction.known or not arrived["attitude_reference"]:
+            misfits = [f for f in self.faults if f.startswith(("rotor_speed", "motor_command")) and _COUNT in f]
+            if misfits and not told:
+                wanted = f"{len(self._vehicle.rotors)}, the rotors of '{self._vehicle.name}'"
+                raise LogError(f"live: {misfits[0]}", wanted, "choose the vehicle file that belongs to these data")
             return rotor_signal(recording, self._vehicle)
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
         self._reconstruction.advance(self._buffers, until, float(at[0]) - HISTORY)

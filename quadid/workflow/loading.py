@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from quadid.errors import LogError, VehicleError
 
@@ -194,15 +194,6 @@ def load(
     doubts = () if unchecked else _doubts(recording, described, cut)
     windows, report = _gridded(recording, described, rate, cut)
     return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
-
-
-def load_logs(
-    texts: Sequence[str], vehicle: Vehicle, rate: float | None, start: float | None = None, stop: float | None = None,
-    preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
-) -> list[Log]:  # fmt: skip
-    """Opens several logs, see `load`."""
-    options: dict[str, Any] = {"start": start, "stop": stop, "preset": preset, "unchecked": unchecked}
-    return [load(text, vehicle, rate=rate, columns=columns, **options) for text in texts]
 
 
 def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import quadid
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.workflow.loading import GRID, load_logs, load_vehicle
+from quadid.workflow.loading import load_vehicle
 from studies.campaign import Case, cases, flown
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
@@ -120,4 +121,4 @@ def load(flight: Flight, cache: Path | None = None) -> Given:
 
 
 def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:
-    return [w for log in load_logs([str(DATA / n) for n in names], vehicle, GRID) for w in log.windows]
+    return [w for n in names for w in quadid.load(DATA / n, vehicle).windows]
