@@ -231,6 +231,12 @@ def lowpass_span(t: FloatArray, step: float, held: bool) -> tuple[float, float]:
     return float(t[0]) + HALF_WIDTH * step, float(t[-1]) + tail - HALF_WIDTH * step
 
 
+def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
+    """Where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]
+
+
 def fresh_rows(values: FloatArray) -> IndexArray:
     """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.model.thrust import ThrustModel
-from quadid.resample import moving_mean, sample_period
+from quadid.resample import moving_mean, sample_period, true_runs
 from quadid.rotor_signal import rotor_channel
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -112,9 +112,8 @@ def _vibrates(accel: Channel) -> BoolArray:
 
 
 def _spans(t: FloatArray, on: BoolArray) -> Spans:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
     spans: list[tuple[float, float]] = []
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
+    for first, end in zip(*true_runs(on), strict=True):
         a, b = float(t[first]), float(t[end - 1])
         if spans and a - spans[-1][1] <= _BRIDGE:
             spans[-1] = (spans[-1][0], b)

@@ -12,6 +12,7 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, Verdict
+from quadid.resample import true_runs
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
@@ -105,10 +106,10 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
 
 
 def _longest(t: FloatArray, same: BoolArray) -> tuple[float, float]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    if not len(edges):
+    first, end = true_runs(same)
+    if not len(first):
         return 0.0, 0.0
-    begins, ends = t[edges[::2]], t[np.minimum(edges[1::2], len(t) - 1)]
+    begins, ends = t[first], t[np.minimum(end, len(t) - 1)]
     longest = int(np.argmax(ends - begins))
     return float(begins[longest]), float(ends[longest])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
-from quadid.resample import measured_period
+from quadid.resample import measured_period, true_runs
 from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
 from quadid.types import BoolArray, FloatArray
@@ -55,10 +55,8 @@ def _facts(channel: Channel) -> ChannelFacts:
 
 def _longest_rest(t: FloatArray, same: BoolArray) -> float:
     """Returns the longest time [s] during which no column changed."""
-    if not same.any():
-        return 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    return float(np.max(t[edges[1::2]] - t[edges[::2]]))
+    first, end = true_runs(same)
+    return float(np.max(t[end] - t[first], initial=0.0))
 
 
 def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying: float) -> list[Check]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from quadid.online.resampler import Rows
+from quadid.resample import true_runs
 from quadid.types import BoolArray, FloatArray
 from quadid.window import Window
 
@@ -126,7 +127,7 @@ class GridBuffer:
         good: BoolArray = np.isfinite(columns["rotor_speed"]).all(axis=1) & (t >= start) & (t < stop)
         good &= _bridged(np.asarray(np.isfinite(columns["gyro"]).all(axis=1)))
         out = []
-        for a, b in _runs(good):
+        for a, b in zip(*true_runs(good), strict=True):
             if (b - a) * self._step < SHORTEST - 0.5 * self._step:
                 continue
             cut: dict[str, Any] = {
@@ -149,13 +150,7 @@ def _stack(blocks: list[Rows], name: str) -> FloatArray:
 def _bridged(good: BoolArray) -> BoolArray:
     """Short holes count as good: the model simply has no measurement there."""
     out = good.copy()
-    for a, b in _runs(~good):
+    for a, b in zip(*true_runs(~good), strict=True):
         if b - a <= LONGEST_GYRO_GAP and a > 0 and b < len(good):
             out[a:b] = True
     return out
-
-
-def _runs(good: BoolArray) -> list[tuple[int, int]]:
-    """Start and end (exclusive) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -10,6 +10,7 @@ import numpy as np
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import Verdict
 from quadid.model.thrust import ThrustModel
+from quadid.resample import true_runs
 from quadid.saturation import at_limit
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -74,9 +75,8 @@ def _broken(window: Window) -> str:
 
 
 def _longest_repeat(rows: FloatArray) -> int:
-    same = np.concatenate([[False], np.all(rows[1:] == rows[:-1], axis=1), [False]])
-    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
-    return int(np.max(edges[1::2] - edges[::2], initial=0))
+    first, end = true_runs(np.all(rows[1:] == rows[:-1], axis=1))
+    return int(np.max(end - first, initial=0))
 
 
 def _units(window: Window) -> str:
