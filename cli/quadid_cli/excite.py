@@ -97,7 +97,7 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
     tables.print_tables(console, [TextTable(title, heads, rows)])
     console.print(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms")
     for name, amplitudes, times in grouped(result["movements"]):
-        console.print(f"  {times} times {name}: {amplitudes}")
+        console.print(f"  {times} × {name}: {amplitudes}")
     peak = result["peak"]
     room, e = result["room"], result["envelope"]
     console.print(

@@ -45,7 +45,8 @@ class TextTable:
     def lines(self, width: int) -> list[tuple[Cell, ...]]:
         """Lines of pieces with their tones, for a terminal of `width` columns."""
         out: list[tuple[Cell, ...]] = [(Cell(line, "title"),) for line in _folded(self.title, width)]
-        for kept in self._blocks(width):
+        for n, kept in enumerate(self._blocks(width)):
+            out += [(Cell(""),)] * (n > 0)
             widths = [self._width(i) for i in kept]
             shown = [self.columns[i] for i in kept]
             out.append(tuple(Cell(_put(c.heading, w, c.right), "head") for c, w in zip(shown, widths, strict=True)))
