@@ -92,7 +92,7 @@ class LazyGroup(TyperGroup):
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         for name, text in _available().items():
-            self.commands[name] = TyperCommand(name, help=text, rich_markup_mode=None)
+            self.commands[name] = TyperCommand(name, help=text, short_help=text, rich_markup_mode=None)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Finds the command asked for, imported and complete."""

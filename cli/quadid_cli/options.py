@@ -60,7 +60,7 @@ Stop = Annotated[
     float | None,
     typer.Option("--stop", metavar="S", help="Use every log up to this many seconds after its first IMU sample."),
 ]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Decides every random number.")]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random numbers.")]
 Preset = Annotated[
     str,
     typer.Option(

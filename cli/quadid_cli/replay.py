@@ -33,7 +33,7 @@ class ReplayError(QuadidError):
 def replay(
     log: Annotated[str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV.")],
     vehicle: VehicleName,
-    speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Times real time, or max.")] = "max",
+    speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Multiple of real time, or max.")] = "max",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
     ] = None,

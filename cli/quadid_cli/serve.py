@@ -61,7 +61,7 @@ def serve(
     seed: Seed = 0,
     json: JsonTarget = None,
 ) -> None:
-    """Identify a flying vehicle over MAVLink; tell parameters, findings and health as component 191."""
+    """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191."""
     from quadid_node.stopping import Stop
 
     stop = Stop()

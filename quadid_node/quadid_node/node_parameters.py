@@ -41,7 +41,7 @@ PARAMETERS: tuple[NodeParameter, ...] = (
     P("rate", 50.0, "[Hz] of the uniform grid.", (20.0, 400.0)),
     P("memory", 120.0, "[s] time constant with which excited flight is forgotten.", (20.0, 86400.0)),
     P("diagnose", 60.0, "[s] between two diagnoses of the last minute of flight; 0: never.", (0.0, 3600.0)),
-    P("seed", 0, "Decides every random number.", (0, 2**31 - 1)),
+    P("seed", 0, "Seed of all random numbers.", (0, 2**31 - 1)),
     P("approval", "auto", "auto: what passes the gate is published; manual: it waits for quadid/approve.", live=True),
     P("gate.windows", 3, "Windows without a common sample that must agree.", (2, 20)),
     P("gate.width", 0.05, "Largest half-width of the 95 % interval of b, J_xx, J_yy, relative.", (0.001, 1.0)),

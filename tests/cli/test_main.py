@@ -21,6 +21,11 @@ def test_help_lists_every_installed_command(quadid: Cli) -> None:
     assert quadid().out == run.out
 
 
+def test_the_list_of_commands_is_whole_on_a_narrow_terminal(quadid: Cli) -> None:
+    text = " ".join(quadid("--help", COLUMNS="60").out.split())
+    assert all(sentence in text for sentence in COMMANDS.values())
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_examples_and_json(inside: Cli, command: str) -> None:
     run = inside(command, "--help")
