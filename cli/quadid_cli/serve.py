@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,23 +85,18 @@ def serve(
     known = name or described.name
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     with ExitStack() as opened:
-        store = Store(file or default_path(), known)  # first: who is refused here must not have taken the port
-        opened.callback(store.close)
+        # First the store: who is refused there must not have taken the port.
+        store = opened.enter_context(closing(Store(file or default_path(), known)))
         secret = read_key(key) if key is not None else None
         kept = memory_path((file or default_path()).parent, secret) if secret is not None else None
-        link = MavlinkLink(mavlink, len(described.rotors), system, secret, memory=kept)
-        opened.callback(link.close)
-        worker = with_ground(ProcessWorker(described), ground or "", known)
-        opened.callback(worker.close)
-        service = Service(described, settings, worker, store)
-        opened.callback(service.close)
+        link = opened.enter_context(closing(MavlinkLink(mavlink, len(described.rotors), system, secret, memory=kept)))
+        worker = opened.enter_context(closing(with_ground(ProcessWorker(described), ground or "", known)))
+        service = opened.enter_context(closing(Service(described, settings, worker, store)))
         outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
         if zenoh is not None:
             from quadid_node.zenoh_link import ZenohLink
 
-            told = ZenohLink(zenoh, known, service)
-            opened.callback(told.close)
-            outlets.append(told)
+            outlets.append(opened.enter_context(closing(ZenohLink(zenoh, known, service))))
         opened.callback(stop.ignore_more)
         run(service, link, outlets, lambda: stop() or time.monotonic() > end)
         result = summary(service, link, known)

@@ -89,7 +89,8 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
     if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
         low, high = vehicle.parameters["b"].limits
         modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
-        typical = float(np.median(modelled[modelled >= 0.25 * np.max(modelled)]))
+        highest = float(np.max(modelled))  # of losses that no rotor has it may be negative
+        typical = float(np.median(modelled[modelled >= 0.25 * highest])) if highest > 0.0 else 0.0
         if low / high < typical / hover < high / low:
             return modelled, hover
     powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]

@@ -229,6 +229,12 @@ def test_the_vehicle_is_weighed_by_its_whole_model(clean: Recording, effect: str
     assert check(inspect(flown, vehicle), "mass").verdict is Verdict.WARNING, "by b omega^2 alone it would weigh less"
 
 
+@pytest.mark.filterwarnings("error")
+def test_thrust_that_pulls_down_is_no_flight_by_the_vehicle_file(clean: Recording) -> None:
+    pulls = PELICAN.model_copy(update={"effects": {"weak_rotor": {"rotor": 1, "loss": 20.0}}})
+    assert check(inspect(clean, pulls), "hover").verdict is not Verdict.OK
+
+
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_wrong_mass_is_named_with_the_factor_where_thrust_is_known(
     clean: Recording, factor: float, happened: Happened
