@@ -86,9 +86,7 @@ class Refit:
 def _refit(shooting: Shooting, model: Model, candidate: Candidate, tests: int) -> Refit:
     """Refits one candidate as the selection does it."""
     extended = extend(shooting, model, candidate, tried=float(tests))
-    alike = rule.calibration(model, extended)
-    likely = rule.log_evidence(extended, alike) > rule.log_evidence(model, alike)
-    return Refit(paired_gain(model.held_out, extended.held_out), likely)
+    return Refit(paired_gain(model.held_out, extended.held_out), rule.advantage(extended, model) > 0.0)
 
 
 def _errors(case: Case, found: Diagnosis) -> dict[str, dict[str, float]]:

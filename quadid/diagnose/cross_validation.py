@@ -4,6 +4,10 @@ Segments are grouped into blocks of about 10 s.  For each block the parameters a
 Gauss-Newton step from the common optimum, exact for the linearised problem), so a model is charged for every parameter
 that only fits noise; the paired differences between two models, one a block, carry their own standard error whatever
 the correlation inside a block.
+
+A block that moves the vehicle as no other does is an extrapolation of parameters that the others hardly determine.  Its
+error says nothing of the model, so each block is scored by its predictive density, in which that uncertainty has its
+share (Geisser and Eddy, J. Am. Stat. Assoc. 74 (1979) 153).
 """
 
 from __future__ import annotations
@@ -36,12 +40,20 @@ def block_labels(lin: Linearised) -> IndexArray:
 
 
 def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> FloatArray:
-    """Deviance of each block under parameters fitted to the other blocks, shape (blocks,)."""
+    """Deviance of each block in the density that the other blocks predict, shape (blocks,).
+
+    Twice the negative logarithm of N(r; r(z), I + B V B'), with z and V mean and covariance of the parameters from the
+    other blocks and B the derivative of the block's residuals r; less that of the noise alone, N(0; 0, I).
+    """
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     if grad.shape[1] == 0:
         return cost
     z = steps_without(gram, grad, prior_precision)
-    return np.asarray(cost + 2.0 * np.sum(grad * z, axis=1) + np.einsum("bp,bpq,bq->b", z, gram, z))
+    moved = np.einsum("bpq,bq->bp", gram, z)
+    slope, rest = grad + moved, _rest(gram, prior_precision)
+    shared = np.einsum("bp,bp->b", slope, np.linalg.solve(rest + gram, slope[..., None])[..., 0])
+    spread = np.linalg.slogdet(rest + gram)[1] - np.linalg.slogdet(rest)[1]
+    return np.asarray(cost + np.sum((grad + slope) * z, axis=1) - shared + spread)
 
 
 def steps_without(gram: FloatArray, grad: FloatArray, prior_precision: FloatArray) -> FloatArray:
@@ -52,9 +64,13 @@ def steps_without(gram: FloatArray, grad: FloatArray, prior_precision: FloatArra
         grad: half the slope of the deviance of each block, shape (blocks, P).
         prior_precision: of each parameter, shape (P,).
     """
-    h_rest = gram.sum(axis=0) - gram + np.diag(np.maximum(prior_precision, 1e-12))
     g_rest = grad.sum(axis=0) - grad
-    return np.asarray(-np.linalg.solve(h_rest, g_rest[..., None])[..., 0])
+    return np.asarray(-np.linalg.solve(_rest(gram, prior_precision), g_rest[..., None])[..., 0])
+
+
+def _rest(gram: FloatArray, prior_precision: FloatArray) -> FloatArray:
+    """Information of all blocks but one and of the prior, for each in turn, shape (blocks, P, P)."""
+    return np.asarray(gram.sum(axis=0) - gram + np.diag(np.maximum(prior_precision, 1e-12)))
 
 
 def sum_by_block(values: FloatArray, labels: IndexArray) -> FloatArray:

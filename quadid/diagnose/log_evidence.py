@@ -15,6 +15,7 @@ import numpy as np
 from quadid.chi_square import exceeded
 from quadid.diagnose.cross_validation import paired_gain
 from quadid.diagnose.model import Model
+from quadid.types import BoolArray
 
 FALSE_ALARM = 1e-3
 """Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
@@ -30,31 +31,35 @@ def better(b: Model, a: Model) -> bool:
         return not better(a, b)
     if less < more and not relevant(a, b):
         return False
-    alike = calibration(a, b)
-    return log_evidence(b, alike) > log_evidence(a, alike)
+    return advantage(b, a) > 0.0
 
 
-def log_evidence(model: Model, calibration: float) -> float:
-    """Twice the log evidence of `model`; differences count, between models of the same data, noise and calibration.
+def advantage(b: Model, a: Model) -> float:
+    """Twice the log evidence of `b` less that of `a`, times the calibration, between models of the same data and noise.
 
-    Args:
-        model: fitted; its deviance holds the quadratic part of its prior.
-        calibration: `calibration` of the two models compared.
+    Each model pays for what only it has by the calibration of its own scores: where a parameter's scores vary much more
+    than the deviance counts on, that is no reason to count less what the other model explains.
     """
+    return a.deviance - b.deviance + _cost(a, b) - _cost(b, a)
+
+
+def _cost(model: Model, other: Model) -> float:
+    """Deviance that the causes and parameters which only `model` has must take away for it to be as likely."""
+    own = np.array([n not in other.free.names for n in model.free.names])
+    present = {c.label for c in other.causes}
+    prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes if c.label not in present)
+    if not own.any():
+        return float(prior)
+    ratio = calibration(model, own)
     gram = model.lin.information / np.sqrt(np.outer(model.prior.precision, model.prior.precision))
-    occam = float(np.linalg.slogdet(np.eye(len(gram)) + gram / calibration)[1])
-    prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes)
-    return -model.deviance / calibration - occam - float(prior)
+    wide = np.eye(len(gram)) + gram / ratio
+    occam = np.linalg.slogdet(wide)[1] - np.linalg.slogdet(wide[np.ix_(~own, ~own)])[1]
+    return ratio * float(occam + prior)
 
 
-def calibration(a: Model, b: Model) -> float:
-    """By how much scores of the parameters in which two models differ vary more than their deviance counts on, or 1."""
-    ratios = [1.0]
-    for model, other in ((a, b), (b, a)):
-        own = [n not in other.free.names for n in model.free.names]
-        if any(own):
-            ratios.append(float(np.mean(model.inflation[own])))
-    return max(ratios)
+def calibration(model: Model, own: BoolArray) -> float:
+    """By how much scores of the parameters `own` of `model` vary more than its deviance counts on, or 1."""
+    return max(float(np.mean(model.inflation[own])), 1.0)
 
 
 def relevant(small: Model, large: Model) -> bool:

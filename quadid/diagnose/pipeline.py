@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from quadid.diagnose.attribution import validate
 from quadid.diagnose.extended_vehicle import extended_vehicle
 from quadid.diagnose.findings import describe
 from quadid.diagnose.hypotheses import Candidate, candidates
-from quadid.diagnose.model import Model, fit_model, free_names
+from quadid.diagnose.model import Model, fit_model, free_names, without
 from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
@@ -20,7 +20,7 @@ from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
-from quadid.identify.covariance import parameter_set
+from quadid.identify.covariance import SPREAD_LIMIT, parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import swarm_search
@@ -109,7 +109,7 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
     ]
-    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict)
+    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict, doubts)
     parameters, moved = possible_moments(parameters)
     warnings += [*reasons, *([] if moved is None else [moved])]
     text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
@@ -139,12 +139,13 @@ def _prediction(
 
 
 def _nominal_parameters(
-    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict
+    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubts: Collection[str] = ()
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
-    Where the model misses something, estimates must agree as those of an identification.  Where the cause of the error
-    is unknown, so is what it does to them: none is identified.
+    Where the model misses something, estimates must agree as those of an identification, and with those without each
+    cause in `doubts` (labels): it stands for something else, which may do to them what it does.  Where the cause of the
+    error is unknown, so is what it does to them: none is identified.
     """
     uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
     reasons: tuple[str, ...] = ()
@@ -153,6 +154,13 @@ def _nominal_parameters(
             decisive, model, model.free, model.prior, polish(short, model.theta, model.free, model.prior, iterations=8)
         )
         uncertain, reasons = trust.widened(uncertain), trust.reasons(model.free, uncertain)
+    steps = {label: model.free.step(model.theta, without(decisive, model, c).theta)
+             for c in model.causes if (label := c.label) in doubts}  # fmt: skip
+    uncertain = uncertain.differing(list(steps.values()))
+    for label, step in steps.items():
+        moved = [n for n, s in zip(model.free.names, step, strict=True) if n in NOMINAL_NAMES and abs(s) > SPREAD_LIMIT]
+        if moved:
+            reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
     everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
     if verdict is Verdict.UNKNOWN:

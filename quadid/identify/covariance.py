@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,6 +60,16 @@ class Uncertainty:
     def from_noise(self) -> FloatArray:
         """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
         return self.sigma if self.grown is None else self.sigma / self.grown
+
+    def differing(self, steps: Sequence[FloatArray]) -> Uncertainty:
+        """Intervals that hold other estimates too, which lie `steps` away, each of shape (P,); they count as spread."""
+        if not steps:
+            return self
+        farthest = np.max(np.abs(steps), axis=0)
+        grow = np.hypot(1.0, farthest / np.maximum(self.sigma, 1e-300))
+        grown = grow if self.grown is None else grow * self.grown
+        spread = farthest if self.spread is None else np.hypot(self.spread, farthest)
+        return replace(self, covariance=self.covariance * np.outer(grow, grow), grown=grown, spread=spread)
 
 
 def uncertainty(lin: Linearised, prior: Prior, information: FloatArray | None = None) -> Uncertainty:
@@ -141,11 +152,16 @@ def _status(
     if not free.is_log[j] or sigma[j] <= KNOWN:
         return Status.IDENTIFIED, None
     best, partner = math.inf, None
-    for k in np.flatnonzero(free.is_log):
-        if k != j and sigma[k] > 0.3 * sigma[j]:
-            spread = math.sqrt(max(unc.covariance[j, j] + unc.covariance[k, k] - 2.0 * unc.covariance[j, k], 0.0))
-            if spread < best:
-                best, partner = spread, free.entries[int(k)].name
+    for k in range(len(sigma)):
+        if k == j or (free.is_log[k] and sigma[k] <= 0.3 * sigma[j]):
+            continue
+        if free.is_log[k]:
+            left = unc.covariance[j, j] + unc.covariance[k, k] - 2.0 * unc.covariance[j, k]
+        else:  # an effect's number, were it known
+            left = unc.covariance[j, j] - unc.covariance[j, k] ** 2 / unc.covariance[k, k]
+        spread = math.sqrt(max(left, 0.0))
+        if spread < best:
+            best, partner = spread, free.entries[k].name
     if best <= min(RATIO_SIGMA, RATIO_GAIN * sigma[j]):
         return Status.RATIO_ONLY, partner
     return Status.IDENTIFIED, None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
+import numpy as np
 import pytest
 
 from quadid.diagnose.log_evidence import better, relevant
@@ -51,6 +52,15 @@ def test_a_true_cause_is_better_than_none_and_none_than_an_absent_one() -> None:
 def test_of_two_look_alikes_the_true_one_is_better() -> None:
     assert answer(named("command_delay"), named("motor_lag"))
     assert not answer(named("motor_lag"), named("command_delay"))
+
+
+def test_a_cause_is_not_replaced_because_scores_of_the_other_one_vary() -> None:
+    """What explains nothing has no claim on what another cause explains, however little its own scores count."""
+    lag, nothing = named("motor_lag"), named("rotor_spin_up")
+    loud = replace(nothing, tried=dict.fromkeys(nothing.tried, 0.1 * TESTS))
+    loud.__dict__["inflation"] = np.where(np.arange(len(loud.free.names)) < len(lag.free.names) - 1, 1.0, 1e9)
+    assert not better(loud, lag)
+    assert better(lag, loud)
 
 
 def test_what_gains_in_a_single_block_is_not_relevant() -> None:
