@@ -56,6 +56,13 @@ def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: Inde
     return np.asarray(cost + np.sum((grad + slope) * z, axis=1) - shared + spread)
 
 
+def deviance_without(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> FloatArray:
+    """Deviance of all blocks but one under parameters fitted to them, for each block in turn, shape (blocks,)."""
+    gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
+    z = steps_without(gram, grad, prior_precision) if grad.shape[1] else np.zeros_like(grad)
+    return np.asarray(cost.sum() - cost + np.sum((grad.sum(axis=0) - grad) * z, axis=1))
+
+
 def steps_without(gram: FloatArray, grad: FloatArray, prior_precision: FloatArray) -> FloatArray:
     """Scaled step to the optimum of all blocks but one, for each in turn, shape (blocks, P).
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import block_labels, held_out_deviance
+from quadid.diagnose.cross_validation import block_labels, deviance_without, held_out_deviance
 from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import EFFECTS, NEVER
 from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
@@ -28,7 +28,8 @@ class Model(Polished):
     Attributes:
         causes: candidates it contains.
         free: its free parameters; prior: weak prior on them.
-        held_out: deviance of each block under parameters fitted to the others.
+        held_out: deviance of each block in the density that the others predict.
+        rest: deviance of all blocks but one under parameters fitted to them, for each block.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
     """
 
@@ -36,6 +37,7 @@ class Model(Polished):
     free: Free
     prior: Prior
     held_out: FloatArray
+    rest: FloatArray
     tried: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -111,9 +113,10 @@ def fit_model(
 def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
     """Wraps the result of a polish with the default prior, with its held-out deviance."""
     prior = default_prior(shooting, free)
-    held_out = held_out_deviance(result.lin, prior.precision, block_labels(result.lin))
+    blocks = block_labels(result.lin)
+    held_out, rest = (of(result.lin, prior.precision, blocks) for of in (held_out_deviance, deviance_without))
     return Model(
-        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, held_out
+        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, held_out, rest
     )
 
 

@@ -13,11 +13,12 @@ from quadid.diagnose.extended_vehicle import extended_vehicle
 from quadid.diagnose.findings import describe
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names, without
-from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.plausibility import impossible_causes, late_unknown
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
+from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
 from quadid.identify.covariance import SPREAD_LIMIT, parameter_set
@@ -31,7 +32,7 @@ from quadid.identify.reliability import MISFIT, reliability
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
 from quadid.identify.shooting import Shooting
 from quadid.model.supply import with_reference_voltage
-from quadid.parameters import NOMINAL_NAMES, Parameter, Status
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, Parameter, Status
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -103,15 +104,17 @@ def diagnose(
     if search.model.causes and (outcome.contradicted or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
     alike = {c.family for c in search.model.causes if c.label in doubts}
-    believed = () if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
-    findings = describe(decisive, search, per_finding, believed)
+    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict, doubts)
+    parameters, moved = possible_moments(parameters)
+    late = late_unknown(search.model, parameters)
+    believed = [] if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
+    findings = describe(decisive, search, per_finding, [c for c in believed if c.label not in late])
     warnings = [
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
-    ]
-    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict, doubts)
-    parameters, moved = possible_moments(parameters)
-    warnings += [*reasons, *([] if moved is None else [moved])]
+        *(f"{label} is not named with confidence: {reason}" for label, reason in late.items()),
+        *reasons, *([] if moved is None else [moved]),
+    ]  # fmt: skip
     text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
     prediction = None
     if search.model.reduced_chi_square > POOR:
@@ -145,7 +148,7 @@ def _nominal_parameters(
 
     Where the model misses something, estimates must agree as those of an identification, and with those without each
     cause in `doubts` (labels): it stands for something else, which may do to them what it does.  Where the cause of the
-    error is unknown, so is what it does to them: none is identified.
+    error is unknown, so is what it does to them: none is identified; nor an inertia beside a doubtful moment.
     """
     uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
     reasons: tuple[str, ...] = ()
@@ -163,11 +166,13 @@ def _nominal_parameters(
             reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
     everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
-    if verdict is Verdict.UNKNOWN:
-        doubted = [p for p in nominal if p.status is Status.IDENTIFIED]
-        nominal = tuple(replace(p, status=Status.UNRELIABLE) if p in doubted else p for p in nominal)
-        told = f"{', '.join(p.name for p in doubted)}: not to be used while the cause of the error is unknown"
-        reasons = (*reasons, told) if doubted else reasons
+    told = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
+    if turning := [c.label for c in model.causes if c.label in doubts and EFFECTS[c.effect].turns]:
+        told |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
+    for names, why in told.items():
+        if doubted := [p.name for p in nominal if p.status is Status.IDENTIFIED and p.name in names]:
+            nominal = tuple(replace(p, status=Status.UNRELIABLE) if p.name in doubted else p for p in nominal)
+            reasons = (*reasons, f"{', '.join(doubted)}: not to be used while {why}")
     return nominal, reasons
 
 

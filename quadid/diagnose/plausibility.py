@@ -7,12 +7,14 @@ selection prefers causes whose numbers are possible; where none is, the finding 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from quadid.chi_square import Z95
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
 from quadid.model.layout import Entry
-from quadid.parameters import at_bound
+from quadid.parameters import Parameter, Status, at_bound
 
 LIKELY_SENSOR = 10.0
 """Typical sizes beyond which an error of a sensor is not believed."""
@@ -24,6 +26,18 @@ def impossible_causes(model: Model) -> dict[str, str]:
     """Causes of `model` with a number that no vehicle has, and which, by label."""
     told = {c.label: impossible(model, c) for c in model.causes}
     return {label: reason for label, reason in told.items() if reason}
+
+
+def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str]:
+    """Lags and delays of `model` that rotation shows beside moments of inertia which are not to be used, by label.
+
+    What is late in rotation is weaker too: a lag beside one inertia is a delay beside another.
+    """
+    turning = [p for p in parameters if p.name in ("J_xx", "J_yy")]
+    if not all(p.status is Status.UNRELIABLE for p in turning):
+        return {}
+    reason = f"{' and '.join(p.name for p in turning)}, beside which rotation shows it, are not to be used"
+    return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
 
 
 def impossible(model: Model, cause: Candidate) -> str:

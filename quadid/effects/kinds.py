@@ -105,6 +105,11 @@ class Effect:
         return any(p.name == "time" for p in self.parameters)
 
     @property
+    def turns(self) -> bool:
+        """Whether angular acceleration shows it, of which a moment of inertia is told."""
+        return any("':" in s or s.endswith("_dot") for s in self.shows)
+
+    @property
     def refinements(self) -> tuple[str, ...]:
         """Names in the parameter vector of its optional numbers."""
         return tuple(f"{self.name}.{p.entry or p.name}" for p in self.parameters if p.optional)

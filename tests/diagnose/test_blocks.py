@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 from quadid.diagnose.cross_validation import (
     BLOCK_SECONDS,
     block_labels,
+    deviance_without,
     held_out_deviance,
     paired_gain,
     steps_without,
@@ -70,6 +71,17 @@ def test_steps_without_blocks_are_those_of_refits() -> None:
     steps = steps_without(sum_by_block(lin.gram, labels), sum_by_block(lin.grad, labels), prior)
     for block, step in enumerate(steps):
         np.testing.assert_allclose(step, refitted(b[labels != block], r[labels != block], prior)[0], rtol=1e-9)
+
+
+def test_the_deviance_of_the_other_blocks_is_that_of_a_refit_to_them() -> None:
+    lin, b, r = linear(np.random.default_rng(8), 47)
+    labels = block_labels(lin)
+    prior = np.array([0.1, 1.0, 10.0, 0.5, 2.0])
+    expected = []
+    for block in range(labels.max() + 1):
+        z = refitted(b[labels != block], r[labels != block], prior)[0]
+        expected.append(np.sum((r[labels != block] + b[labels != block] @ z) ** 2) + np.sum(prior * z * z))
+    np.testing.assert_allclose(deviance_without(lin, prior, labels), expected, rtol=1e-10)
 
 
 def test_a_block_that_alone_determines_a_parameter_does_not_decide_against_it() -> None:

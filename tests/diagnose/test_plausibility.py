@@ -11,7 +11,7 @@ import pytest
 from quadid.diagnose.extended_vehicle import extended_vehicle
 from quadid.diagnose.model import Model, extend
 from quadid.diagnose.pipeline import _nominal_parameters
-from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.plausibility import impossible_causes, late_unknown
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
 from quadid.diagnose.result import Verdict
 from quadid.identify.answer import possible_moments
@@ -129,3 +129,31 @@ def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> Non
     assert written.parameters["J_zz"].initial == moved.value
     assert written.parameters["J_zz"].sigma is None
     assert moved.status is Status.UNRELIABLE
+
+
+def test_numbers_beside_a_cause_that_stands_for_something_else_are_not_to_be_used() -> None:
+    """Without the moment of the drag the inertias change, and nobody knows what is in its place; thrust stays."""
+    problem, model = dragged()
+
+    def told(*doubted: str) -> tuple[dict[str, Status], str]:
+        numbers, reasons = _nominal_parameters(
+            problem.shooting, problem.shooting, model, Verdict.PARTLY_EXPLAINED, doubted
+        )
+        return {p.name: p.status for p in numbers}, " ".join(reasons)
+
+    assert told()[0]["J_xx"] is told()[0]["b"] is Status.IDENTIFIED
+    status, reasons = told("rotor_drag_moment")
+    assert {status[name] for name in ("J_xx", "J_yy", "J_zz")} == {Status.UNRELIABLE}
+    assert status["b"] is Status.IDENTIFIED
+    assert "rotor_drag_moment" in reasons
+
+
+def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> None:
+    problem = fitted(window_with({"motor_lag": {"tau": 0.04}}), clean().shooting.noise)
+    model = extend(problem.shooting, problem.nominal, cause(problem, "motor_lag"), iterations=12)
+    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Verdict.EXPLAINED)
+    assert late_unknown(model, numbers) == {}
+    useless = [replace(p, status=Status.UNRELIABLE) for p in numbers]
+    assert list(late_unknown(model, useless)) == ["motor_lag"]
+    one = [replace(p, status=Status.UNRELIABLE) if p.name == "J_xx" else p for p in numbers]
+    assert late_unknown(model, one) == {}

@@ -69,7 +69,16 @@ def test_what_gains_in_a_single_block_is_not_relevant() -> None:
     held_out = named().held_out.copy()
     held_out[1:] = lag.held_out[1:]
     held_out[0] += 1e6
-    assert not relevant(replace(named(), held_out=held_out), lag)
+    assert not relevant(replace(named(), held_out=held_out, rest=lag.rest), lag)
+
+
+def test_what_only_one_block_determines_is_not_relevant_whatever_the_others_gain_by_it() -> None:
+    """A stretch that is kept apart bends the fit of the others no more; without it there is nothing to gain."""
+    lag, rest = named("motor_lag"), named().rest.copy()
+    best = int(np.argmax(named().held_out - lag.held_out))
+    rest[best] = lag.rest[best]
+    assert (named().held_out - lag.held_out).sum() > 0.5 * named().rows
+    assert not relevant(replace(named(), rest=rest), lag)
 
 
 def test_what_gains_nothing_is_dropped_and_nothing_else() -> None:
