@@ -2,7 +2,8 @@
 
 An autopilot writes its messages in order, so a message without a stamp was written between the stamped ones before and
 after it.  The link only shows how long after the earlier one it came; nothing older than that one counts, so neither a
-slow drift of the receiver's clock nor a simulation that runs faster than time moves it.
+slow drift of the receiver's clock nor a simulation that runs faster than time moves it.  Messages of one moment come
+one after the other, and a slow or shared link draws them out: each of them shows how late the link is by then.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ T = TypeVar("T")
 
 FARTHEST = 1.0
 """A message that comes more than this [s] after the last stamped one has no known time."""
+MOMENT = 1e-3
+"""Stamps no farther apart than this [s] are of one moment: some messages count milliseconds, others microseconds."""
 MOST_WAITING = 4096
 """Messages without a stamp that wait for one; more are given up."""
 
@@ -31,6 +34,7 @@ class BootClock(Generic[T]):
         self.newest: float | None = None
         """Time of the newest stamped message [s]."""
         self._newest_received = 0.0
+        """When the last message of that moment came [s]."""
         self._waiting: list[tuple[T, float]] = []
 
     def stamped(self, item: T, time: float, received: float) -> list[Placed[T]]:
@@ -42,6 +46,8 @@ class BootClock(Generic[T]):
             received: when it came [s], on any clock.
         """
         if self.newest is not None and self.newest - FARTHEST <= time <= self.newest:
+            if time >= self.newest - MOMENT:
+                self._newest_received = received
             return [Placed(item, time)]
         placed = self._release(time)
         self.newest, self._newest_received = time, received
@@ -50,7 +56,7 @@ class BootClock(Generic[T]):
     def unstamped(self, item: T, received: float) -> list[Placed[T]]:
         """Takes a message without a stamp; returns messages that have waited too long for a stamped one."""
         early = self._release(None) if len(self._waiting) >= MOST_WAITING else []
-        self._waiting.append((item, received))
+        self._waiting.append((item, max(0.0, received - self._newest_received)))
         return early
 
     def finish(self) -> list[Placed[T]]:
@@ -58,15 +64,14 @@ class BootClock(Generic[T]):
         return self._release(None)
 
     def _release(self, following: float | None) -> list[Placed[T]]:
-        placed = [Placed(item, self._between(received, following)) for item, received in self._waiting]
+        placed = [Placed(item, self._between(later, following)) for item, later in self._waiting]
         self._waiting.clear()
         return placed
 
-    def _between(self, received: float, following: float | None) -> float | None:
-        """Time of a message received at `received`, before a stamp of `following` [s]."""
+    def _between(self, later: float, following: float | None) -> float | None:
+        """Time of a message that came `later` than the stamped one before it, before a stamp of `following` [s]."""
         if self.newest is None:
             return None
-        later = max(0.0, received - self._newest_received)
         if following is not None and following >= self.newest:
             return min(self.newest + later, following)
         return self.newest + later if later <= FARTHEST else None

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.boot_clock import FARTHEST, MOST_WAITING, BootClock, Placed
+from quadid_replay.boot_clock import FARTHEST, MOMENT, MOST_WAITING, BootClock, Placed
 from quadid_replay.tlog_messages import SERVO_TURN, ZERO_IS_BOOT, boot_stamp
 
 
@@ -96,7 +96,9 @@ def at_once(stamps: Stamps) -> Placing | None:
     if not sure or (len(waiting) and np.bincount(before[waiting] + 1).max() > MOST_WAITING):
         return None
     last, following = np.append(news, -1)[before[waiting]], np.append(news, count)[before[waiting] + 1]
-    later = np.maximum(0.0, stamps.received[waiting] - stamps.received[last])
+    heard = np.flatnonzero(stamped & ~(time < newest - MOMENT))
+    heard = np.append(heard, -1)[np.searchsorted(heard, waiting) - 1]
+    later = np.maximum(0.0, stamps.received[waiting] - stamps.received[heard])
     guess = np.where(last < 0, np.nan, time[last] + later)
     ended = following == count
     limit = np.where(ended, np.inf, np.append(time, np.inf)[following])

@@ -71,3 +71,22 @@ def test_an_older_stamp_between_is_disorder() -> None:
     clock.unstamped("esc", 0.0)
     assert clock.stamped("servo", 1.0, 0.001) == [Placed("servo", 1.0)]
     assert clock.stamped("attitude", 1.02, 0.002)[0] == Placed("esc", 1.006)
+
+
+def test_a_link_that_draws_out_the_messages_of_one_moment_does_not_delay_the_last_of_them() -> None:
+    clock: BootClock[str] = BootClock()
+    clock.stamped("servo", 1.0002, 5.0)
+    clock.stamped("position", 1.0, 5.010)
+    clock.unstamped("esc", 5.0101)
+    clock.stamped("attitude", 1.0, 5.015)
+    item, time = clock.stamped("next", 1.02, 5.02)[0]
+    assert item == "esc"
+    assert time == pytest.approx(1.0003)
+
+
+def test_a_stamp_of_an_earlier_moment_tells_nothing_of_the_link() -> None:
+    clock: BootClock[str] = BootClock()
+    clock.stamped("servo", 1.0, 5.0)
+    clock.stamped("position of a while ago", 0.9, 5.008)
+    clock.unstamped("esc", 5.009)
+    assert clock.stamped("next", 1.02, 5.02)[0] == Placed("esc", pytest.approx(1.009))
