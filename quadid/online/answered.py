@@ -36,7 +36,7 @@ def answers(request: FitRequest, reply: FitReply) -> bool:
         channels.add(len(request.noise.white))
     no_numbers = reply.estimate is not None and not reply.estimate.finite
     return (
-        all(a is None or a.shape == (_SIX,) for a in (reply.excitation, reply.misfit))
+        all(a is None or a.shape == (_SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
         and all(n is None or _is_noise(n, channels) for n in (reply.noise, reply.measured))
         and (reply.theta is None or _is_vector(reply.theta, request.theta, no_numbers))
         and (reply.estimate is None or _is_estimate(reply.estimate, request))

@@ -42,7 +42,7 @@ class Estimator:
 
     Attributes:
         vehicle: of the vehicle file.
-        model: the same, its bare guesses moved by the first fit with effects; windows are fitted with it.
+        model: the same, with room for its bare guesses once effects are fitted along; windows are fitted with it.
         flexible: every effect that moves the vehicle is fitted along, as the vehicle file's model misses the flight.
         fusion: the fused windows.
         misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
@@ -247,6 +247,7 @@ class Estimator:
         return Case(
             parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval,
             self.fusion.counted - seen, unexplained, unproven, self._stated, self._walked(max(most, 3)),
+            {} if reply.between_rows is None else dict(zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)),
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:

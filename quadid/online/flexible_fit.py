@@ -46,6 +46,8 @@ STEP = 1e-5
 HALVED = 3.0
 """Lines between samples miss four times as much at twice the distance (Richardson): leaving every second one out moves
 the estimate by three times its error."""
+SPARSE_ITERATIONS = 4
+"""Linearisations of a fit with every second row: how far it moves is wanted, to its size."""
 MOVING = ("command", "rotor", "air", "body")
 """Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
 
@@ -138,28 +140,29 @@ def halved(window: Window, first: int) -> Window:
     return replace(window, rotor_speed=speed, rotor_slope=None)
 
 
-def with_sampling_error(
-    estimate: WindowEstimate, windows: Sequence[Window], vehicle: Vehicle, nominal: Prior, theta: FloatArray,
+def sampling_error(
+    estimate: WindowEstimate, windows: Sequence[Window], vehicle: Vehicle, free: Free, prior: Prior, best: Polished,
     noise: NoiseModel,
-) -> WindowEstimate:  # fmt: skip
-    """The estimate with its covariance widened by the error of sampling the rotors; its optimum stays.
+) -> FloatArray:  # fmt: skip
+    """Covariance of the nominal six, log scale, shape (6, 6), by what the rotors do between two rows.
 
     Args:
         estimate: of these windows.
         windows: data.
         vehicle: the vehicle.
-        nominal: prior of the nominal six.
-        theta: the optimum, full vector.
+        free: what was free, with `prior`.
+        prior: of everything that was free.
+        best: the optimum.
         noise: of the fit.
     """
-    missed, tried = np.zeros_like(estimate.information), 0
+    missed, tried, layout = np.zeros_like(estimate.information), 0, Layout(vehicle)
     for first in (0, 1):
-        sparse = [halved(w, first) for w in windows]
-        _, free, prior, result = flexible_fit(sparse, vehicle, nominal, theta, noise)
+        sparse = Shooting.cut([halved(w, first) for w in windows], vehicle, SEGMENT, noise, layout)
+        result = polish(sparse, best.theta, free, prior, best.states, iterations=SPARSE_ITERATIONS)
         if np.isfinite(result.cost):
-            z = reduced(estimate.start, estimate.stop, Layout(vehicle), vehicle, free, prior, result).z
+            z = reduced(estimate.start, estimate.stop, layout, vehicle, free, prior, result).z
             missed, tried = missed + np.outer(z - estimate.z, z - estimate.z) / HALVED**2, tried + 1
-    return widened(estimate, missed / max(tried, 1))
+    return np.asarray(missed / max(tried, 1))
 
 
 def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:

@@ -77,6 +77,7 @@ class Case:
         stated: value and standard deviation of the parameters that the vehicle file claims to know.
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
+        between_rows: relative standard deviation by what the rotors do between two rows, newest window, by name.
     """
 
     parameters: ParameterSet
@@ -94,6 +95,7 @@ class Case:
     unproven: str = ""
     stated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     walked: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    between_rows: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,12 @@ def _width(case: Case, settings: GateSettings) -> str | None:
         half = Z95 * p.sigma / max(abs(p.value), 1e-300)
         if p.name in MUST_BE_KNOWN:
             if p.status in UNKNOWN or half > settings.width:
-                return f"{p.name} is known to {half:.1%} only, wanted {settings.width:.1%}: keep flying"
+                missed = Z95 * case.between_rows.get(p.name, 0.0)
+                text = f"{p.name} is known to {half:.1%} only, wanted {settings.width:.1%}: keep flying"
+                unseen = (
+                    f"; what the rotors do between two rows moves it by {missed:.0%}: log faster, or fly more smoothly"
+                )
+                return text + unseen if missed > settings.width else text
         elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
             return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
     return None

@@ -1,23 +1,21 @@
-"""The vehicle whose guesses a first fit has moved."""
+"""The vehicle that windows are fitted with where every effect is fitted along: its bare guesses have room."""
 
 from __future__ import annotations
 
-from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+
+ROOM = 16.0
+"""A bare guess may be wrong by this factor each way; how sure it is stays as it was.
+
+What the nominal model made of a flight that it misses is no better guess: it may be wrong by as much.
+"""
 
 
-def moved(vehicle: Vehicle, theta: FloatArray) -> Vehicle:
-    """The vehicle with the nominal six of `theta` as first guesses.
-
-    Bounds that the vehicle file gives stay; a bare guess moves with its default bounds.
-    """
+def with_room(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with wide bounds about its bare guesses, as sure of these as before; bounds that it gives stay."""
     parameters = {}
-    for name, found in zip(NOMINAL_NAMES, theta[: len(NOMINAL_NAMES)].tolist(), strict=True):
-        given = vehicle.parameters[name]
-        if given.bounds is None:
-            parameters[name] = ParameterPrior(initial=found)
-        else:
-            parameters[name] = given.model_copy(update={"initial": min(max(found, given.bounds[0]), given.bounds[1])})
+    for name, given in vehicle.parameters.items():
+        bounds = given.bounds or (given.initial / ROOM, given.initial * ROOM)
+        sigma = given.sigma or (None if given.bounds else given.log_sigma * given.initial)
+        parameters[name] = given.model_copy(update={"bounds": bounds, "sigma": sigma})
     return vehicle.model_copy(update={"parameters": parameters})

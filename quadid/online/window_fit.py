@@ -20,10 +20,10 @@ from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.answered import answers
-from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced, with_sampling_error
+from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced, sampling_error, widened
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
-from quadid.online.model_vehicle import moved
+from quadid.online.model_vehicle import with_room
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -131,7 +131,8 @@ class FitReply(JobReply):
             1 where the model misses nothing; with `measured`, or where noise was found anew.
         lack: what effects of the catalogue would explain; with `misfit`, where they were not fitted along.
         vehicle: where every effect that moves the vehicle was fitted along, what it was fitted with: that of the
-            request, its bare guesses moved where effects joined.
+            request, with room for its bare guesses where effects joined.
+        between_rows: standard deviations, log scale, by what the rotors do between two rows, shape (6,); in `estimate`.
     """
 
     excitation: FloatArray | None = None
@@ -143,6 +144,7 @@ class FitReply(JobReply):
     misfit: FloatArray | None = None
     lack: LackOfFit | None = None
     vehicle: Vehicle | None = None
+    between_rows: FloatArray | None = None
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
@@ -189,7 +191,7 @@ def _fit(request: FitRequest) -> FitReply:
         return reply
     lack = _lack_of_fit(shooting, result)
     if lack.significant:
-        joined = replace(request, vehicle=moved(request.vehicle, result.theta))
+        joined = replace(request, vehicle=with_room(request.vehicle))
         return replace(_flexible(joined, result.theta, None), lack=lack)
     return replace(reply, misfit=_share_of(measured or noise, sensor), lack=lack)
 
@@ -205,11 +207,12 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     if not np.isfinite(result.cost):
         return request.failed("the simulation diverges at every point tried")
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
-    bounds = bounds_of(estimate.information)
-    estimate = with_sampling_error(estimate, request.windows, vehicle, nominal, result.theta, shooting.noise)
+    # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
+    bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
+    missed = sampling_error(estimate, request.windows, vehicle, free, prior, result, shooting.noise)
     reply = FitReply(
-        request.number, "", bounds, is_excited(bounds), estimate, result.theta, shooting.noise,
-        vehicle=vehicle,
+        request.number, "", bounds, is_excited(bounds), widened(estimate, missed), result.theta, shooting.noise,
+        vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),
     )  # fmt: skip
     if not request.measure:
         return reply

@@ -43,6 +43,16 @@ def good(**changes: Any) -> Case:
     return replace(case, **changes)
 
 
+def test_it_says_where_faster_logs_are_missing_and_no_longer_flight() -> None:
+    wide = good(parameters=parameter_set(TRUE, sigma=0.04), between_rows={"J_xx": 0.2})
+    assert "log faster" not in decide(wide, GateSettings()).reason, "b is asked for first, and the rows tell it"
+    narrow = {name: 0.04 if name == "J_xx" else 0.005 for name in TRUE}
+    some = parameter_set(TRUE)
+    some = ParameterSet(tuple(replace(p, sigma=abs(p.value) * narrow[p.name]) for p in some), some.covariance)
+    assert "log faster" in decide(good(parameters=some, between_rows={"J_xx": 0.2}), GateSettings()).reason
+    assert "log faster" not in decide(good(parameters=some, between_rows={"J_xx": 0.01}), GateSettings()).reason
+
+
 def scaled(**factors: float) -> dict[str, float]:
     return {name: value * factors.get(name, 1.0) for name, value in TRUE.items()}
 

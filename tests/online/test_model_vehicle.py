@@ -9,9 +9,10 @@ import pytest
 
 from quadid.model.layout import Layout
 from quadid.model.thrust import ThrustModel
-from quadid.online import Session, SessionSettings
-from quadid.online.model_vehicle import moved
+from quadid.online import FitReply, FitRequest, Session, SessionSettings
+from quadid.online.model_vehicle import with_room
 from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import ParameterPrior
 from tests.online.driving import drive, events, flight, published, samples
 from tests.online.test_gate import TRUE
 
@@ -41,10 +42,26 @@ def test_the_secant_of_a_thrust_curve_carries_the_weight() -> None:
     assert thrust.tangent(secant, weight) == pytest.approx(theta[0])
 
 
-def test_a_bare_guess_moves_with_its_bounds_and_given_bounds_stay() -> None:
-    theta = Layout(PELICAN).initial(PELICAN)
-    theta[:6] *= 1.5
-    model = moved(PELICAN, theta)
-    assert model.parameters["J_xx"].initial == pytest.approx(1.5 * PELICAN.parameters["J_xx"].initial)
-    assert model.parameters["J_xx"].limits[1] == pytest.approx(6.0 * PELICAN.parameters["J_xx"].initial)
-    assert model.parameters["b"].limits == PELICAN.parameters["b"].limits
+def test_a_bare_guess_has_room_and_given_bounds_stay() -> None:
+    bare = {name: p.model_copy(update={"bounds": None}) for name, p in PELICAN.parameters.items()}
+    model = with_room(PELICAN.model_copy(update={"parameters": {**bare, "b": PELICAN.parameters["b"]}}))
+    guess, given = model.parameters["J_xx"], model.parameters["b"]
+    assert guess.initial == bare["J_xx"].initial
+    assert guess.limits == pytest.approx((guess.initial / 16.0, guess.initial * 16.0))
+    assert guess.log_sigma == pytest.approx(bare["J_xx"].log_sigma), "it is no less sure of its guess"
+    assert given == PELICAN.parameters["b"]
+
+
+def test_a_guess_at_the_end_of_its_bounds_is_found_whatever_the_first_fit_made_of_it() -> None:
+    """The nominal model of a first window may miss an inertia by as much as its bounds allow."""
+    window = flight(24.0, 5, effects=LAGGING).window.slice(0, 500)
+    far = {"b": 2.0e-5, "d": 4.0e-7, "J_xx": 3.9 * TRUE["J_xx"], "J_yy": 3.9 * TRUE["J_yy"], "J_zz": 0.05, "J_r": 5e-5}
+    vehicle = PELICAN.model_copy(update={"parameters": {n: ParameterPrior(initial=v) for n, v in far.items()}})
+    start = Layout(vehicle).initial(vehicle)
+    start[2:4] *= 2.0
+    request = FitRequest(1, with_room(vehicle), (window,), 0.0, 10.0, start, None, False, 0, flexible=True)
+    reply = request.run()
+    assert isinstance(reply, FitReply)
+    assert reply.theta is not None
+    for place, name in ((2, "J_xx"), (3, "J_yy")):
+        assert reply.theta[place] == pytest.approx(TRUE[name], rel=0.1)
