@@ -35,7 +35,8 @@ SIGNIFICANT = 7.0
 LEAST = 0.03
 """Smallest step worth a word: share of thrust; roll and pitch moment over what losing half the thrust would give."""
 CHANNELS = ("thrust", "roll moment", "pitch moment")
-_Series = tuple[FloatArray, FloatArray, FloatArray]  # values, regressors, typical sizes of their coefficients
+_Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Values, regressors, typical sizes of their coefficients, how regressors may be off (`step_beside`)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,11 @@ class Change:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Means over one chunk: time [s], log thrust per squared speed, its regressors; by roll and pitch the rest."""
+    """Means over one chunk: time [s], log thrust per squared speed, its regressors; by roll and pitch the rest.
+
+    `astray`: change of the regressors of thrust by a standard deviation of each axis of velocity, shape (3, 4);
+    `sigma`: that deviation [m/s].
+    """
 
     t: float
     thrust: float
@@ -67,6 +72,8 @@ class _Chunk:
     gyroscopic: FloatArray
     rate: FloatArray
     across: FloatArray
+    astray: FloatArray
+    sigma: float
 
 
 class ChangeDetector:
@@ -118,10 +125,13 @@ class ChangeDetector:
         weight /= weight.sum()
         moment = weight @ np.where(good[:, None], square @ self._arms, 0.0)
         p, q, r = gyro[rate].T
-        state = self._state.thrust(speed[good], velocity[good], lift)
+        state, sigma = self._state.thrust(speed[good], velocity[good], lift), self._velocity.sigma
+        axes = sigma * np.eye(3)
+        astray = [self._state.thrust(speed[good], velocity[good] + axis, lift) - state for axis in axes]
         return _Chunk(
             float(rows.t.mean()), float(np.log(lift / total)), state, np.asarray(slope), np.asarray(moment),
             np.array([np.mean(q * r), np.mean(p * r)]), gyro[rate, :2].mean(axis=0), velocity[:, 1::-1].mean(axis=0),
+            np.array(astray), sigma,
         )  # fmt: skip
 
     def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> Change | None:
@@ -142,15 +152,15 @@ class ChangeDetector:
         first = max(len(t) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
         best: Change | None = None
         for split in range(first, len(t) - AFTER + 1):
-            for name, (y, x, typical) in zip(CHANNELS, seen, strict=False):
-                errors, size = step_beside(y, x, typical, split, LEAST)
+            for name, (y, x, typical, astray) in zip(CHANNELS, seen, strict=False):
+                errors, size = step_beside(y, x, typical, split, LEAST, astray)
                 if errors > SIGNIFICANT and (best is None or errors > best.errors):
                     best = Change(float(t[split]) - 0.5 * CHUNK, name, size, errors)
         return best
 
     def _thrust(self) -> _Series:
         y, x = np.array([c.thrust for c in self._chunks]), np.array([c.state for c in self._chunks])
-        return y, x, self._state.typical
+        return y, x, self._state.typical, np.array([c.astray for c in self._chunks])
 
     def _moment(self, axis: int, b: float, inertia: FloatArray, doubt: float) -> _Series:
         """Roll (0) or pitch (1) acceleration that the rotors do not explain, over half the hover moment of one side."""
@@ -161,4 +171,6 @@ class ChangeDetector:
         moment = b / j * np.array([c.moment[axis] for c in chunks])
         y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
         x = np.column_stack([moment, [c.rate[axis] for c in chunks], [c.across[axis] / j for c in chunks]])
-        return y / half, x / half, np.array([doubt, *self._state.typical_moment])
+        astray = np.zeros((len(chunks), 1, 3))
+        astray[:, 0, 2] = [c.sigma / j / half for c in chunks]
+        return y / half, x / half, np.array([doubt, *self._state.typical_moment]), astray

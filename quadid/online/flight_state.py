@@ -27,16 +27,22 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 SETTLES = 40.0
 """Velocity that nobody measures is integrated, and forgotten with this time constant [s]."""
+ASTRAY = 0.5
+"""Standard deviation, an axis, of a velocity that was integrated [m/s]."""
 ROUNDS = 4
 """Reweighted fits of a regression: outliers count less."""
 
 
 class Velocity:
-    """Velocity of a vehicle, as well as it is known: measured, or integrated from the specific force."""
+    """Velocity of a vehicle, as well as it is known: measured, or integrated from the specific force.
+
+    Attributes:
+        sigma: standard deviation of the newest rows, an axis [m/s].
+    """
 
     def __init__(self) -> None:
         """Stands still."""
-        self._at = np.zeros(3)
+        self._at, self.sigma = np.zeros(3), ASTRAY
 
     def body(self, rows: Rows) -> FloatArray:
         """Velocity in body axes [m/s] of the next rows, shape (n, 3); zero where no attitude says what is up."""
@@ -48,9 +54,9 @@ class Velocity:
         gain = np.nan_to_num(rotated(q, force) + [0.0, 0.0, GRAVITY]) * step
         gained = np.cumsum(gain, axis=0) - 0.5 * gain
         start = self._at * math.exp(-step * len(rows.t) / SETTLES)
-        measured = rows.columns.get("velocity")
+        measured, self.sigma = rows.columns.get("velocity"), ASTRAY
         if measured is not None and (here := np.isfinite(measured).all(axis=1)).any():
-            start = np.mean(measured[here] - gained[here], axis=0)
+            start, self.sigma = np.mean(measured[here] - gained[here], axis=0), 0.0
         self._at = start + gain.sum(axis=0)
         return np.nan_to_num(rotated(conjugate(q), start + gained))
 
@@ -94,7 +100,9 @@ class FlightState:
         )
 
 
-def step_beside(y: FloatArray, x: FloatArray, typical: FloatArray, split: int, least: float) -> tuple[float, float]:
+def step_beside(
+    y: FloatArray, x: FloatArray, typical: FloatArray, split: int, least: float, astray: FloatArray | None = None
+) -> tuple[float, float]:  # fmt: skip
     """Step of `y` at `split` beside what regressors explain: its size in standard errors, and the step.
 
     The coefficients are zero to within their typical sizes, or what the values before the step say; their uncertainty
@@ -107,6 +115,7 @@ def step_beside(y: FloatArray, x: FloatArray, typical: FloatArray, split: int, l
         split: index of the first value after the step.
         least: smallest step; a smaller one counts as none.  No value is trusted to better than a fifth of it, because
             what no regressor describes does not average out.
+        astray: ways in which the regressors may all be off together, each by one standard deviation, shape (n, m, k).
     """
     before, x = y[:split], x - x[:split].mean(axis=0)
     past, slope = x[:split], np.zeros(x.shape[1])
@@ -126,4 +135,6 @@ def step_beside(y: FloatArray, x: FloatArray, typical: FloatArray, split: int, l
     means = np.convolve(left[:split], np.full(count, 1.0 / count), "valid")
     scatter = max(1.4826 * median(np.abs(means)), spread / math.sqrt(count))
     variance = 1.25**2 * (scatter**2 + spread**2 / split) + far @ covariance @ far
+    if astray is not None:
+        variance += float(np.sum((astray[split:].mean(axis=0) @ slope) ** 2))
     return abs(size) / math.sqrt(variance), size

@@ -32,7 +32,9 @@ def rows_of(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
                 yield rows
 
 
-def steps(log: Path, vehicle: Vehicle, scale: float = 1.0, at: float = np.inf) -> list[tuple[float, str, float]]:
+def steps(
+    log: Path, vehicle: Vehicle, scale: float = 1.0, at: float = np.inf, velocity: bool = True
+) -> list[tuple[float, str, float]]:
     """What is seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
     store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
     supervisor, seen, first, tick = ChangeSupervisor(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
@@ -40,6 +42,8 @@ def steps(log: Path, vehicle: Vehicle, scale: float = 1.0, at: float = np.inf) -
         if rows.fresh:
             first, tick = float(rows.t[0]), np.floor(rows.t[0] + 1.0)
         rows.columns["rotor_speed"][rows.t - first > at] /= np.sqrt(scale)
+        if not velocity:
+            rows.columns.pop("velocity", None)
         store.add(rows)
         while rows.t[-1] >= tick:
             found = _last(supervisor.look(tick, 1.0, estimator))
@@ -72,6 +76,15 @@ FLIGHTS = [
 def test_take_off_climbs_manoeuvres_descents_and_landing_are_no_change(log: str, file: str, data_dir: Path) -> None:
     folder = data_dir / "ardupilot_sitl"
     assert steps(folder / log, Vehicle.from_yaml((folder / file).read_text())) == []
+
+
+def test_velocity_that_nobody_measures_may_be_off(data_dir: Path) -> None:
+    folder = data_dir / "ardupilot_sitl"
+    vehicle = Vehicle.from_yaml((folder / "sitl_x_pwm.yaml").read_text())
+    assert steps(folder / "x_zero_rpm.tlog", vehicle, velocity=False) == []
+    found = steps(folder / "x_zero_rpm.tlog", vehicle, 0.85, 120.0, velocity=False)
+    assert [channel for _, channel, _ in found] == ["thrust"]
+    assert 120.0 < found[0][0] < 123.5
 
 
 @pytest.mark.parametrize("scale", [1.0 / 1.15, 1.0 / 0.85, 0.9])
