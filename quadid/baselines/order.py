@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quadid.baselines.hankel import as_records
 from quadid.baselines.state_space import predict
-from quadid.baselines.subspace import Loop, fit_orders
+from quadid.baselines.subspace import fit_orders
 from quadid.errors import NotIdentifiableError
 from quadid.types import FloatArray
 
@@ -42,7 +42,6 @@ def choose_order(
     sigma: ArrayLike,
     past: int = 20,
     future: int = 15,
-    loop: Loop = "closed",
     feedthrough: bool | Sequence[bool] = True,
 ) -> OrderChoice:
     """Fits each order to the first 70 % of every record and scores it on segments of the rest.
@@ -59,7 +58,6 @@ def choose_order(
         sigma: standard deviations that weigh the outputs, shape (p,).
         past: block rows.
         future: block rows.
-        loop: closed or open.
         feedthrough: for all outputs or each.
 
     Raises:
@@ -70,7 +68,7 @@ def choose_order(
     early = [record[:cut] for record, cut in zip(u, cuts, strict=True)]
     models = fit_orders(
         method, early, [record[:cut] for record, cut in zip(y, cuts, strict=True)],
-        list(orders), past, future, loop, feedthrough,
+        list(orders), past, future, "closed", feedthrough,
     )  # fmt: skip
     held = [(a[cut:], b[cut:]) for a, b, cut in zip(u, y, cuts, strict=True) if len(a) - cut >= length]
     if not held:

@@ -1,7 +1,8 @@
 """One step of the rigid body with effects, for many parameter vectors at once.
 
 The equations are written once and compiled for groups of effects; what a group leaves out costs nothing.  Forces are
-those of `quadid.model.equations`, the integrator that of `quadid.model.kernel`.
+those of `quadid.model.equations`, the integrator that of `quadid.model.kernel`.  Right-hand side and step are kept
+whole: one reads like the free-body diagram, the other like the Runge-Kutta tableau, and all of it stays in registers.
 """
 
 from __future__ import annotations

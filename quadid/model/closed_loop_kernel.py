@@ -2,6 +2,7 @@
 
 Rotors, body and sensors are those of `quadid.model.rollout_kernel`; the control law is `quadid.attitude_controller`.
 Each lane flies its own trajectory, so rotors are stepped lane by lane from what each lane's stabiliser commanded.
+The flight is kept whole because it is the order of events within a step.
 """
 
 from __future__ import annotations

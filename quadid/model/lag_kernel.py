@@ -3,7 +3,8 @@
 omega' = (u - omega) / tau.  Over each half step the means of omega and omega^2 are exact for first-order lag and pure
 delay.  The input u, delayed by (j + f) dt, switches (held) or bends (linear) once within a step, f dt after its start;
 each half step is therefore two pieces, one of which may have no length.  A held input may run on at a slope within its
-samples, whose mean it is (`quadid.intersample`).
+samples, whose mean it is (`quadid.intersample`).  The ways through a step are closures of one function, kept whole,
+because they share the sums that they are compiled with.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Segment loop of the rollout: simulates every segment for one block of lanes; writes residuals or adds up their cost.
 
 Follows the motion through rotors, body, AHRS and IMU, and compares it with what was measured, one pass over time.
+The march is kept whole because it is the order of events within a step.
 """
 
 from __future__ import annotations
