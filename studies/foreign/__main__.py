@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import quadid
 from quadid.errors import QuadidError
@@ -19,6 +20,7 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 from quadid.workflow.loading import load_vehicle
 from studies.foreign.learning import FEATURES, network, ridge, runs_of, shares, velocity_against_position
+from studies.foreign.numbers import Number, of_cases, of_rotorpy
 from studies.foreign.page import AHEAD, Row, page, section
 from studies.foreign.sets import SETS, FlightSet
 
@@ -27,6 +29,8 @@ RATE = 100.0
 SOON = 0.1
 """Time [s] after which the rate of `crazyflie rpm` is wanted below 0.35 of no change."""
 NOTES = Path(__file__).with_name("notes.md")
+NUMBERS = "numbers"
+"""Key of the numbers of other data."""
 _KEPT = ("parameters", "verdict", "validation", "findings")
 
 
@@ -35,19 +39,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    parser.add_argument("--others", action="store_true", help="numbers of RotorPy's flights and independent cases too")
     parser.add_argument("names", nargs="*", help=", ".join(SETS))
     given = parser.parse_args()
     unknown = [n for n in given.names if n not in SETS]
     if unknown:
         sys.exit(f"no set called {unknown[0]}; there are {', '.join(SETS)}")
     kept = given.out / "foreign.json"
-    for name in given.names or SETS:
+    rows = json.loads(kept.read_text()) if kept.exists() else {}
+    if given.others:
+        rows[NUMBERS] = [dataclasses.asdict(n) for n in (*of_rotorpy(), *of_cases(given.data))]
+        _write(kept, rows)
+    for name in given.names or ([] if given.others else SETS):
         row = measured(SETS[name], given.data)
         print(section(name, SETS[name], row), flush=True)
-        rows = json.loads(kept.read_text()) if kept.exists() else {}
         rows[name] = dataclasses.asdict(row)
-        kept.write_text(json.dumps(rows, indent=1) + "\n")
-        (given.out / "foreign.md").write_text(page({n: Row(**rows[n]) for n in SETS if n in rows}, NOTES.read_text()))
+        _write(kept, rows)
+
+
+def _write(kept: Path, rows: dict[str, Any]) -> None:
+    """Keeps all results so far, and writes the page of them."""
+    kept.write_text(json.dumps(rows, indent=1) + "\n")
+    sets = {n: Row(**rows[n]) for n in SETS if n in rows}
+    text = page(sets, NOTES.read_text(), [Number(**n) for n in rows.get(NUMBERS, [])])
+    kept.with_suffix(".md").write_text(text)
 
 
 def measured(one: FlightSet, data: Path) -> Row:

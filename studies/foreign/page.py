@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from quadid.identify.open_loop import QUANTITIES
+from studies.foreign.numbers import Number, of_set, table
 from studies.foreign.sets import SETS, FlightSet
 
 AHEAD = 0.5
@@ -44,28 +45,33 @@ class Row:
     date: str = field(default_factory=lambda: datetime.date.today().isoformat())
 
 
-def page(rows: Mapping[str, Row], notes: str = "") -> str:
-    """Markdown of all sets measured so far, `notes` last; what else each gave stands in `foreign.json`."""
+def page(rows: Mapping[str, Row], notes: str = "", others: Sequence[Number] = ()) -> str:
+    """Markdown of all sets measured so far, `notes` last; what else each gave stands in `foreign.json`.
+
+    `others` are numbers with truth of data beside the sets.
+    """
     head = (
         f"# Vehicles of others\n\n`{COMMAND}`, {min(row.date for row in rows.values())}; parameters, intervals, sizes "
         "of causes and terms of every set are in `foreign.json`."
     )
-    return "\n\n".join(p.strip() for p in (head, _ahead(rows), _kept(rows), _answers(rows), notes) if p) + "\n"
+    return (
+        "\n\n".join(p.strip() for p in (head, _ahead(rows), _numbers(rows, others), _answers(rows), notes) if p) + "\n"
+    )
 
 
 def _answers(rows: Mapping[str, Row]) -> str:
     """Verdict, error and causes of every set."""
-    lines = ["| data | verdict | error on data not fitted [noise variances] | causes (not confident in brackets) |",
-             "|---|---|---|---|"]  # fmt: skip
+    lines = ["| data | measured | verdict | error on data not fitted [noise variances] | causes (not confident in "
+             "brackets) |", "|---|---|---|---|---|"]  # fmt: skip
     for name, row in rows.items():
         if row.diagnosed is None:
-            lines.append(f"| {name} | refused | | {row.failed.partition('; fix')[0]} |")
+            lines.append(f"| {name} | {row.date} | refused | | {row.failed.partition('; fix')[0]} |")
             continue
         error = row.diagnosed["validation"]
         found = [f["effect"] if f["confident"] else f"({f['effect']})" for f in row.diagnosed["findings"]]
         lines.append(
-            f"| {name} | {row.diagnosed['verdict']} | {error['mse_nominal']:.3g} → {error['mse_extended']:.3g} | "
-            f"{', '.join(found)} |"
+            f"| {name} | {row.date} | {row.diagnosed['verdict']} | {error['mse_nominal']:.3g} → "
+            f"{error['mse_extended']:.3g} | {', '.join(found)} |"
         )
     return "\n".join(lines)
 
@@ -95,28 +101,13 @@ def _share(value: float) -> str:
     return "–" if np.isnan(value) else f"{value:.2f}"
 
 
-def _kept(rows: Mapping[str, Row]) -> str:
-    """How many numbers called identified hold their known truth."""
-    total, outside = 0, []
-    for name, row in rows.items():
-        for by, answer in (("identify", row.identified), ("diagnose", row.diagnosed)):
-            named = [p for p in (answer or {}).get("parameters", []) if p["status"] == "identified"]
-            known = [p for p in named if p["name"] in SETS[name].truth]
-            total += len(known)
-            outside += [
-                f"{p['name']} of {name} by {by}" for p in known if not _holds(p["ci95"], SETS[name].truth[p["name"]])
-            ]
-    if not total:
-        return ""
-    which = f" Outside: {', '.join(outside)}." if outside else ""
-    return (
-        f"Of {total} numbers called identified whose truth is known {total - len(outside)} hold it inside 95 % "
-        f"({1 - len(outside) / total:.0%}; wanted 90 %).{which}"
-    )
-
-
-def _holds(interval: list[float], truth: tuple[float, float]) -> bool:
-    return interval[0] <= truth[1] and truth[0] <= interval[1]
+def _numbers(rows: Mapping[str, Row], others: Sequence[Number]) -> str:
+    """Every number whose truth is known, beside it."""
+    own = [
+        n for name, row in rows.items()
+        for n in of_set(name, SETS[name], {"identify": row.identified, "diagnose": row.diagnosed})
+    ]  # fmt: skip
+    return table([*own, *others])
 
 
 def section(name: str, one: FlightSet, row: Row) -> str:

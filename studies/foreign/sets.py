@@ -13,7 +13,9 @@ class FlightSet:
     Attributes:
         vehicle: vehicle file, in the data folder, or a path of its own.
         train, unseen: logs, in the data folder; spans as ``log@start:stop``.
-        truth: parameters known from elsewhere, each with the interval [low, high] in which the truth lies.
+        truth: parameters known from elsewhere, each with the interval [low, high] in which the truth lies, in the units
+            of the vehicle file: its mass, and rotor speeds as its command gives them.
+        beside_curve: truth of those that mean something else beside a thrust curve.
         source: where the truth comes from.
     """
 
@@ -22,6 +24,7 @@ class FlightSet:
     unseen: tuple[str, ...]
     truth: dict[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""
+    beside_curve: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def _near(value: float, share: float = 0.0) -> tuple[float, float]:
@@ -34,17 +37,41 @@ _X = {"J_xx": _near(0.02297), "J_yy": _near(0.02297), "J_zz": _near(0.04594)}
 _BRUSHED = {"b": _near(2.02e-8, 0.03), "J_xx": (1.5e-5, 2.3e-5), "J_yy": (1.5e-5, 2.3e-5)}
 _NANO = {"b": _near(3.72e-8, 0.03), "J_xx": (2.3e-5, 2.6e-5), "J_yy": (2.3e-5, 2.9e-5)}
 
+_IRIS_B, _IRIS_FULL, _IRIS_IDLE = 5.84e-6, 1.1, 100.0
+"""The simulator's rotors turn at pwm - 900 rad/s, those of the vehicle file at 1.1 (pwm - 1000): 1.1 times
+as fast less 110 rad/s.  Beside a curve with that dead speed b is 5.84e-6 / 1.21; without one the thrust in the flown
+range counts."""
+_IRIS_FLOWN = (1546.0, 1861.0)
+"""PWM of the rotors, 1st and 99th percentile of both halves."""
+_IRIS_MASS = 1.5 / 1.535
+"""Mass of the vehicle file over that of the simulator: thrust and inertias scale with the mass that is believed."""
+
+
+def _iris_secant(pwm: float) -> float:
+    return _IRIS_B * ((pwm - 1000.0 + _IRIS_IDLE) / (_IRIS_FULL * (pwm - 1000.0))) ** 2
+
+
+_IRIS = {
+    "b": (_IRIS_MASS * _iris_secant(_IRIS_FLOWN[1]), _iris_secant(_IRIS_FLOWN[0])),
+    **{n: (_IRIS_MASS * v, v) for n, v in (("J_xx", 0.029125), ("J_yy", 0.029125), ("J_zz", 0.055225))},
+}
+_IRIS_CURVE = {"b": (_IRIS_MASS * _IRIS_B / _IRIS_FULL**2, _IRIS_B / _IRIS_FULL**2)}
+
 SETS: dict[str, FlightSet] = {
     "iris": FlightSet(
-        "iris/vehicle.yaml", ("iris/sideways.csv",), ("iris/pitch_yaw.csv",),
-        {"b": _near(5.84e-6, 0.01), "J_xx": _near(0.029125), "J_yy": _near(0.029125), "J_zz": _near(0.055225)},
-        "the simulator's own file",
+        "iris/vehicle.yaml", ("iris/sideways.csv",), ("iris/pitch_yaw.csv",), _IRIS, "the simulator's own file",
+        _IRIS_CURVE,
+    ),
+    "iris pitch_yaw": FlightSet(
+        "iris/vehicle.yaml", ("iris/pitch_yaw.csv",), ("iris/sideways.csv",), _IRIS, "the simulator's own file",
+        _IRIS_CURVE,
     ),
     "ardupilot quad_sq": FlightSet(
         "ardupilot_sitl/quad_sq.yaml", ("ardupilot_sitl/quad_sq.bin",), (), _SQ, "ArduPilot's own physics",
     ),
     "ardupilot x": FlightSet(
         "ardupilot_sitl/sitl_x.yaml", ("ardupilot_sitl/x.bin",), (), _X, "ArduPilot's own physics",
+        {"b": (2.15e-5, 3.19e-5)},  # of its curve about vertex and tangent
     ),
     "brushed rpm": FlightSet(
         "brushed/vehicle.yaml", ("brushed/jana00.csv@:6", "brushed/jana02.csv@:5"),

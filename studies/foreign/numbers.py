@@ -1,0 +1,118 @@
+"""Numbers beside their truth: of the sets of `make foreign`, of RotorPy's flights and of the independent cases."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from quadid.diagnose import diagnose
+from quadid.parameters import Parameter, Status
+from quadid.vehicle import Vehicle
+from studies.cases import FOLDERS, windows
+from studies.foreign.sets import FlightSet
+from studies.rotorpy_flight import fly, hummingbird
+
+ROTORPY_SECONDS = 30.0
+ROTORPY_NAMES = {"b": "k_eta", "d": "k_m", "J_xx": "Ixx", "J_yy": "Iyy", "J_zz": "Izz"}
+
+
+@dataclass(frozen=True)
+class Number:
+    """One parameter beside what it is.
+
+    Attributes:
+        data: set, flight or case; by: command.
+        name: of the parameter; status: as the command gives it; value: its estimate.
+        interval: 95 %; truth: interval in which the truth lies.
+    """
+
+    data: str
+    by: str
+    name: str
+    status: str
+    value: float
+    interval: tuple[float, float]
+    truth: tuple[float, float]
+
+    @property
+    def inside(self) -> bool:
+        """Whether the interval holds the truth, or part of what is known of it."""
+        return self.interval[0] <= self.truth[1] and self.truth[0] <= self.interval[1]
+
+    @property
+    def identified(self) -> bool:
+        """Whether the number deserves its name, as the command says."""
+        return self.status == Status.IDENTIFIED.value
+
+
+def of_set(name: str, one: FlightSet, answers: Mapping[str, Mapping[str, Any] | None]) -> Iterator[Number]:
+    """Numbers of one set whose truth is known; `answers` by command, as JSON results."""
+    for by, answer in answers.items():
+        found = {f["effect"] for f in (answer or {}).get("findings", [])}
+        truth = one.truth | (one.beside_curve if "thrust_curve" in found else {})
+        for p in (answer or {}).get("parameters", []):
+            if p["name"] in truth:
+                low, high = p["ci95"]
+                yield Number(name, by, p["name"], p["status"], p["value"], (low, high), truth[p["name"]])
+
+
+def of_rotorpy() -> Iterator[Number]:
+    """RotorPy's Hummingbird with aerodynamics and 45 ms of lag, and without aerodynamics and 5 ms."""
+    for name, truth, options in (
+        ("RotorPy, aerodynamics, lag 45 ms", hummingbird(tau_m=0.045), {"seed": 1, "reach": 1.4}),
+        ("RotorPy, no aerodynamics, lag 5 ms", hummingbird(tau_m=0.005), {"seed": 2, "aero": False}),
+    ):
+        flight = fly(truth, ROTORPY_SECONDS, **options)  # type: ignore[arg-type]
+        found, _ = diagnose([flight.window], flight.vehicle)
+        yield from _beside(name, found.parameters, {ours: truth[theirs] for ours, theirs in ROTORPY_NAMES.items()})
+
+
+def of_cases(data: Path) -> Iterator[Number]:
+    """Nominal parameters of the first flights of the independent cases, the hidden effect not told."""
+    for folder in FOLDERS:
+        for answer in json.loads((data / folder / "answers.json").read_text(encoding="utf-8")):
+            place = data / folder / answer["case"]
+            vehicle = Vehicle.from_yaml((place / "vehicle.yaml").read_text(encoding="utf-8"))
+            found, _ = diagnose(windows(place / "train.csv", vehicle), vehicle)
+            yield from _beside(f"{folder} {answer['case']}", found.parameters, answer["nominal"])
+
+
+def _beside(data: str, parameters: Iterable[Parameter], truth: Mapping[str, float]) -> Iterator[Number]:
+    for p in parameters:
+        if p.name in truth:
+            both = (truth[p.name], truth[p.name])
+            yield Number(data, "diagnose", p.name, p.status.value, p.value, (p.ci95[0], p.ci95[1]), both)
+
+
+def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")) -> str:
+    """Markdown: the share of identified numbers that hold their truth, then each number.
+
+    Of data whose name begins with one of `short` only those that do not.
+    """
+    named = [n for n in numbers if n.identified]
+    if not named:
+        return ""
+    held = sum(n.inside for n in named)
+    lines = [
+        f"Of {len(named)} numbers called identified whose truth is known {held} hold it inside 95 % "
+        f"({held / len(named):.0%}; wanted 90 %).",
+        "",
+    ]
+    for group in short:
+        mine = [n for n in named if n.data.startswith(group)]
+        if mine:
+            lines += [f"{group}: {sum(n.inside for n in mine)} of {len(mine)} inside.", ""]
+    lines += ["| data | by | number | status | estimate [95 %] | truth | |", "|---|---|---|---|---|---|---|"]
+    for n in numbers:
+        outside = n.identified and not n.inside
+        if n.data.startswith(tuple(short)) and not outside:
+            continue
+        low, high = n.truth
+        truth = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        mark = "**outside**" if outside else "inside" if n.identified else ""
+        interval = f"{n.value:.3g} [{n.interval[0]:.3g}, {n.interval[1]:.3g}]"
+        lines.append(f"| {n.data} | {n.by} | {n.name} | {n.status} | {interval} | {truth} | {mark} |")
+    return "\n".join(lines)
