@@ -19,6 +19,9 @@ from quadid.parameters import NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_b
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
 
+MAY_VANISH = "J_r"
+"""Rotors too light to be seen turning the vehicle: this may rest on its lower bound, and is then unreliable."""
+
 
 class GateSettings(BaseModel):
     """How cautious the gate is.
@@ -163,6 +166,7 @@ def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
             return f"{p.name} = {p.value:g} {p.unit} is not positive"
         low, high = p.bounds
         guessed = p.status is Status.PRIOR_DOMINATED or p.prior_share > PRIOR_SHARE**2
+        guessed |= p.name == MAY_VANISH and p.value < high / 2.0
         if at_bound(p.value, low, high) and not guessed:
             return f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]"
     why = impossible_inertia([parameters[n].value for n in ("J_xx", "J_yy", "J_zz")], settings.inertia_slack)

@@ -43,6 +43,13 @@ def good(**changes: Any) -> Case:
     return replace(case, **changes)
 
 
+def test_rotors_too_light_to_be_seen_hold_nothing_back() -> None:
+    low, high = PELICAN.parameters["J_r"].limits
+    light, heavy = (parameter_set({**TRUE, "J_r": bound}, J_r=Status.UNRELIABLE) for bound in (low, high))
+    assert decide(good(parameters=light), GateSettings()).state is SetState.ACCEPTED
+    assert decide(good(parameters=heavy), GateSettings()).check == "physical_bounds"
+
+
 def test_it_says_where_faster_logs_are_missing_and_no_longer_flight() -> None:
     wide = good(parameters=parameter_set(TRUE, sigma=0.04), between_rows={"J_xx": 0.2})
     assert "log faster" not in decide(wide, GateSettings()).reason, "b is asked for first, and the rows tell it"
