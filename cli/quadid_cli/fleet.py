@@ -136,9 +136,10 @@ def show(result: dict[str, Any], quiet: bool) -> None:
                 p["parameter"], number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
             )  # fmt: skip
             rows.append((*head, *tail))
-    right = ("logs", "answers", "median", "spread")
-    heads = ("vehicle", "logs", "answers", "parameter", "median", "unit", "spread")
-    columns = tuple(Column(name, right=name in right) for name in heads)
+    columns = (
+        Column("vehicle"), Column("logs", right=True, rank=1), Column("answers", right=True, rank=2),
+        Column("parameter"), Column("median", right=True), Column("unit"), Column("spread", right=True),
+    )  # fmt: skip
     tables.print_tables(console, [TextTable("Vehicles", columns, tuple(rows))])
     tables.print_verdict(console, fleet_verdict(result, result["health"]))
     for reason in result["reasons"][:10]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from quadid_cli import compare, excite, history, replay
+from quadid_cli import compare, excite, fleet, history, replay
 
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.text_table import Column, TextTable
@@ -38,9 +38,17 @@ REPLAYED = {
     "vehicle": "pelican", "events": [], "refused": {"held_out_gain": 27}, "published": [SET], "status": {},
 }  # fmt: skip
 STORED = {"vehicle": "pelican", "sets": [SET], "vehicles": [], "candidates": [], "events": []}
+FLEET = {
+    "units": [{"unit": "airframe-07", "logs": 2, "done": 2, "parameters": [
+        {"parameter": n, "unit": u, "median": 1.23456e-5, "spread": 0.0123} for n, u in NOMINAL_UNITS.items()
+    ]}],
+    "counts": {"done": 2}, "rough": 0, "drifts": [], "outliers": [], "reasons": [], "health": [], "worked": 2,
+    "logs": 2, "seconds": 1.0, "files": [], "report": "fleet.html",
+}  # fmt: skip
 SHOWN: dict[str, tuple[Any, dict[str, Any], tuple[str, ...]]] = {
     "excite": (excite.show, EXCITED, ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
     "compare": (compare.show, COMPARED, ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3")),
+    "fleet": (fleet.show, FLEET, ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
     "replay": (replay.show, REPLAYED, ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
     "history": (history.show, STORED, ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor")),
 }
