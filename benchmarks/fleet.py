@@ -201,7 +201,7 @@ def _workers_processor_time() -> float:
     living = 0.0
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.NoSuchProcess):
-            living += sum(process.cpu_times()[:2])
+            living += sum(process.cpu_times()[:4])  # and of its children that have ended
     return ended.ru_utime + ended.ru_stime + living
 
 

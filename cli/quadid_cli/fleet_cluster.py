@@ -24,9 +24,14 @@ _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", 
 
 _QUIET = {
     "distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "500ms",
-    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.system-monitor.interval": "5s", "distributed.worker.memory.monitor-interval": "500ms",
 }  # fmt: skip
-"""Dask otherwise looks at every worker's stack each 10 ms and at itself each 20 ms, which nobody here sees."""
+"""Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
+_WARM = (
+    "distributed", "distributed.nanny", "quadid.workflow.fleet", "quadid.workflow.identify", "quadid.health.stored",
+    "quadid.health.trims", "quadid_replay.mcap_reader",
+)  # fmt: skip
+"""What a process has imported from which all workers are forked, those that replace dead ones too."""
 
 STARTING = 180.0
 """Time that a worker may take to start [s]: when none lives for so long, there is no cluster."""
@@ -55,11 +60,13 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
     """
     import dask
     from distributed import Client, LocalCluster
+    from distributed.utils import get_mp_context
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     settings = {
         "distributed.scheduler.allowed-failures": 0, "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
+        "distributed.worker.multiprocessing-method": "forkserver",
     }  # fmt: skip
     with dask.config.set({**settings, **_QUIET}):
         if address is not None:
@@ -73,6 +80,7 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
             with client:
                 yield client
             return
+        get_mp_context().set_forkserver_preload(list(_WARM))
         count, others = workers or os.cpu_count() or 1, set(multiprocessing.active_children())
         try:
             own = LocalCluster(

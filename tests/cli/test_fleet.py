@@ -139,6 +139,18 @@ def test_a_log_that_kills_its_worker_is_reported_and_the_rest_goes_on(folder: Pa
     assert "workers died with this log" in lost[0]["reason"]
 
 
+def test_workers_begin_warm_and_with_one_thread_each() -> None:
+    def state() -> tuple[bool, int, str | None]:
+        import os
+        import sys
+
+        warm = "quadid.workflow.identify" in sys.modules
+        return warm, sys.modules["numba"].config.NUMBA_NUM_THREADS, os.environ.get("OPENBLAS_NUM_THREADS")
+
+    with cluster(None, 1, "1GiB") as client:
+        assert list(client.run(state).values()) == [(True, 1, "1")]
+
+
 def test_workers_killed_at_random_lose_no_log_and_do_none_twice(tmp_path: Path) -> None:
     """Four workers die in the middle of it; a log is worked on again only where its worker died with it."""
     jobs = [Job(str(tmp_path), f"flight{i}", "alpha", "", 0, 0, "", 50.0, 1, False) for i in range(40)]
@@ -168,20 +180,33 @@ def test_workers_killed_at_random_lose_no_log_and_do_none_twice(tmp_path: Path) 
     assert len(finished) - len(jobs) <= 4
 
 
-@pytest.mark.parametrize(("setting", "memory"), [("no_such_module", "1GiB"), (None, "30MiB")], ids=["dead", "starved"])
+CANNOT_WORK: dict[str, dict[str, Any]] = {
+    "dead": {"distributed.worker.preload": ["no_such_module"]},
+    "starved": {"distributed.worker.memory.pause": 0.01, "distributed.worker.memory.terminate": False},
+}
+
+
+@pytest.mark.parametrize("how", CANNOT_WORK)
 def test_workers_that_cannot_start_are_an_error_and_leave_nothing_behind(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, setting: str | None, memory: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
 ) -> None:
-    """Their processes end at once, or are ended for their memory as soon as they live, again and again."""
+    """Their processes end at once, or take no work because their memory is full."""
     monkeypatch.setattr(fleet_cluster, "STARTING", 5.0)
     others = set(multiprocessing.active_children())
-    jobs = [Job(str(tmp_path), f"flight{i}", "alpha", "", 0, 0, "", 50.0, 1, False) for i in range(3)]
+    jobs = [Job(str(tmp_path), f"flight{i}", "alpha", "", 0, 0, "", 50.0, 1, False) for i in range(4)]
+
+    def slow(job: Job) -> Row:
+        import time
+
+        time.sleep(1.0)
+        return {"name": job.name, "status": "done"}
+
     with (
-        dask.config.set({"distributed.worker.preload": [setting] if setting else []}),
+        dask.config.set(CANNOT_WORK[how]),
         pytest.raises(ClusterError, match=r"no worker can start.*--memory"),
-        cluster(None, 1, memory) as client,
+        cluster(None, 1, "1GiB") as client,
     ):
-        list(results(client, jobs))
+        list(results(client, jobs, slow))
     assert set(multiprocessing.active_children()) <= others
 
 
