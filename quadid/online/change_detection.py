@@ -165,12 +165,14 @@ class ChangeDetector:
     def _moment(self, axis: int, b: float, inertia: FloatArray, doubt: float) -> _Series:
         """Roll (0) or pitch (1) acceleration that the rotors do not explain, over half the hover moment of one side."""
         j = inertia[axis]
-        couple = (inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j
+        # No body couples its axes more than this (triangle inequality), whatever is guessed of its yaw inertia.
+        couple = float(np.clip((inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j, -1.0, 1.0))
         half = float(np.abs(self._arms[:, axis]).sum()) * 0.25 * b * self._vehicle.hover_speed(b) ** 2 / j
         chunks = self._chunks
         moment = b / j * np.array([c.moment[axis] for c in chunks])
         y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
         x = np.column_stack([moment, [c.rate[axis] for c in chunks], [c.across[axis] / j for c in chunks]])
-        astray = np.zeros((len(chunks), 1, 3))
+        x = np.column_stack([x, [c.gyroscopic[axis] for c in chunks]])
+        astray = np.zeros((len(chunks), 1, 4))
         astray[:, 0, 2] = [c.sigma / j / half for c in chunks]
-        return y / half, x / half, np.array([doubt, *self._state.typical_moment]), astray
+        return y / half, x / half, np.array([doubt, *self._state.typical_moment, 1.0]), astray

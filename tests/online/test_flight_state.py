@@ -10,6 +10,7 @@ import pytest
 from quadid_node.playback import stream
 from quadid_replay import open_log
 
+from quadid.online.change_detection import CHUNK, ChangeDetector
 from quadid.online.change_supervisor import ChangeSupervisor, Seen
 from quadid.online.estimator import Estimator
 from quadid.online.flight_state import Velocity, step_beside
@@ -85,6 +86,25 @@ def test_velocity_that_nobody_measures_may_be_off(data_dir: Path) -> None:
     found = steps(folder / "x_zero_rpm.tlog", vehicle, 0.85, 120.0, velocity=False)
     assert [channel for _, channel, _ in found] == ["thrust"]
     assert 120.0 < found[0][0] < 123.5
+
+
+def test_a_wrong_guess_of_the_yaw_inertia_moves_no_moment(data_dir: Path) -> None:
+    """Coupling of roll and pitch with yaw: this flight has none, and the guess would make six times what a body may."""
+    folder = data_dir / "ardupilot_sitl"
+    vehicle = Vehicle.from_yaml((folder / "sitl_x.yaml").read_text())
+    detector, seen, first, tick = ChangeDetector(vehicle), [], 0.0, 0.0
+    store = GridBuffer(RATE, 60.0)
+    for rows in rows_of(folder / "x.bin", vehicle):
+        if rows.fresh:
+            first, tick = float(rows.t[0]), np.floor(rows.t[0] + 20.0)
+        store.add(rows)
+        while rows.t[-1] >= tick:
+            detector.add(store.span(tick - CHUNK - 1e-6, tick - 1e-6))
+            seen.append(detector.look(4.24e-5, np.array([0.023, 0.023, 0.18]), np.array([0.05, 0.05])))
+            tick += CHUNK
+        if rows.t[0] - first > 70.0:
+            break
+    assert [s for s in seen if s is not None and s.channel != "thrust"] == []
 
 
 @pytest.mark.parametrize("scale", [1.0 / 1.15, 1.0 / 0.85, 0.9])
