@@ -22,7 +22,6 @@ from benchmarks.speed.assembly import instructions
 from benchmarks.speed.cases import effect_table, kernel_table
 from benchmarks.speed.limits import limits
 from benchmarks.speed.page import page
-from benchmarks.speed.pieces import pieces
 from benchmarks.speed.plots import draw
 from benchmarks.speed.timing import machine
 
@@ -35,7 +34,6 @@ def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dic
         "kernel": lambda: kernel_table(rounds),
         "effects": lambda: effect_table(rounds),
         "instructions": instructions,
-        "pieces": lambda: pieces(rounds),
         "objectives": lambda: peers.objectives(rounds),
         "peers": lambda: peers.swarms(few),
         "optimum": lambda: peers.time_to_optimum(rounds),
