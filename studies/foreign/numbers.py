@@ -71,12 +71,13 @@ def of_rotorpy() -> Iterator[Number]:
 
 
 def of_cases(data: Path) -> Iterator[Number]:
-    """Nominal parameters of the first flights of the independent cases, the hidden effect not told."""
+    """Nominal parameters of the independent cases, diagnosed as `studies.cases` does, the hidden effect not told."""
     for folder in FOLDERS:
         for answer in json.loads((data / folder / "answers.json").read_text(encoding="utf-8")):
             place = data / folder / answer["case"]
             vehicle = Vehicle.from_yaml((place / "vehicle.yaml").read_text(encoding="utf-8"))
-            found, _ = diagnose(windows(place / "train.csv", vehicle), vehicle)
+            train, other = (windows(place / f"{flight}.csv", vehicle) for flight in ("train", "validate"))
+            found, _ = diagnose(train, vehicle, other)
             yield from _beside(f"{folder} {answer['case']}", found.parameters, answer["nominal"])
 
 
