@@ -113,7 +113,13 @@ def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")
             continue
         low, high = n.truth
         truth = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        mark = "**outside**" if outside else "inside" if n.identified else ""
+        mark = (
+            f"**outside**, {n.value / min(max(n.value, low), high) - 1.0:+.2%}"
+            if outside
+            else "inside"
+            if n.identified
+            else ""
+        )
         interval = f"{n.value:.3g} [{n.interval[0]:.3g}, {n.interval[1]:.3g}]"
         lines.append(f"| {n.data} | {n.by} | {n.name} | {n.status} | {interval} | {truth} | {mark} |")
     return "\n".join(lines)

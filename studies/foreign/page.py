@@ -51,7 +51,7 @@ def page(rows: Mapping[str, Row], notes: str = "", others: Sequence[Number] = ()
     `others` are numbers with truth of data beside the sets.
     """
     head = (
-        f"# Vehicles of others\n\n`{COMMAND}`, {min(row.date for row in rows.values())}; parameters, intervals, sizes "
+        f"# Vehicles of others\n\n`{COMMAND}`, {max(row.date for row in rows.values())}; parameters, intervals, sizes "
         "of causes and terms of every set are in `foreign.json`."
     )
     return (
