@@ -12,9 +12,8 @@ ten-second blocks of the training log are left out in turn.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +55,8 @@ class Validation:
     Attributes:
         nominal, extended: mean squared error without and with the findings.
         on: ``validation logs`` or ``held-out blocks``.
-        refitted: extended, with per-log values refitted on the first half and scored on the second; None without logs.
+        refitted: extended, with per-log values refitted on the first half of each log and scored on the second; only
+            where it is stated, and there are such.
         contradicted: the findings make the prediction of the validation logs worse, values of a flight refitted.
     """
 
@@ -113,8 +113,10 @@ def _boxed(shooting: Shooting, names: Sequence[str], theta: FloatArray) -> Free:
     return Free(tuple(out))
 
 
-_ALL = ""
-"""Key of the model from which no cause was taken out."""
+_NOMINAL, _FOUND, _AMID = "nominal", "found", "amid clutter"
+"""Keys of models beside those from which one cause was taken out: without causes, as found, with all amid clutter."""
+Errors = dict[str, tuple[FloatArray, float]]
+"""Deviance of each block of unseen data, and independent rows, by key of a model."""
 
 
 @dataclass(frozen=True)
@@ -145,12 +147,22 @@ def validate(
     Returns:
         The overall figures, and the worth of each cause: what is larger than on any vehicle first, then by gain.
     """
-    rest = _each_left_out(decisive, model, listed)
-    figures, worth = (
-        _on_logs(decisive, nominal, model, rest, logs) if logs else _on_blocks(nominal, model, rest, decisive.seconds)
+    models = {_NOMINAL: nominal, _FOUND: model, **_each_left_out(decisive, model, listed)}
+    left_out: Errors = {key: (m.held_out, m.rows) for key, m in models.items()}
+    unseen, on, contradicted = left_out, "held-out blocks", False
+    if logs:
+        scorer = decisive.on(logs)
+        unseen, on = {key: block_deviance(scorer, m) for key, m in models.items()}, "validation logs"
+        contradicted = _contradicted(scorer, nominal, model, logs, unseen)
+    before, after = (float(total.sum()) / rows for total, rows in (unseen[_NOMINAL], unseen[_FOUND]))
+    worth = []
+    for cause in model.causes:
+        # A value that belongs to the training flight is measured there, on blocks left out.
+        errors = left_out if EFFECTS[cause.effect].per_log else unseen
+        worth.append(_worth(cause, errors, ordinary(decisive, model, cause, listed), decisive.seconds))
+    return Validation(before, after, on, None, contradicted), tuple(
+        sorted(worth, key=lambda w: (w.ordinary, -w.deviance))
     )
-    told = [replace(w, ordinary=ordinary(decisive, model, w.cause, listed)) for w in worth]
-    return figures, tuple(sorted(told, key=lambda w: (w.ordinary, -w.deviance)))
 
 
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
@@ -158,62 +170,28 @@ def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]
         return {}
     model = replace(model, lin=replace(model.lin, states=settled_states(decisive, model)))
     return {
-        _ALL if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
+        _AMID if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
     }
 
 
-def _on_blocks(nominal: Model, model: Model, rest: dict[str, Model], seconds: float) -> tuple[Validation, list[Worth]]:
-    before, after = (float(m.held_out.sum()) / model.rows for m in (nominal, model))
-    return Validation(before, after, "held-out blocks"), [_block_worth(c, model, rest, seconds) for c in model.causes]
-
-
-def _block_worth(cause: Candidate, model: Model, rest: dict[str, Model], seconds: float) -> Worth:
-    mse = float(model.held_out.sum()) / model.rows
-    return _worth(cause, rest[cause.label].held_out, rest[_ALL].held_out, mse, model.rows, seconds)
-
-
-def _worth(cause: Candidate, before: FloatArray, after: FloatArray, mse: float, rows: float, seconds: float) -> Worth:
-    """Worth from the deviance of each block without and with the cause, both amid clutter.
-
-    Args:
-        cause: what was taken out.
-        before: deviance of each block without it.
-        after: deviance of each block with it.
-        mse: error of the extended model, which the gain is reported on top of.
-        rows: independent residuals.
-        seconds: length of a run.
-    """
-    gain = paired_gain(before, after)
+def _worth(cause: Candidate, errors: Errors, ordinary: bool, seconds: float) -> Worth:
+    """Worth from the deviance of each block without and with the cause, both amid clutter; runs of so many seconds."""
+    found, rows = errors[_FOUND]
+    gain, mse = paired_gain(errors[cause.label][0], errors[_AMID][0]), float(found.sum()) / rows
     low, high = gain.interval
     benefit = Benefit(mse + gain.total / rows, mse, (low / rows, high / rows), seconds)
-    return Worth(cause, benefit, gain.total)
+    return Worth(cause, benefit, gain.total, ordinary)
 
 
-def _on_logs(
-    decisive: Shooting, nominal: Model, model: Model, rest: dict[str, Model], logs: Sequence[Window]
-) -> tuple[Validation, list[Worth]]:
-    scorer = decisive.on(logs)
-    simple, rows = block_deviance(scorer, nominal)
-    extended, _ = block_deviance(scorer, model)
-    mse, untidy = float(extended.sum()) / rows, np.empty(0)
-    worth = []
-    for cause in model.causes:
-        if EFFECTS[cause.effect].per_log:
-            # The value belongs to the training flight; its worth is measured there, on blocks left out.
-            worth.append(_block_worth(cause, model, rest, decisive.seconds))
-        else:
-            if not len(untidy):
-                untidy, _ = block_deviance(scorer, rest[_ALL])
-            before, _ = block_deviance(scorer, rest[cause.label])
-            worth.append(_worth(cause, before, untidy, mse, rows, decisive.seconds))
-    figures = Validation(float(simple.sum()) / rows, mse, "validation logs")
-    halves = _second_halves(scorer, nominal, model, logs)
-    if halves is not None:
-        figures = replace(figures, refitted=float(halves.refitted.sum()) / halves.rows)
-    before, after = (simple, extended) if halves is None else (halves.nominal, halves.refitted)
-    events = any(c.timed is not None for c in model.causes)
-    contradicted = bool(model.causes) and not events and paired_gain(before, after).total < 0.0
-    return replace(figures, contradicted=contradicted), worth
+def _contradicted(scorer: Shooting, nominal: Model, model: Model, logs: Sequence[Window], unseen: Errors) -> bool:
+    """Whether the findings make the prediction of the validation logs worse, values of a flight refitted."""
+    if not model.causes or any(c.timed is not None for c in model.causes):
+        return False
+    gains = [
+        block_deviance(second, nominal)[0].sum() - block_deviance(second, model, theta)[0].sum()
+        for second, theta in second_halves(scorer, model, logs)
+    ]
+    return bool((sum(gains) if gains else unseen[_NOMINAL][0].sum() - unseen[_FOUND][0].sum()) < 0.0)
 
 
 def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = None) -> tuple[FloatArray, float]:
@@ -227,26 +205,17 @@ def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = No
     return total, lin.total_rows
 
 
-class _Halves(NamedTuple):
-    """Deviance of the blocks of the second halves, per-log values refitted on the first, and of the nominal model."""
+def second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> Iterator[tuple[Shooting, FloatArray]]:
+    """The second half of each log, and `model` with what belongs to a flight refitted on the first; none without such.
 
-    refitted: FloatArray
-    nominal: FloatArray
-    rows: float
-
-
-def _second_halves(scorer: Shooting, nominal: Model, model: Model, logs: Sequence[Window]) -> _Halves | None:
-    """Refits what belongs to a flight on the first half of each log and scores its second half; None without such."""
+    Args:
+        scorer: how halves are cut and weighted.
+        model: fitted to other flights.
+        logs: long enough ones count.
+    """
     per_log = model.per_log_names
-    refitted, simple, rows = [], [], 0.0
     for window in logs:
         middle = len(window) // 2
-        if not per_log or middle < 4 * scorer.length:
-            continue
-        first, second = scorer.on([window.slice(0, middle)]), scorer.on([window.slice(middle, len(window))])
-        theta = polish(first, model.theta, first.free(per_log), iterations=6).theta
-        total, count = block_deviance(second, model, theta)
-        refitted.append(total)
-        simple.append(block_deviance(second, nominal)[0])
-        rows += count
-    return _Halves(np.concatenate(refitted), np.concatenate(simple), rows) if refitted else None
+        if per_log and middle >= 4 * scorer.length:
+            first, second = (scorer.on([w]) for w in (window.slice(0, middle), window.slice(middle, len(window))))
+            yield second, polish(first, model.theta, first.free(per_log), iterations=6).theta

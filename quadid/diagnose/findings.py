@@ -1,4 +1,4 @@
-"""From the selected model to findings: numbers with intervals, losers, a sentence."""
+"""From the selected model to findings, numbers with intervals, losers, a sentence, and to the extended vehicle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from quadid.diagnose.result import Alternative, Finding, FoundParameter
 from quadid.diagnose.selection import Search
 from quadid.effects import EFFECTS
 from quadid.identify.shooting import Shooting
-from quadid.model.layout import Entry
+from quadid.model.layout import Layout
+from quadid.parameters import Parameter, Status
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
 
 STEP_SIGMA = 3e-4
 """Standard deviation [s] added to lags and delays: commands and samples of a loop at 1 kHz keep whole steps, and stamps
@@ -54,43 +57,24 @@ def _p_value(search: Search, cause: Candidate) -> float:
 
 
 def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]) -> tuple[FoundParameter, ...]:
-    spec = EFFECTS[cause.effect]
-    if cause.effect == "weak_rotor":
-        entry = shooting.layout.entry(cause.names[0])
-        value, half = float(model.theta[entry.index]), Z95 * sigma[entry.name]
-        rotor = float(entry.name.rsplit("_", 1)[1])
-        return (
-            FoundParameter("rotor", "", rotor, (rotor, rotor)),
-            FoundParameter("loss", "", value, (value - half, value + half)),
-            *_drag_loss(shooting, model, entry, sigma),
-        )
-    if cause.effect == "imu_lag":
-        entry = shooting.layout.entry(cause.names[0])
-        value, half = float(model.theta[entry.index]), Z95 * sigma[entry.name]
-        low = 1.0 / (value + half)
-        high = 1.0 / (value - half) if value > half else math.inf
-        return (FoundParameter("cutoff", "Hz", 1.0 / max(value, 1e-9), (low, high)),)
-    out: list[FoundParameter] = []
-    for p in spec.parameters:
-        entry = shooting.layout.entry(f"{cause.effect}.{p.entry or p.name}")
-        if p.optional and entry.name not in sigma:
+    effect, out, which = cause.effect, [], ""
+    if effect == "weak_rotor":
+        rotor = float(cause.names[0].rsplit("_", 1)[1])
+        out, which = [FoundParameter("rotor", "", rotor, (rotor, rotor))], f"_{rotor:.0f}"
+    for p in EFFECTS[effect].parameters:
+        name = f"{effect}.{p.entry or p.name}{which}"
+        if p.name == "rotor" or (p.optional and name not in sigma):
             continue
-        base = next((f for f in out if f.name == p.beside), None)
-        value = float(model.theta[entry.index]) + (base.value if base else 0.0)
-        spread = math.hypot(sigma.get(entry.name, 0.0), sigma[f"{cause.effect}.{p.beside}"] if base else 0.0)
-        half = Z95 * _sigma(p.name, spread)
-        out.append(FoundParameter(p.name, p.unit, value, (value - half, value + half)))
+        base = next((f.value for f in out if f.name == p.beside), None)
+        value = float(model.theta[shooting.layout.entry(name).index]) + (base or 0.0)
+        half = Z95 * _sigma(
+            p.name, math.hypot(sigma.get(name, 0.0), 0.0 if base is None else sigma[f"{effect}.{p.beside}{which}"])
+        )
+        low, high = value - half, value + half
+        if p.name == "cutoff":  # the vector holds its period
+            value, low, high = 1.0 / max(value, 1e-9), 1.0 / high, 1.0 / low if low > 0.0 else math.inf
+        out.append(FoundParameter(p.name, p.unit, value, (low, high)))
     return tuple(out)
-
-
-def _drag_loss(shooting: Shooting, model: Model, loss: Entry, sigma: Mapping[str, float]) -> tuple[FoundParameter, ...]:
-    """What a weak rotor's drag torque lost by itself, where the data asked for it."""
-    extra = shooting.layout.entry(loss.name.replace("loss", "extra"))
-    if extra.name not in sigma:
-        return ()
-    value = float(model.theta[loss.index] + model.theta[extra.index])
-    half = Z95 * math.hypot(sigma[loss.name], sigma[extra.name])
-    return (FoundParameter("drag_loss", "", value, (value - half, value + half)),)
 
 
 def _sigma(name: str, from_data: float) -> float:
@@ -131,3 +115,23 @@ def _sentence(effect: str, values: Mapping[str, float], benefit: Benefit) -> str
         f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "
         f"{benefit.mse_before:.3g} to {benefit.mse_after:.3g} times the noise."
     )
+
+
+def extended_vehicle(vehicle: Vehicle, layout: Layout, model: Model, parameters: Sequence[Parameter]) -> str:
+    """Returns the YAML of `vehicle` with `parameters`, their standard deviations, and the effects of `model`.
+
+    A number that is not to be used is a guess, without standard deviation.
+    """
+    priors = {}
+    for p in parameters:
+        low, high = vehicle.parameters[p.name].limits
+        priors[p.name] = ParameterPrior(
+            initial=p.value, bounds=(min(low, p.value), max(high, p.value)),
+            sigma=None if p.status is Status.UNRELIABLE else p.sigma,
+        )  # fmt: skip
+    effects = {k: dict(v) for k, v in vehicle.effects.items()}
+    for cause in model.causes:
+        effects[cause.effect] = {
+            k: v for k, v in layout.read_effect(model.theta, cause.effect).items() if math.isfinite(v)
+        }
+    return vehicle.model_copy(update={"parameters": priors, "effects": effects}).to_yaml()

@@ -9,8 +9,7 @@ import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import validate
-from quadid.diagnose.extended_vehicle import extended_vehicle
-from quadid.diagnose.findings import describe
+from quadid.diagnose.findings import describe, extended_vehicle
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown

@@ -12,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from quadid.diagnose.attribution import Validation
+from quadid.diagnose.attribution import Validation, second_halves
 from quadid.diagnose.cross_validation import block_labels, steps_without, sum_by_block
 from quadid.diagnose.model import Model, free_names
 from quadid.identify.fit import Fit
-from quadid.identify.gauss_newton import polish
 from quadid.identify.priors import default_prior, posterior_covariance
 from quadid.identify.score import SCORE_SECONDS, Tally, covering, mse_score, settle_states, tallied
 from quadid.identify.shooting import Shooting
@@ -80,14 +79,8 @@ def _scorer(fit: Fit, windows: Sequence[Window]) -> Shooting:
 
 def _refitted(fit: Fit, model: Model, logs: Sequence[Window]) -> float | None:
     """Error of the second half of each log, what belongs to a flight refitted on its first; None without such."""
-    per_log = model.per_log_names
     total: Tally | None = None
-    for window in logs if per_log else ():
-        middle = len(window) // 2
-        halves = [_scorer(fit, [w]) for w in (window.slice(0, middle), window.slice(middle, len(window)))]
-        if not all(half.count for half in halves):
-            continue
-        theta = polish(halves[0], model.theta, halves[0].free(per_log), iterations=6).theta
-        part = tallied(halves[1], theta)
+    for second, theta in second_halves(_scorer(fit, logs), model, logs):
+        part = tallied(second, theta)
         total = part if total is None else total + part
     return None if total is None else total.mse

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnose.extended_vehicle import extended_vehicle
+from quadid.diagnose.findings import extended_vehicle
 from quadid.diagnose.model import Model, extend
 from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes, late_unknown
