@@ -15,7 +15,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from studies.ablation.answers import Answer, run
-from studies.ablation.corpus import FLIGHTS, flights
+from studies.ablation.corpus import FLIGHTS, SCALED, flights
 from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
@@ -40,6 +40,8 @@ def row(subject: str, chosen: Sequence[Variant], answers: Mapping[str, Sequence[
 
 
 def _cell(base: Sequence[Answer], answers: Sequence[Answer]) -> str:
+    known = {b.flight: b for b in base}
+    base = [known[a.flight] for a in answers]
     pairs = [(b, a) for b, a in zip(base, answers, strict=True) if b.difference(a)]
     better = sum(a.right is True and b.right is False for b, a in pairs)
     worse = sum(a.right is False and b.right is True for b, a in pairs)
@@ -72,8 +74,11 @@ def main() -> None:
     todo = flights(options.flights.split(","))
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
-    by_flight = [run(flight, chosen, options.cache, options.records, told) for flight in todo]
-    answers = {v.name: [each[i] for each in by_flight] for i, v in enumerate(chosen)}
+    answers: dict[str, list[Answer]] = {v.name: [] for v in chosen}
+    for flight in todo:
+        here = [v for v in chosen if not v.scaled or flight.name in SCALED]
+        for answer in run(flight, here, options.cache, options.records, told):
+            answers[answer.variant].append(answer)
     rows = [row(s, chosen, answers) for s in dict.fromkeys(v.subject for v in chosen) if s != "base"]
     print("\n".join(rows))
     if options.out is not None:

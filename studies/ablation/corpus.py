@@ -16,12 +16,16 @@ from quadid.workflow.loading import load_vehicle
 from studies.campaign import Case, cases, flown
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
-FLIGHTS = (
+SCALED = (
     "single 7000", "single 7006", "single 7008", "single 7009", "null 7000", "pair 7001", "look_alike 7000",
-    "look_alike 7003", "outside 7000", "outside 7003", "cases case_012", "cases_hub case_002", "cases_hub case_006",
-    "clutter 7000", "iris",
+    "look_alike 7003", "outside 7000",
 )  # fmt: skip
-"""What a run takes where nothing else is asked for: a few of each kind that compute fast."""
+"""Flights on which numbers are halved and doubled too: one of each kind, which compute fast."""
+FLIGHTS = (
+    *SCALED, "outside 7003", "single 1083", "single 8005", "look_alike 15", "outside 1029", "clutter 2005",
+    "cases case_012", "cases_hub case_002", "cases_hub case_006", "iris",
+)  # fmt: skip
+"""What a run takes where nothing else is asked for: besides those, flights that rules were once made for."""
 Given = tuple[list[Window], list[Window], Vehicle]
 """Windows to diagnose, windows to measure the gain on, and the vehicle."""
 

@@ -29,13 +29,14 @@ class Variant:
     """One change of the method.
 
     Attributes:
-        name: for the page; subject: the rule or number that it changes.
+        name: for the page; subject: the rule or number that it changes; scaled: a number is halved or doubled.
         values: what replaces what, by name of an attribute of a module, or of a class there (`Class.name`).
     """
 
     name: str
     subject: str
     values: dict[str, Any]
+    scaled: bool = False
 
     @contextmanager
     def in_force(self) -> Iterator[None]:
@@ -72,9 +73,8 @@ def variants() -> list[Variant]:
     """The method as it is (`base`), without each rule, and without, with half and with twice each number."""
     out = [Variant("base", "base", {}), *(Variant(f"without {name}", name, values) for name, values in RULES.items())]
     for name, value in numbers().items():
-        changed = {f"× {factor:g}": _times(value, factor) for factor in (0.5, 2.0)}
-        changed |= {"out": OUT[name]} if name in OUT else {}
-        out += [Variant(f"{name} {how}", name, {name: other}) for how, other in changed.items()]
+        out += [Variant(f"{name} out", name, {name: OUT[name]})] if name in OUT else []
+        out += [Variant(f"{name} × {f:g}", name, {name: _times(value, f)}, scaled=True) for f in (0.5, 2.0)]
     return out
 
 
