@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import validate
+from quadid.diagnose.cross_validation import FEWEST_BLOCKS
 from quadid.diagnose.findings import describe, extended_vehicle
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names, without
@@ -41,7 +42,6 @@ Progress = Callable[[str, float], None]
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (`climb.USUAL_SECONDS` says when the longest may), longest first; below them
 only the short ones of the first fit."""
-FEWEST_SEGMENTS = 5
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8
@@ -211,7 +211,7 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     flexible = flexible_fit(windows, short, *begun)
     short = short.with_noise(flexible.noise)
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
-    schedule = [*(s for s in schedule if s.count >= FEWEST_SEGMENTS), short]
+    schedule = [*(s for s in schedule if s.count >= FEWEST_BLOCKS), short]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
     return _Begun(short, schedule, first.theta, flexible.theta, listed)

@@ -25,9 +25,7 @@ from quadid.identify.shooting import Shooting
 from quadid.types import FloatArray, IndexArray
 
 ERRORS = 2.5
-"""Standard errors of a gain on unseen blocks above which a site counts as structured …"""
-LEAST_GAIN = 50.0
-"""… and at least this much deviance."""
+"""Standard errors of a gain on unseen blocks above which a site counts as structured."""
 _RIDGE = 1e-6
 """Prior precision of a probe, relative to its information: keeps signals finite that double one another."""
 LAGS = (0.04, 0.1)
@@ -71,7 +69,7 @@ class Follows:
     @property
     def significant(self) -> bool:
         """Whether the gain stands above its own error."""
-        return self.gain.total > max(ERRORS * self.gain.error, LEAST_GAIN)
+        return self.gain.total > ERRORS * self.gain.error
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,8 @@ ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
 CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
 """How the name of a signal begins that an offset may follow: warming up, vibration, acceleration."""
-CHANGE_ALARM = 30.0
-"""Chi-square of one signal alone that no luck brings among a few hundred …"""
 CHANGE_SHARE = 0.008
-"""… and the share of the finding's own chi-square that it must reach: an untidy vehicle has a little of everything."""
+"""Share of an offset's own chi-square beyond which it is no offset: an untidy vehicle has a little of everything."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
     if not kind:
         return ""
     group = {s.name: s.group for s in SITES}
-    least = max(CHANGE_ALARM, CHANGE_SHARE * model.wald(cause))
+    least = max(ALARM**2, CHANGE_SHARE * model.wald(cause))
     here = [a for a in left.alone if a.site.startswith(kind) and a.signal.startswith(CHANGES)]
     here = [a for a in here if a.chi_square > least and a.chi_square >= _elsewhere(left, a, group)]
     if not here:
