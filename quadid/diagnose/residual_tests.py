@@ -19,14 +19,11 @@ from quadid.diagnose.model import Model
 from quadid.diagnose.residual_regressors import SITES, Alone, Follows, follows
 from quadid.effects import EFFECTS
 from quadid.identify.noise_estimation import SPECTRUM_SECONDS
-from quadid.identify.noise_spectrum import LOWEST, mode_power
-from quadid.identify.noise_spectrum import SMOOTH as SPECTRUM_SMOOTH
+from quadid.identify.noise_spectrum import SMOOTH, mode_power
 from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES
 from quadid.types import BoolArray, FloatArray
 
-SMOOTH = 3
-"""Neighbouring modes averaged before they are judged."""
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
 CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
@@ -114,11 +111,9 @@ def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: 
     spacing = 0.5 * rate / len(found)
     frequency = spacing * np.arange(len(found))
     usable = null > 0.3  # modes the initial state takes away say nothing
-    # Where the noise spectrum came from the data, a line of vibration narrower than it resolves is noise.
-    resolved = SPECTRUM_SMOOTH / (2.0 * SPECTRUM_SECONDS)
-    wide = max(SMOOTH, 2 * round(0.5 * resolved / spacing) + 1)
-    own = [_band(found, null, usable, segments, width) for width in (SMOOTH, wide)]
-    ratio, z = (np.where(frequency < LOWEST, slow, fast) for slow, fast in zip(*own, strict=True))
+    # The noise spectrum came from the data: a line of vibration narrower than it resolves is noise.
+    resolved = SMOOTH / (2.0 * SPECTRUM_SECONDS)
+    ratio, z = _band(found, null, usable, segments, 2 * round(0.5 * resolved / spacing) + 1)
     k = int(np.argmax(z))
     excess = np.where(usable & (z > 2.0), null * (ratio - 1.0), 0.0)
     deviance = float(segments * max(np.sum(excess), 0.0))
