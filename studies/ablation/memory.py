@@ -24,6 +24,10 @@ NUMBERS = ("quadid.diagnose.residual_regressors", "quadid.diagnose.cross_validat
 """… whose answer depends on numbers of these modules, and on nothing else that a variant changes."""
 
 
+MOST = 600
+"""Answers kept; the oldest go first."""
+
+
 class Memory:
     """Answers of functions to arguments of equal content, and how many linearisations a diagnosis asked for.
 
@@ -62,6 +66,8 @@ class Memory:
                     self._known[key] = function(*args, **kwargs)
                 finally:
                     self._inside = False
+                if len(self._known) > MOST:
+                    self._known.pop(next(iter(self._known)))
             found = self._known[key]
             self.asked += getattr(found, "iterations", 1)
             return found
