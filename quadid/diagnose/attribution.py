@@ -19,7 +19,7 @@ import numpy as np
 
 from quadid.diagnose.cross_validation import block_labels, paired_gain
 from quadid.diagnose.hypotheses import Candidate, all_names
-from quadid.diagnose.model import Model, as_model, free_names, settled_states, taken_out
+from quadid.diagnose.model import Model, as_model, free_names, taken_out
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import polish
 from quadid.identify.parameterization import Free
@@ -168,7 +168,6 @@ def validate(
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
     if not model.causes:
         return {}
-    model = replace(model, lin=replace(model.lin, states=settled_states(decisive, model)))
     return {
         _AMID if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
     }

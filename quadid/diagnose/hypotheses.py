@@ -21,7 +21,6 @@ class Candidate:
         requires: effect, or label of a cause, that must be in the model first.
         timed: index of its time entry, when it begins at an unknown moment.
         label: tells candidates of one effect apart.
-        split: for causes that show only together (drag in wind): what it stands for once accepted.
         refines: it frees optional numbers of an effect that is in the model, and shares its finding.
     """
 
@@ -31,7 +30,6 @@ class Candidate:
     requires: str | None = None
     timed: int | None = None
     label: str = field(default="")
-    split: tuple[Candidate, ...] = ()
     refines: bool = False
 
     @property
@@ -76,9 +74,6 @@ def candidates(
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
         out.append(Candidate(effect, spec.entries, spec.starts, spec.requires, timed))
         out += _refinements(spec)
-    out += [_pair(out, effect, f"{effect} central", 1.0, "at the CG") for effect in ("rotor_drag", "axial_inflow")]
-    if has_velocity:
-        out.append(_pair(out, "rotor_drag", "wind", 0.0, "in wind"))
     return out
 
 
@@ -90,16 +85,6 @@ def _refinements(spec: Effect) -> list[Candidate]:
         for names in together
         if names
     ]
-
-
-def _pair(listed: list[Candidate], label: str, beside: str, start: float, name: str) -> Candidate:
-    """Two causes at once where the first explains nothing alone.
-
-    Drag in air that moves faster than the vehicle; air at the rotors that damps no rotation, since it acts at the CG.
-    """
-    one, other = (next(c for c in listed if c.label == wanted) for wanted in (label, beside))
-    begin = (*one.starts[0], *[start] * len(other.names))
-    return Candidate(one.effect, (*one.names, *other.names), (begin,), label=f"{label} {name}", split=(one, other))
 
 
 def all_names(listed: Sequence[Candidate]) -> list[str]:

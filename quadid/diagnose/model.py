@@ -15,7 +15,6 @@ from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
 from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance, prior_terms
-from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -120,16 +119,6 @@ def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Can
     )
 
 
-def settled_states(shooting: Shooting, model: Model) -> InitialStates:
-    """States of `model`, those that a linearisation of the whole catalogue begins at fitted to it.
-
-    Filters and delays begin before a segment, where no fit without them has been; from states as measured there, the
-    linear problem can promise more than there is to gain.
-    """
-    anything = ("imu_lag.period", "rotor_drag.k_x")  # what begins early, what needs velocity
-    return settle_states(shooting, model.theta, anything, model.states).states
-
-
 @dataclass(frozen=True)
 class Sketch:
     """Where one Gauss-Newton step from a start would lead.
@@ -174,18 +163,17 @@ def extend(
     Args:
         shooting: the problem.
         model: what to extend.
-        candidate: the cause to add; one that stands for two adds both.
+        candidate: the cause to add.
         start: full vector to start from, or a sketch on the same segments; one without states begins at measured ones.
         iterations: linearisations to spend; four times as many from measured states.
         tried: how many alternatives were looked at.
     """
     begun = sketch(shooting, model, candidate) if start is None else start
     theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
-    new = [c for c in candidate.split or (candidate,) if c.label not in {x.label for x in model.causes}]
     fitted = fit_model(
-        shooting, theta, (*model.causes, *new), states, iterations if states else 4 * iterations, tolerance=0.2
+        shooting, theta, (*model.causes, candidate), states, iterations if states else 4 * iterations, tolerance=0.2
     )
-    return replace(fitted, tried={**model.tried, **{c.label: tried for c in new}})
+    return replace(fitted, tried={**model.tried, candidate.label: tried})
 
 
 def taken_out_causes(causes: Sequence[Candidate], cause: Candidate) -> tuple[Candidate, ...]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
-from quadid.diagnose.model import Model, settled_states, taken_out_causes
+from quadid.diagnose.model import Model, taken_out_causes
 from quadid.identify.priors import prior_terms
 from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Linearised, Shooting
@@ -82,7 +82,7 @@ class Everything:
         """Linearises `model` with all of `listed` free."""
         names = list(dict.fromkeys([*model.free.names, *all_names(_open(model, listed))]))
         theta = unset_times(model.theta, model.effects)
-        lin = shooting.linearise(theta, shooting.free(names), settled_states(shooting, model))
+        lin = shooting.linearise(theta, shooting.free(names), model.states)
         return cls(model, lin, {n: i for i, n in enumerate(names)})
 
     def loss(self, gone: Candidate) -> float:
@@ -98,11 +98,7 @@ class Everything:
         there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
         out = []
         for candidate in _open(self.model, listed):
-            if (
-                candidate.label in present
-                or any(c.label in present for c in candidate.split)
-                or (candidate.requires and candidate.requires not in there)
-            ):
+            if candidate.label in present or (candidate.requires and candidate.requires not in there):
                 continue
             mine = np.array([self.place[n] for n in candidate.names])
             found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)

@@ -126,7 +126,7 @@ def _round(
         best = _best(model, trials)
         if best is not None:
             return Round(model, tuple(trials), best)
-    return Round(model, tuple(trials), _possible(shooting, model, trials))
+    return Round(model, tuple(trials), None)
 
 
 def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
@@ -137,20 +137,6 @@ def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
         if best is None or better(t.model, best.model):
             best = t
     return best
-
-
-def _possible(shooting: Shooting, model: Model, trials: Sequence[Trial]) -> Trial | None:
-    """The best swap of a cause with an impossible number for a possible one that is better than nothing in its place.
-
-    What no vehicle has stands for something else, and a true cause need not fit as well as a stand-in of any sign: a
-    lag that the model lacks comes out as damping that drives the rotation.
-    """
-    for label in impossible_causes(model):
-        cause = next(c for c in model.causes if c.label == label)
-        mine = [t for t in trials if t.gone is cause and not impossible_causes(t.model)]
-        if mine and (best := _best(without(shooting, model, cause), mine)):
-            return best
-    return None
 
 
 def _adds_and_drops(
@@ -179,7 +165,7 @@ def _swaps(shooting: Shooting, everything: Everything, listed: Sequence[Candidat
 def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
     """Whether a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
     candidate = score.candidate
-    if candidate.split or candidate.effect == cause.effect:
+    if candidate.effect == cause.effect:
         return False
     return regains or (candidate.family == cause.family and candidate.timed is None)
 

@@ -106,20 +106,12 @@ def _own_noise(windows: object, shooting: Shooting, *_: object) -> tuple[Any, No
     return shooting.noise, None
 
 
-def _own_states(shooting: object, model: Any) -> Any:
-    return model.states
-
-
 def _gains(small: Model, large: Model) -> bool:
     return paired_gain(small.held_out, large.held_out).total > RELEVANT * small.rows
 
 
 def _regains(score: Any, cause: Any, regains: bool) -> bool:
-    return regains and not score.candidate.split and score.candidate.effect != cause.effect
-
-
-def _unpaired(*given: Any) -> Any:
-    return [c for c in candidates(*given) if not c.split]
+    return regains and score.candidate.effect != cause.effect
 
 
 def _unrefined(*given: Any) -> Any:
@@ -142,7 +134,6 @@ def _first_guess(*given: Any) -> Any:
 RULES: dict[str, dict[str, Any]] = {
     "swaps": {"_swaps": _none},
     "swaps within a family": {"_rivals": _regains},
-    "swap of an impossible cause for a possible one": {"_possible": _given(None)},
     "impossible numbers": {"impossible_causes": _given({})},
     "constancy of a bias": {"inconstant_causes": _given({})},
     "calibration (Godambe)": {"calibration": _given(1.0)},
@@ -152,9 +143,7 @@ RULES: dict[str, dict[str, Any]] = {
     "noise around the causes": {"_noise_around": _same_noise},
     "memory of the noise": {"with_memory": _own_noise},
     "two starts of the flexible fit when far": {"flexible_fit": _first_guess},
-    "initial states settled first": {"settled_states": _own_states},
     "what the fit left undone, in scores": {"Everything._unspent": _given(0.0)},
-    "causes that show only in pairs": {"candidates": _unpaired},
     "optional numbers of a cause": {"candidates": _unrefined},
     "onset refined": {"_refine_time": _as_scanned},
     "a look at the longest segments": {"Stage.longest": _given(None)},
