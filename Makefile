@@ -95,8 +95,8 @@ autopilot: venv ## ArduCopter's and others' flights through the online session, 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) studies.campaign --out docs/results
 
-ablation: venv ## the diagnosis without each rule, with half and twice each number (many hours; goes on where it stopped)
-	$(STUDY) studies.ablation --records ablation.jsonl --out docs/results
+ablation: venv ## the diagnosis without each rule and number, with half and twice each number (hours; goes on where it stopped)
+	$(STUDY) studies.ablation --records ablation.jsonl --cache build/ablation --out docs/results
 
 health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
 	$(STUDY) studies.health.hours --out docs/results

@@ -14,7 +14,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from studies.ablation.answers import Answer, run
+from studies.ablation.answers import Answer, read, run
 from studies.ablation.corpus import FLIGHTS, SCALED, flights
 from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
@@ -41,16 +41,17 @@ def row(subject: str, chosen: Sequence[Variant], answers: Mapping[str, Sequence[
 
 def _cell(base: Sequence[Answer], answers: Sequence[Answer]) -> str:
     known = {b.flight: b for b in base}
-    base = [known[a.flight] for a in answers]
+    all_of_them, base = len(base), [known[a.flight] for a in answers]
     pairs = [(b, a) for b, a in zip(base, answers, strict=True) if b.difference(a)]
     better = sum(a.right is True and b.right is False for b, a in pairs)
     worse = sum(a.right is False and b.right is True for b, a in pairs)
     fits = sum(a.fits for a in answers) / max(sum(b.fits for b in base), 1)
-    told = [f"**+{better} −{worse}**"] if better or worse else []
+    told = [f"(of {len(base)})"] if len(base) < all_of_them else []
+    told += [f"**+{better} −{worse}**"] if better or worse else []
     told += [f"{b.flight}: {b.difference(a)}" for b, a in sorted(pairs, key=_weight)[:SHOWN]]
     told += [f"and {len(pairs) - SHOWN} more"] if len(pairs) > SHOWN else []
     told += [f"fits × {fits:.2f}"] if abs(fits - 1.0) > 0.03 else []
-    return "; ".join(told) or "–"
+    return "; ".join(told) if len(told) > (len(base) < all_of_them) else " ".join([*told, "–"])
 
 
 def _weight(pair: tuple[Answer, Answer]) -> tuple[bool, bool]:
@@ -66,6 +67,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder that keeps flights once flown")
     parser.add_argument("--flights", default=",".join(FLIGHTS), help="by commas: single 7000,cases case_012,iris …")
     parser.add_argument("--only", default="", help="variants whose name holds one of these words, by commas")
+    parser.add_argument("--recorded", action="store_true", help="run nothing, use what the records hold")
     parser.add_argument("--out", type=Path, help="folder of the page")
     options = parser.parse_args()
     if options.house:
@@ -75,9 +77,11 @@ def main() -> None:
     words = [w for w in options.only.split(",") if w]
     chosen = [v for v in variants() if v.name == "base" or not words or any(w in v.name for w in words)]
     answers: dict[str, list[Answer]] = {v.name: [] for v in chosen}
+    recorded = {(a.flight, a.variant) for a in read(options.records)}
     for flight in todo:
         here = [v for v in chosen if not v.scaled or flight.name in SCALED]
-        for answer in run(flight, here, options.cache, options.records, told):
+        known = [v for v in here if not options.recorded or (flight.name, v.name) in recorded]
+        for answer in run(flight, known, options.cache, options.records, told):
             answers[answer.variant].append(answer)
     rows = [row(s, chosen, answers) for s in dict.fromkeys(v.subject for v in chosen) if s != "base"]
     print("\n".join(rows))
