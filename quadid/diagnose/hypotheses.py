@@ -74,6 +74,11 @@ def candidates(
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
         out.append(Candidate(effect, spec.entries, spec.starts, spec.requires, timed))
         out += _refinements(spec)
+        if (central := f"{effect}.central") in spec.refinements:
+            # Air that acts at the CG turns nothing; what it does at the hubs, which does, may explain nothing alone.
+            out.append(
+                Candidate(effect, (*spec.entries, central), ((*spec.starts[0], 1.0),), label=f"{effect} at the CG")
+            )
     return out
 
 

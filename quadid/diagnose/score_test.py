@@ -94,11 +94,11 @@ class Everything:
         """What each of `listed` that is not in the model would do, in the place of `gone` if given; best first."""
         lin, own, risen = self._left(gone)
         risen += self._unspent()
-        present = {c.label for c in self.model.causes}
+        present = set(self.model.free.names)
         there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
         out = []
         for candidate in _open(self.model, listed):
-            if candidate.label in present or (candidate.requires and candidate.requires not in there):
+            if present.intersection(candidate.names) or (candidate.requires and candidate.requires not in there):
                 continue
             mine = np.array([self.place[n] for n in candidate.names])
             found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)

@@ -120,13 +120,13 @@ def _round(
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
     trials: list[Trial] = []
+    best = None
     for moves in (_adds_and_drops, _swaps):
-        new = moves(shooting, everything, listed, least)
-        trials += [t for t in new if _key(shooting, t.model) not in seen]
-        best = _best(model, trials)
-        if best is not None:
-            return Round(model, tuple(trials), best)
-    return Round(model, tuple(trials), None)
+        if best is None:
+            new = moves(shooting, everything, listed, least)
+            trials += [t for t in new if _key(shooting, t.model) not in seen]
+            best = _best(model, trials)
+    return Round(model, tuple(trials), best)
 
 
 def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
