@@ -1,8 +1,8 @@
 """What remains, held against generic causes: does the residual follow anything that the vehicle did?
 
 A spectrum sees structure only where it stands above the noise.  Something that follows a command, a motion or the
-time is seen far below that.  Each probe is a signal (an input, its square, its past, a predicted motion, a slow
-function of time) acting at a site: as a moment, a force, an error of the gyro or of the attitude.  Its whitened
+time is seen far below that.  Each probe is a signal (an input, its square, its change, a predicted motion, a
+slow function of time) acting at a site: as a moment, a force, an error of the gyro or of the attitude.  Its whitened
 response, less what initial states and free parameters take up, is fitted on all blocks but one and judged on that one,
 so a probe that follows only noise loses.
 
@@ -28,8 +28,6 @@ ERRORS = 2.5
 """Standard errors of a gain on unseen blocks above which a site counts as structured."""
 _RIDGE = 1e-6
 """Prior precision of a probe, relative to its information: keeps signals finite that double one another."""
-LAGS = (0.04, 0.1)
-"""How far back [s] inputs are also looked at."""
 WAVES = 4
 """Half waves over the log, for what comes and goes slowly."""
 _AXES = "xyz"
@@ -225,9 +223,6 @@ def _inputs(part: Columns) -> dict[str, FloatArray]:
         basic[f"moment {i + 1}"] = apart @ axis / level
     out = dict(basic)
     for name, s in basic.items():
-        for lag in LAGS:
-            steps = max(round(lag / part.window.dt), 1)
-            out[f"{name} {lag:g} s before,"] = np.concatenate([np.full(steps, s[0]), s[:-steps]])
         change = np.diff(s, prepend=s[0])
         out[f"changing {name}"] = change
         out[f"|changing {name}|"] = np.abs(change)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.diagnose.residual_regressors import LAGS, SITES, Follows, follows, signals
+from quadid.diagnose.residual_regressors import SITES, Follows, follows, signals
 from quadid.flight import draw_truth, fly
 from quadid.identify.segment_jacobian import Columns
 from quadid.types import FloatArray
@@ -91,10 +91,6 @@ def test_inputs_are_those_of_the_step_before() -> None:
     named = signals(part)
     expected = thrust_before(problem)
     np.testing.assert_allclose(named["thrust input"], expected[part.rows], atol=1e-12)
-    steps = round(LAGS[1] / problem.shooting.dt)
-    np.testing.assert_allclose(
-        named[f"thrust {LAGS[1]:g} s before, input"], expected[part.rows - steps], atol=1e-12
-    )  # fmt: skip
     np.testing.assert_allclose(named["squared thrust input"], expected[part.rows] ** 2, atol=1e-12)
     np.testing.assert_array_equal(named["constant"], 1.0)
     assert named["time, 1 half waves"][0, 0] == pytest.approx(1.0, abs=1e-3)
