@@ -40,8 +40,8 @@ from quadid.window import Window
 Progress = Callable[[str, float], None]
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
-"""Lengths of segments that may decide (`climb.USUAL_SECONDS` says when the longest may), longest first; below them
-only the short ones of the first fit."""
+"""Lengths of segments that may decide (`segment_schedule.USUAL_SECONDS` says when the longest may), longest first;
+below them only the short ones of the first fit."""
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
 SHARE_TO_NAME = 0.8

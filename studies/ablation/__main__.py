@@ -19,6 +19,8 @@ from studies.ablation.corpus import FLIGHTS, SCALED, flights
 from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
+REMOVED = Path(__file__).with_name("removed.md")
+"""What went because of such runs, in words."""
 SHOWN = 3
 """Answers that one cell of the table tells."""
 
@@ -93,13 +95,23 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
     """The result page."""
     command = f"python -m studies.ablation --flights '{options.flights}'"
     command += f" --only '{options.only}'" if options.only else ""
+    sizes = str(measured()).splitlines()[:3]
+    right = [a for a in base if a.right is not None]
     return (
         f"""# Diagnosis: without each rule, without, with half and with twice each number
 
-{len(base)} flights, `{command}`, {datetime.date.today().isoformat()}. Class and number of a campaign case are its seed;
-recorded flights have the seed 0. +n −n: cases that become right or wrong; an answer differs in this order: names
-(− no longer, + newly listed), verdict, error on unseen data by more than 1 %, width of an interval by more than 5 %,
-what the rest follows. "Fits" are linearisations asked for, where they change by more than 3 %; – : nothing changes.
+{len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
+
+Class and number of a campaign case are its seed; recorded flights have the seed 0. As it is the diagnosis is right on
+{sum(bool(a.right) for a in right)} of the {len(right)} whose answer is known.
+Size: {"; ".join(line.split(":")[0] for line in sizes)}.
+
+{REMOVED.read_text(encoding="utf-8").strip()}
+
+## What is left
++n −n: cases that become right or wrong. An answer differs in this order: names (− no longer, + newly listed), verdict,
+error on unseen data by more than 1 %, width of an interval by more than 5 %, what the rest follows. "Fits" are
+linearisations asked for, where they change by more than 3 %; – : nothing changes; (of n): of fewer flights than all.
 
 | changed | without | × 0.5 | × 2 |
 |---|---|---|---|
