@@ -121,10 +121,7 @@ Errors = dict[str, tuple[FloatArray, float]]
 
 @dataclass(frozen=True)
 class Worth:
-    """Benefit of one cause given all others, and its uncorrected p-value.
-
-    `ordinary` ones are no larger than on any vehicle.
-    """
+    """Benefit of one cause given all others; `ordinary` ones are no larger than on any vehicle."""
 
     cause: Candidate
     benefit: Benefit
@@ -160,9 +157,8 @@ def validate(
         # A value that belongs to the training flight is measured there, on blocks left out.
         errors = left_out if EFFECTS[cause.effect].per_log else unseen
         worth.append(_worth(cause, errors, ordinary(decisive, model, cause, listed), decisive.seconds))
-    return Validation(before, after, on, None, contradicted), tuple(
-        sorted(worth, key=lambda w: (w.ordinary, -w.deviance))
-    )
+    worth.sort(key=lambda w: (w.ordinary, -w.deviance))
+    return Validation(before, after, on, None, contradicted), tuple(worth)
 
 
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:

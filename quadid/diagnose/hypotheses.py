@@ -22,6 +22,7 @@ class Candidate:
         timed: index of its time entry, when it begins at an unknown moment.
         label: tells candidates of one effect apart.
         refines: it frees optional numbers of an effect that is in the model, and shares its finding.
+        split: what it stands for once accepted, where that shows only together.
     """
 
     effect: str
@@ -31,6 +32,7 @@ class Candidate:
     timed: int | None = None
     label: str = field(default="")
     refines: bool = False
+    split: tuple[Candidate, ...] = ()
 
     @property
     def family(self) -> str:
@@ -72,13 +74,12 @@ def candidates(
                 out.append(Candidate(effect, (f"{effect}.extra_{i + 1}",), requires=label, label=torque, refines=True))
             continue
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
-        out.append(Candidate(effect, spec.entries, spec.starts, spec.requires, timed))
-        out += _refinements(spec)
-        if (central := f"{effect}.central") in spec.refinements:
-            # Air that acts at the CG turns nothing; what it does at the hubs, which does, may explain nothing alone.
-            out.append(
-                Candidate(effect, (*spec.entries, central), ((*spec.starts[0], 1.0),), label=f"{effect} at the CG")
-            )
+        cause, optional = Candidate(effect, spec.entries, spec.starts, spec.requires, timed), _refinements(spec)
+        out += [cause, *optional]
+        for at_cg in (c for c in optional if c.names == (f"{effect}.central",)):
+            # Air that acts at the CG turns nothing; at the hubs, where it does, it may explain nothing.
+            names, starts, both = (*cause.names, *at_cg.names), ((*spec.starts[0], 1.0),), (cause, at_cg)
+            out.append(Candidate(effect, names, starts, label=f"{effect} at the CG", split=both))
     return out
 
 

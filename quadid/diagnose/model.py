@@ -170,10 +170,11 @@ def extend(
     """
     begun = sketch(shooting, model, candidate) if start is None else start
     theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
+    new = candidate.split or (candidate,)
     fitted = fit_model(
-        shooting, theta, (*model.causes, candidate), states, iterations if states else 4 * iterations, tolerance=0.2
+        shooting, theta, (*model.causes, *new), states, iterations if states else 4 * iterations, tolerance=0.2
     )
-    return replace(fitted, tried={**model.tried, candidate.label: tried})
+    return replace(fitted, tried={**model.tried, **{c.label: tried for c in new}})
 
 
 def taken_out_causes(causes: Sequence[Candidate], cause: Candidate) -> tuple[Candidate, ...]:

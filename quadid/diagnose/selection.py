@@ -165,7 +165,7 @@ def _swaps(shooting: Shooting, everything: Everything, listed: Sequence[Candidat
 def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
     """Whether a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
     candidate = score.candidate
-    if candidate.effect == cause.effect:
+    if candidate.split or candidate.effect == cause.effect:
         return False
     return regains or (candidate.family == cause.family and candidate.timed is None)
 

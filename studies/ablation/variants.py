@@ -114,6 +114,10 @@ def _regains(score: Any, cause: Any, regains: bool) -> bool:
     return regains and score.candidate.effect != cause.effect
 
 
+def _unpaired(*given: Any) -> Any:
+    return [c for c in candidates(*given) if not c.split]
+
+
 def _unrefined(*given: Any) -> Any:
     return [c for c in candidates(*given) if not c.refines]
 
@@ -144,6 +148,7 @@ RULES: dict[str, dict[str, Any]] = {
     "memory of the noise": {"with_memory": _own_noise},
     "two starts of the flexible fit when far": {"flexible_fit": _first_guess},
     "what the fit left undone, in scores": {"Everything._unspent": _given(0.0)},
+    "causes that show only in pairs": {"candidates": _unpaired},
     "optional numbers of a cause": {"candidates": _unrefined},
     "onset refined": {"_refine_time": _as_scanned},
     "a look at the longest segments": {"Stage.longest": _given(None)},
