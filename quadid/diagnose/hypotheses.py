@@ -80,6 +80,11 @@ def candidates(
             # Air that acts at the CG turns nothing; at the hubs, where it does, it may explain nothing.
             names, starts, both = (*cause.names, *at_cg.names), ((*spec.starts[0], 1.0),), (cause, at_cg)
             out.append(Candidate(effect, names, starts, label=f"{effect} at the CG", split=both))
+    if has_velocity:
+        # Drag in air that moves faster than the vehicle explains nothing alone.
+        drag, wind = (next(c for c in out if c.label == wanted) for wanted in ("rotor_drag", "wind"))
+        names, starts, both = (*drag.names, *wind.names), ((*drag.starts[0], 0.0, 0.0),), (drag, wind)
+        out.append(Candidate(drag.effect, names, starts, label="rotor_drag in wind", split=both))
     return out
 
 
