@@ -17,7 +17,7 @@ from quadid.diagnose.plausibility import impossible_causes, late_unknown
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
-from quadid.diagnose.selection import Search, pruned, select
+from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
@@ -181,13 +181,14 @@ class _Begun:
 
     Attributes:
         short: short segments; schedule: the lengths that may decide, short ones last.
-        nominal: nominal optimum, full vector.
+        nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
         listed: the catalogue.
     """
 
     short: Shooting
     schedule: list[Shooting]
     nominal: FloatArray
+    flexible: FloatArray
     listed: list[Candidate]
 
 
@@ -207,12 +208,13 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     report("noise floor", 0.0)
     # Far off, what the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
     begun = ([first.theta, start], free, typical, FAR_ITERATIONS) if far else ([first.theta], free, short.noise)
-    short = short.with_noise(flexible_fit(windows, short, *begun).noise)
+    flexible = flexible_fit(windows, short, *begun)
+    short = short.with_noise(flexible.noise)
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     schedule = [*(s for s in schedule if s.count >= FEWEST_BLOCKS), short]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    return _Begun(short, schedule, first.theta, listed)
+    return _Begun(short, schedule, first.theta, flexible.theta, listed)
 
 
 def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
@@ -225,6 +227,11 @@ def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
     """Selects causes, and again when they show the noise to be less."""
     search = select(begun.schedule, begun.nominal, begun.listed, report)
+    if search.model.reduced_chi_square > LINEAR_MISFIT:
+        # One by one led nowhere; from everything at once it may.
+        general = from_everything(begun.short, begun.flexible, begun.listed)
+        other = select(begun.schedule, begun.nominal, begun.listed, report, general)
+        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
     while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance

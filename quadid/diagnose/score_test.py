@@ -134,6 +134,33 @@ class Everything:
         return replace(self.lin, grad=self.lin.grad + moved), risen
 
 
+def missed(model: Model, least: float) -> tuple[Candidate, ...]:
+    """Causes of `model` whose loss, one after the other, the rest could not make up for: at least `least` of deviance.
+
+    Half of them at most are let go: the linear picture does not hold for all at once.
+    """
+    h = model.lin.information + np.diag(model.prior.precision)
+    z, place = model.free.from_neutral(model.theta), {n: i for i, n in enumerate(model.free.names)}
+    kept, alive = list(model.causes), np.ones(len(place), dtype=bool)
+    for _ in range(max(len(kept) // 2, 1)):
+        losses = []
+        for cause in kept:
+            if any(cause.carries(c) for c in kept):
+                continue
+            mine = np.array([place[n] for n in cause.names])
+            rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))
+            left = eliminated(h[np.ix_(mine, mine)], h[np.ix_(mine, rest)], h[np.ix_(rest, rest)])
+            losses.append((float(z[mine] @ left.h @ z[mine]), cause, mine))
+        if not losses:
+            break
+        loss, cause, mine = min(losses, key=lambda item: item[0])
+        if loss > least:
+            break
+        kept.remove(cause)
+        alive[mine] = False
+    return tuple(kept)
+
+
 def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> tuple[FloatArray, FloatArray]:
     """Predicted fall of the deviance and step of candidates' parameters, the model's own refitted.
 

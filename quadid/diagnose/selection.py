@@ -9,9 +9,11 @@ from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.log_evidence import better, worth_a_refit
 from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, without
 from quadid.diagnose.plausibility import impossible_causes
-from quadid.diagnose.score_test import Everything, Score
+from quadid.diagnose.score_test import Everything, Score, missed
 from quadid.diagnose.segment_schedule import Stage
+from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.shooting import Shooting
+from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 
 NEAR = 0.4
@@ -101,6 +103,30 @@ def select(
 def _key(shooting: Shooting, model: Model) -> tuple[int, frozenset[str]]:
     """Length of segments and causes: what the search has visited once it never comes back to."""
     return shooting.length, frozenset(c.label for c in model.causes)
+
+
+def from_everything(shooting: Shooting, theta: FloatArray, listed: Sequence[Candidate]) -> Model:
+    """A start of its own: everything at once at `theta`, the flexible fit, less what is not missed.
+
+    When several causes act at once and strongly, none of them alone leads out of the basin that the nominal fit fell
+    into; the flexible model is outside of it.
+    """
+    allowed = set(flexible_names(shooting.layout, shooting))
+    kept = tuple(c for c in listed if c.timed is None and not c.split and set(c.names) <= allowed)
+    model, before = fit_model(shooting, _only(shooting, theta, kept), kept, iterations=8), -1
+    while len(model.causes) != before:
+        before, kept = len(model.causes), missed(model, worth_a_refit(len(listed), model.rows))
+        if len(kept) < before:
+            model = fit_model(shooting, _only(shooting, model.theta, kept), kept, model.states, iterations=8)
+    return replace(model, tried={c.label: float(len(listed)) for c in kept})
+
+
+def _only(shooting: Shooting, theta: FloatArray, causes: Sequence[Candidate]) -> FloatArray:
+    """The vector with all effects at neutral but those of `causes`."""
+    out = shooting.layout.initial(shooting.vehicle)
+    kept = shooting.free([*NOMINAL_NAMES, *(n for c in causes for n in c.names)]).index
+    out[kept] = theta[kept]
+    return out
 
 
 def pruned(shooting: Shooting, model: Model) -> Model:

@@ -16,7 +16,7 @@ from quadid.diagnose.attribution import validate
 from quadid.diagnose.cross_validation import paired_gain
 from quadid.diagnose.hypotheses import candidates
 from quadid.diagnose.log_evidence import RELEVANT
-from quadid.diagnose.model import Model
+from quadid.diagnose.model import Model, fit_model
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.identify.noise_estimation import flexible_fit
@@ -106,6 +106,10 @@ def _own_noise(windows: object, shooting: Shooting, *_: object) -> tuple[Any, No
     return shooting.noise, None
 
 
+def _nominal(shooting: Shooting, *_: object) -> Model:
+    return fit_model(shooting, shooting.layout.initial(shooting.vehicle), ())
+
+
 def _gains(small: Model, large: Model) -> bool:
     return paired_gain(small.held_out, large.held_out).total > RELEVANT * small.rows
 
@@ -146,6 +150,7 @@ RULES: dict[str, dict[str, Any]] = {
     "a last pruning": {"pruned": _unpruned},
     "noise around the causes": {"_noise_around": _same_noise},
     "memory of the noise": {"with_memory": _own_noise},
+    "a start from everything": {"from_everything": _nominal},
     "two starts of the flexible fit when far": {"flexible_fit": _first_guess},
     "what the fit left undone, in scores": {"Everything._unspent": _given(0.0)},
     "causes that show only in pairs": {"candidates": _unpaired},
