@@ -132,8 +132,7 @@ def attitude_check(recording: Recording) -> Check:
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
     if rates.verdict is Verdict.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
-    q = np.column_stack([np.interp(accel.t, attitude.t, c) for c in attitude.values.T])
-    down = float(np.median(rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)[:, 2]))
+    down = float(np.median(_in_world(accel, attitude)[:, 2]))
     if down < 0.5 * GRAVITY:
         return rates
     return Check(
@@ -254,15 +253,19 @@ def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, Flo
 
 def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
     """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
-    q = linear(attitude.t, attitude.values, accel.t)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    force = rotated(q, accel.values) + np.array([0.0, 0.0, GRAVITY])
+    force = _in_world(accel, attitude) + np.array([0.0, 0.0, GRAVITY])
     stride = max(1, round(0.2 / sample_period(velocity.t)))
     t, speed = velocity.t[::stride], velocity.values[::stride]
     keep = usable_steps(t, accel.t) & usable_steps(t, attitude.t)
     world = Channel("accel", accel.t, force)
     derived = np.diff(running_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
     return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
+
+
+def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
+    """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
+    q = linear(attitude.t, attitude.values, accel.t)
+    return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:

@@ -171,8 +171,8 @@ class ChangeDetector:
         chunks = self._chunks
         moment = b / j * np.array([c.moment[axis] for c in chunks])
         y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
-        x = np.column_stack([moment, [c.rate[axis] for c in chunks], [c.across[axis] / j for c in chunks]])
-        x = np.column_stack([x, [c.gyroscopic[axis] for c in chunks]])
+        beside = [(c.rate[axis], c.across[axis] / j, c.gyroscopic[axis]) for c in chunks]
+        x = np.column_stack([moment, beside])
         astray = np.zeros((len(chunks), 1, 4))
         astray[:, 0, 2] = [c.sigma / j / half for c in chunks]
         return y / half, x / half, np.array([doubt, *self._state.typical_moment, 1.0]), astray
