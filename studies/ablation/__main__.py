@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -23,6 +24,8 @@ REMOVED = Path(__file__).with_name("removed.md")
 """What went because of such runs, in words."""
 SHOWN = 3
 """Answers that one cell of the table tells."""
+IDLE = re.compile(r"\| [^|]+ \|( (\(of \d+\) )?(– )? ?\|){3}")
+"""A row in which nothing changes."""
 
 
 def told(answer: Answer) -> None:
@@ -92,11 +95,12 @@ def main() -> None:
 
 
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
-    """The result page."""
+    """The result page: rows that change something as a table, the others by name."""
     command = f"python -m studies.ablation --flights '{options.flights}'"
     command += f" --only '{options.only}'" if options.only else ""
     sizes = str(measured()).splitlines()[:3]
     right = [a for a in base if a.right is not None]
+    idle = [r.split(" | ")[0].removeprefix("| ") for r in rows if IDLE.fullmatch(r)]
     return (
         f"""# Diagnosis: without each rule, without, with half and with twice each number
 
@@ -109,6 +113,8 @@ Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 {REMOVED.read_text(encoding="utf-8").strip()}
 
 ## What is left
+On these flights nothing changes without, with half or with twice {", ".join(idle)}.
+
 +n −n: cases that become right or wrong. An answer differs in this order: names (− no longer, + newly listed), verdict,
 error on unseen data by more than 1 %, width of an interval by more than 5 %, what the rest follows. "Fits" are
 linearisations asked for, where they change by more than 3 %; – : nothing changes; (of n): of fewer flights than all.
@@ -116,7 +122,7 @@ linearisations asked for, where they change by more than 3 %; – : nothing chan
 | changed | without | × 0.5 | × 2 |
 |---|---|---|---|
 """
-        + "\n".join(rows)
+        + "\n".join(r for r in rows if not IDLE.fullmatch(r))
         + "\n"
     )
 
