@@ -68,8 +68,8 @@ def _about_parameters(result: JsonDict) -> list[str]:
     inside, wrong = (sum(p[key][0] <= p["truth"] <= p[key][1] for p in rows) for key in ("extended_ci95", "ci95"))
     return [
         f"Of the six 95 % intervals of the extended model {inside} hold the truth, of those of the nominal model "
-        f"{wrong}: no interval tells how wrong the equations are. d and J_zz, and J_r with them, are told apart only "
-        "by small terms, as their correlations show.",
+        f"{wrong}: what parts of the flight make of a number widens them where an effect is missing. d and J_zz, and "
+        "J_r with them, are told apart only by small terms, as their correlations show.",
     ]
 
 
