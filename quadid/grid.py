@@ -8,6 +8,7 @@ rotor speeds included; channels slower than the grid stay untouched and are NaN 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,6 +26,8 @@ from quadid.window import Recording, Window
 
 Span = tuple[float, float]
 
+WHOLE: Span = (-math.inf, math.inf)
+"""All of a log."""
 SHORTEST = 1.0
 """Windows shorter than this [s] are dropped where a rate was asked for."""
 
@@ -73,14 +76,14 @@ def to_windows(
     recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
     stop: float | None = None,
 ) -> list[Window]:  # fmt: skip
-    """Merges the channels of a recording onto uniform grids; see `grid_recording` for arguments and errors."""
-    return grid_recording(recording, vehicle, rate, start, stop).windows
+    """Merges what lies between `start` and `stop` [s] onto uniform grids; see `grid_recording` for the rest."""
+    part = -math.inf if start is None else start, math.inf if stop is None else stop
+    return grid_recording(recording, vehicle, rate, [part]).windows
 
 
 def grid_recording(
-    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
-    stop: float | None = None,
-) -> Gridded:  # fmt: skip
+    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, parts: Sequence[Span] = (WHOLE,)
+) -> Gridded:
     """Merges the channels of a recording onto uniform grids, one per stretch without gaps.
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
@@ -91,8 +94,7 @@ def grid_recording(
         recording: a log in core units and frames.
         vehicle: tells what the rotor columns mean and how many there must be.
         rate: grid rate [Hz]; None for the log's own (that of its gyro, else of its rotor signal).
-        start: first time to use [s], in the recording's time.
-        stop: last time to use [s].
+        parts: first and last time [s] of each part to use, rising, in the recording's time.
 
     Raises:
         LogError: no rotor signal, rotor columns that do not fit the vehicle, or no usable stretch.
@@ -104,21 +106,21 @@ def grid_recording(
     rotor = rotor_signal(recording, vehicle)
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
     spans = _spans(plan)
-    low, high = -math.inf if start is None else start, math.inf if stop is None else stop
     shortest = SHORTEST if rate is not None else 0.0
     log_span = _log_span(recording)
     windows: list[Window] = []
     dropped: list[float] = []
     for span in spans:
         a, b = _inside(plan, span)
-        at = _grid_times(plan, max(a, low), min(b, high))
-        if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
-            windows.append(_window(plan, at, recording.name, log_span))
-        elif max(span[0], low) < min(span[1], high):
-            dropped.append(min(span[1], high) - max(span[0], low))
+        for low, high in _common([span], parts):
+            at = _grid_times(plan, max(a, low), min(b, high))
+            if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
+                windows.append(_window(plan, at, recording.name, log_span))
+            elif low < high:
+                dropped.append(high - low)
     if not windows:
         longest = max((b - a for a, b in spans), default=0.0)
-        raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), start, stop)
+        raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), parts)
     windows, followed = follow_feedback(windows, vehicle)
     report = _report(plan, rotor, windows, len(spans) - 1, dropped, log_span)
     return Gridded(windows, replace(report, notes=(*report.notes, followed)) if followed else report)
@@ -153,7 +155,7 @@ def _spans(plan: Plan) -> list[Span]:
     return spans
 
 
-def _common(one: list[Span], other: list[Span]) -> list[Span]:
+def _common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
     """Intersects two rising lists of spans."""
     out, i, j = [], 0, 0
     while i < len(one) and j < len(other):
@@ -212,12 +214,13 @@ def _notes(plan: Plan, period: float) -> list[str]:
 
 
 def _nothing_left(
-    recording: Recording, longest: float, needed: float, start: float | None, stop: float | None
+    recording: Recording, longest: float, needed: float, parts: Sequence[Span]
 ) -> LogError | NotIdentifiableError:
     first, last = _log_span(recording)
-    if start is not None or stop is not None:
+    if tuple(parts) != (WHOLE,):
+        asked = " nor ".join(f"{a:g} and {b:g} s" for a, b in parts)
         return LogError(
-            f"{recording.name}: nothing to use between {start} and {stop} s",
+            f"{recording.name}: nothing to use between {asked}",
             f"times within {first:.3f} to {last:.3f} s", "see `quadid inspect` for the flying spans",
         )  # fmt: skip
     return NotIdentifiableError(

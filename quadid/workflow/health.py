@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError
-from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording, parse_cut
+from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording
 from quadid.workflow.outcome import Outcome
+from quadid.workflow.parts import parse_cut
 
 if TYPE_CHECKING:
     from quadid.health.changes import Health

@@ -8,16 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
-from quadid.workflow.loading import (
-    LONGEST,
-    Log,
-    as_vehicle,
-    flown_parts,
-    open_recording,
-    parse_cut,
-    trimming,
-)
+from quadid.workflow.loading import LONGEST, Log, as_vehicle, open_recording
 from quadid.workflow.outcome import Outcome
+from quadid.workflow.parts import flown_parts, left_on_ground, names_of, parse_cut
 
 if TYPE_CHECKING:
     from quadid.inspection import Inspection
@@ -36,8 +29,8 @@ class Inspected(Outcome):
     @property
     def warnings(self) -> list[str]:
         """What the reader had to say, and what to leave out of the log."""
-        trim = trimming(self.result["use"])
-        return [*self.found.warnings, *([trim] if trim else [])]
+        use = self.result["use"]
+        return [*self.found.warnings, *([left_on_ground(use)] if use else [])]
 
     def tables(self) -> list[TextTable]:
         """Channels, checks, parameters, and what is missing."""
@@ -82,7 +75,7 @@ def inspect(
     recording = cut.of(whole)
     rows = () if described is None else _excitation(recording, described)
     found = inspect_recording(recording, described, rows)
-    use = flown_parts(whole, described, cut)
+    use = names_of(cut, flown_parts(whole, described, cut))
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
 
 

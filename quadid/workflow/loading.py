@@ -3,57 +3,25 @@
 from __future__ import annotations
 
 import importlib
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quadid.errors import LogError, VehicleError
+from quadid.workflow.parts import Cut, first_imu_time, flown_parts, left_on_ground, names_of, parse_cut
 
 if TYPE_CHECKING:
     from quadid.grid import GridReport
+    from quadid.inspection import Spans
     from quadid.vehicle import Vehicle
     from quadid.window import Recording, Window
 
-_CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 _LARGEST_VEHICLE_FILE = 1 << 20
 GRID = 50.0
 """Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
 """Excitation is computed from this much flight at most [s]."""
-
-
-@dataclass(frozen=True)
-class Cut:
-    """Part of a log that was asked for: seconds after its first IMU sample; None for open ends; units to be checked."""
-
-    path: Path
-    start: float | None = None
-    stop: float | None = None
-    checked: bool = True
-
-    def span(self, recording: Recording) -> tuple[float, float]:
-        """First and last time of the part [s], in the time of the recording; infinite for open ends."""
-        zero = first_imu_time(recording)
-        low = -math.inf if self.start is None else zero + self.start
-        return low, math.inf if self.stop is None else zero + self.stop
-
-    def of(self, recording: Recording) -> Recording:
-        """The part of a recording; raises LogError where that is empty."""
-        if self.start is None and self.stop is None:
-            return recording
-        low, high = self.span(recording)
-        inside = {name: (c.t >= low) & (c.t <= high) for name, c in recording.channels.items()}
-        channels = {
-            name: replace(c, t=c.t[inside[name]], values=c.values[inside[name]])
-            for name, c in recording.channels.items()
-            if inside[name].any()
-        }
-        if not channels:
-            raise LogError(f"{recording.name}: nothing between {self.start} and {self.stop} s", "a span inside the log")
-        return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
 
 
 @dataclass(frozen=True)
@@ -68,6 +36,8 @@ class Log:
         grid: how the windows were made.
         cut: the part that is used.
         doubts: what looks wrong about units, frames, motors or clock, each with what to do.
+        flown: what is used of a log that also stands on the ground [s, after its first IMU sample]; empty: all of
+            the part that was asked for.
     """
 
     path: Path
@@ -77,6 +47,7 @@ class Log:
     grid: GridReport
     cut: Cut
     doubts: tuple[str, ...] = ()
+    flown: Spans = ()
 
     @property
     def name(self) -> str:
@@ -90,7 +61,7 @@ class Log:
 
     def at(self, rate: float | None) -> Log:
         """The same log on a grid of another rate [Hz]; None for the log's own."""
-        windows, grid = _gridded(self.recording, self.vehicle, rate, self.cut)
+        windows, grid = _gridded(self.recording, self.vehicle, rate, self.cut, self.flown)
         return replace(self, windows=windows, grid=grid)
 
     def of(self, vehicle: str | Path | Vehicle) -> Log:
@@ -98,9 +69,7 @@ class Log:
         described = as_vehicle(vehicle)
         if described == self.vehicle:
             return self
-        doubts = _doubts(self.recording, described, self.cut) if self.cut.checked else ()
-        windows, grid = _gridded(self.recording, described, self.grid.rate, self.cut)
-        return replace(self, vehicle=described, windows=windows, grid=grid, doubts=doubts)
+        return _read(self.path, self.recording, described, self.grid.rate, self.cut)
 
     def __repr__(self) -> str:
         used, whole = self.grid.seconds_used, self.grid.seconds_log
@@ -135,29 +104,8 @@ def load_vehicle(name: str) -> Vehicle:
         raise VehicleError(f"{name}: not text", "a YAML file", "is this the log? give it as LOG") from error
 
 
-def parse_cut(text: str, start: float | None = None, stop: float | None = None) -> Cut:
-    """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
-    found = _CUT.fullmatch(text)
-    if found is None or Path(text).exists():
-        cut = Cut(Path(text), start, stop)
-    else:
-        try:
-            own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
-        except ValueError as error:
-            raise LogError(
-                f"cannot read the span of '{text}'", "LOG@START:STOP in seconds, for example LOG@76:216"
-            ) from error
-        cut = Cut(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
-    for limit in (cut.start, cut.stop):
-        if limit is not None and not math.isfinite(limit):
-            raise LogError(f"{text}: a span from {cut.start} to {cut.stop} s", "seconds")
-    if cut.start is not None and cut.stop is not None and not cut.start < cut.stop:
-        raise LogError(f"{text}: a span from {cut.start:g} to {cut.stop:g} s", "start before stop", "swap them")
-    return cut
-
-
 def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:
-    """The vehicle itself, or that of a shipped name or a YAML file; see `load_vehicle` for errors."""
+    """The vehicle itself, or as `load_vehicle` has it."""
     return load_vehicle(str(vehicle)) if isinstance(vehicle, str | Path) else vehicle
 
 
@@ -191,9 +139,7 @@ def load(
             f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
             "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
         )  # fmt: skip
-    doubts = () if unchecked else _doubts(recording, described, cut)
-    windows, report = _gridded(recording, described, rate, cut)
-    return Log(cut.path.resolve(), recording, described, windows, report, cut, doubts)
+    return _read(cut.path.resolve(), recording, described, rate, cut)
 
 
 def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
@@ -209,12 +155,22 @@ def write_recording(path: str | Path, recording: Recording) -> Path:
     return Path(path).absolute()
 
 
-def _gridded(recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> tuple[list[Window], GridReport]:
+def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> Log:
+    """A log checked and on the grid; of one that also stands on the ground, what is in the air."""
+    doubts = check_conventions(recording, vehicle, cut) if cut.checked else ()
+    flown = flown_parts(recording, vehicle, cut) if cut.checked else ()
+    windows, report = _gridded(recording, vehicle, rate, cut, flown)
+    left_out = [left_on_ground(names_of(cut, flown))] if flown else []
+    return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown)
+
+
+def _gridded(
+    recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut, flown: Spans
+) -> tuple[list[Window], GridReport]:
     from quadid.grid import grid_recording
 
     zero = first_imu_time(recording)
-    limits = [None if limit is None else zero + limit for limit in (cut.start, cut.stop)]
-    return grid_recording(recording, vehicle, rate, limits[0], limits[1])
+    return grid_recording(recording, vehicle, rate, [(zero + a, zero + b) for a, b in flown] or [cut.span(recording)])
 
 
 def parse_columns(texts: Sequence[str]) -> dict[str, str]:
@@ -254,41 +210,9 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple
         # A check without numbers could not be made; what comes next says why, and better.
         if check.verdict is Verdict.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
-            trim = trimming(flown_parts(recording, vehicle, cut))
-            fix = f"{fix}; {trim}" if trim else fix
+            parts = " ".join(names_of(cut, flown_parts(recording, vehicle, cut)))
+            fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
         if check.verdict in (Verdict.ERROR, Verdict.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
     return tuple(doubts)
-
-
-def _doubts(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple[str, ...]:
-    """What looks wrong with a log, and what to leave out of it; raises as `check_conventions`."""
-    doubts, trim = check_conventions(recording, vehicle, cut), trimming(flown_parts(recording, vehicle, cut))
-    return (*doubts, trim) if trim else doubts
-
-
-def flown_parts(recording: Recording, vehicle: Vehicle | None, cut: Cut) -> list[str]:
-    """What to use of a log that also stands on the ground, as ``flight.bin@73.2:227.3``; none where it hardly does."""
-    from quadid.inspection import flying_spans, proposed_cuts
-    from quadid.mounting import in_body_axes
-
-    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
-    if cut.start is not None or cut.stop is not None or not imu:
-        return []
-    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
-    first, last = first_imu_time(recording), max(float(t[-1]) for t in imu)
-    cuts = proposed_cuts(flying_spans(turned, vehicle), first, last)
-    return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in cuts]
-
-
-def trimming(parts: Sequence[str]) -> str:
-    """The proposal of `flown_parts` as a sentence; empty without one."""
-    return f"the log includes time on the ground, which would count as flight: use {' '.join(parts)}" if parts else ""
-
-
-def first_imu_time(recording: Recording) -> float:
-    """Time [s] of the first gyro or accelerometer sample, else of the first sample of any channel."""
-    imu = [float(c.t[0]) for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
-    rest = [float(c.t[0]) for c in recording.channels.values() if len(c.t)]
-    return min(imu or rest, default=0.0)

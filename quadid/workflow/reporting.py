@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
-from quadid.workflow.loading import LONGEST, open_recording, parse_cut
+from quadid.workflow.loading import LONGEST, open_recording
+from quadid.workflow.parts import parse_cut
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit

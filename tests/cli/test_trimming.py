@@ -1,4 +1,4 @@
-"""A log that also stands on the ground: what is in the air is proposed as LOG@from:to when it is inspected or used."""
+"""A log that also stands on the ground: what is in the air is used, and named as LOG@from:to."""
 
 from __future__ import annotations
 
@@ -43,12 +43,24 @@ def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> Non
     assert inside("inspect", f"{standing}@11:30", "--json", "-").data["use"] == []
 
 
-def test_a_log_in_use_says_so_once(standing: Path) -> None:
-    whole = [w for w in quadid.load(standing, vehicle="pelican").warnings if "ground" in w]
-    assert whole == [
-        "standing.csv: the log includes time on the ground, which would count as flight: use standing.csv@11:30"
+def test_only_what_is_in_the_air_is_used_and_said_once(standing: Path) -> None:
+    log = quadid.load(standing, vehicle="pelican")
+    assert [w for w in log.warnings if "ground" in w] == [
+        "standing.csv: time on the ground is left out: fits use standing.csv@11:30; for all of it give standing.csv@0:"
     ]
-    assert not [w for w in quadid.load(f"{standing}@11:30", vehicle="pelican").warnings if "ground" in w]
+    (flown,) = log.windows
+    (cut,) = quadid.load(f"{standing}@11:30", vehicle="pelican").windows
+    np.testing.assert_array_equal(flown.gyro, cut.gyro)
+    (slower,) = log.at(25.0).windows
+    assert slower.t[0] >= log.recording.channels["gyro"].t[0] + 11.0 - 1e-6
+
+
+@pytest.mark.parametrize("part", ["@0:", "@11:30"])
+def test_a_part_that_was_asked_for_is_used_as_it_is(standing: Path, part: str) -> None:
+    log = quadid.load(f"{standing}{part}", vehicle="pelican")
+    assert not [w for w in log.warnings if "ground" in w]
+    first = log.recording.channels["gyro"].t[0]
+    assert log.windows[0].t[0] - first == pytest.approx(float(part[1:].split(":")[0]), abs=0.02)
 
 
 def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> None:

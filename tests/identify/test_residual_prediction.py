@@ -56,7 +56,7 @@ def test_it_predicts_a_flight_it_has_not_seen_better_than_the_physics(answer: di
 
 def test_without_velocity_only_moments_are_learnt(data_dir: Path) -> None:
     vehicle = Vehicle.from_yaml((data_dir / NANODRONE / "vehicle.yaml").read_text())
-    windows, _ = grid_recording(open_log(data_dir / NANODRONE / "random_run1.csv"), vehicle, 50.0, 0.0, 25.0)
+    windows, _ = grid_recording(open_log(data_dir / NANODRONE / "random_run1.csv"), vehicle, 50.0, [(0.0, 25.0)])
     bare = [replace(w, velocity=None, position=None) for w in windows]
     learnt = learn_prediction(bare, vehicle)
     assert learnt is not None

@@ -1,0 +1,105 @@
+"""Parts of a log: those asked for as LOG@from:to, and those in the air."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from quadid.errors import LogError
+
+if TYPE_CHECKING:
+    from quadid.inspection import Spans
+    from quadid.vehicle import Vehicle
+    from quadid.window import Recording
+
+_CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Part of a log that was asked for: seconds after its first IMU sample; None for open ends; units to be checked."""
+
+    path: Path
+    start: float | None = None
+    stop: float | None = None
+    checked: bool = True
+
+    def span(self, recording: Recording) -> tuple[float, float]:
+        """First and last time of the part [s], in the time of the recording; infinite for open ends."""
+        zero = first_imu_time(recording)
+        low = -math.inf if self.start is None else zero + self.start
+        return low, math.inf if self.stop is None else zero + self.stop
+
+    def of(self, recording: Recording) -> Recording:
+        """The part of a recording; raises LogError where that is empty."""
+        if self.start is None and self.stop is None:
+            return recording
+        low, high = self.span(recording)
+        inside = {name: (c.t >= low) & (c.t <= high) for name, c in recording.channels.items()}
+        channels = {
+            name: replace(c, t=c.t[inside[name]], values=c.values[inside[name]])
+            for name, c in recording.channels.items()
+            if inside[name].any()
+        }
+        if not channels:
+            raise LogError(f"{recording.name}: nothing between {self.start} and {self.stop} s", "a span inside the log")
+        return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
+
+def parse_cut(text: str, start: float | None = None, stop: float | None = None) -> Cut:
+    """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
+    found = _CUT.fullmatch(text)
+    if found is None or Path(text).exists():
+        cut = Cut(Path(text), start, stop)
+    else:
+        try:
+            own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
+        except ValueError as error:
+            raise LogError(
+                f"cannot read the span of '{text}'", "LOG@START:STOP in seconds, for example LOG@76:216"
+            ) from error
+        cut = Cut(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
+    for limit in (cut.start, cut.stop):
+        if limit is not None and not math.isfinite(limit):
+            raise LogError(f"{text}: a span from {cut.start} to {cut.stop} s", "seconds")
+    if cut.start is not None and cut.stop is not None and not cut.start < cut.stop:
+        raise LogError(f"{text}: a span from {cut.start:g} to {cut.stop:g} s", "start before stop", "swap them")
+    return cut
+
+
+def flown_parts(recording: Recording, vehicle: Vehicle | None, cut: Cut) -> Spans:
+    """What to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
+
+    A part that was asked for is used as it is.
+    """
+    from quadid.inspection import flying_spans, proposed_cuts
+    from quadid.mounting import in_body_axes
+
+    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
+    if cut.start is not None or cut.stop is not None or not imu:
+        return ()
+    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
+    first, last = first_imu_time(recording), max(float(t[-1]) for t in imu)
+    return proposed_cuts(flying_spans(turned, vehicle), first, last)
+
+
+def names_of(cut: Cut, parts: Spans) -> list[str]:
+    """Parts of a log as one asks for them: ``flight.bin@73.2:227.3``."""
+    return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in parts]
+
+
+def left_on_ground(names: Sequence[str]) -> str:
+    """What is used of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
+    whole = names[0].rpartition("@")[0]
+    return f"time on the ground is left out: fits use {' '.join(names)}; for all of it give {whole}@0:"
+
+
+def first_imu_time(recording: Recording) -> float:
+    """Time [s] of the first gyro or accelerometer sample, else of the first sample of any channel."""
+    imu = [float(c.t[0]) for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
+    rest = [float(c.t[0]) for c in recording.channels.values() if len(c.t)]
+    return min(imu or rest, default=0.0)
