@@ -14,13 +14,15 @@ from quadid.window import Channel, Recording
 Spans = tuple[tuple[float, float], ...]
 
 _LEAST = 0.5
-"""Flying means at least this fraction of hover thrust."""
+"""Flying means at least this fraction of hover thrust …"""
+_CARRIES = 0.9
+"""… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
 _IDLE = 0.15
 """Commands that never exceed this fraction of full are idling motors."""
 _GROUND = 3.0
 """Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
-_MARGIN = 1.0
-"""Left out after take-off and before landing [s]: feet and ground push, too."""
+_MARGIN = 2.0
+"""Left out after take-off and before landing [s]: feet, ground and the air above it push, too."""
 _FLIGHT = 5.0
 """Shortest flight worth proposing [s]."""
 _SHORTEST, _BRIDGE = 1.0, 0.5
@@ -43,7 +45,8 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
         t, on = rotors.t, thrust > _LEAST * hover
         if "accel" in channels and len(channels["accel"].t) > 10:
             on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
-        return _spans(t, on)
+        carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
+        return tuple(narrow for span in _spans(t, on) if (narrow := _within(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))
     return ()
@@ -110,6 +113,12 @@ def _vibrates(accel: Channel) -> BoolArray:
     length = np.linalg.norm(accel.values, axis=1)
     mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
+
+
+def _within(span: tuple[float, float], times: FloatArray) -> tuple[float, float] | None:
+    """First and last of the rising `times` [s] in a span; None where that is too short."""
+    inside = times[np.searchsorted(times, span[0]) : np.searchsorted(times, span[1], "right")]
+    return (float(inside[0]), float(inside[-1])) if len(inside) and np.ptp(inside) >= _SHORTEST else None
 
 
 def _spans(t: FloatArray, on: BoolArray) -> Spans:

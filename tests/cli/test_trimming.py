@@ -38,24 +38,24 @@ def standing(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> None:
     run = inside("inspect", standing, "--vehicle", "pelican", "--json", "-")
-    assert run.data["use"] == ["standing.csv@11:30"]
-    assert "use standing.csv@11:30" in inside("inspect", standing, "--vehicle", "pelican").out
-    assert inside("inspect", f"{standing}@11:30", "--json", "-").data["use"] == []
+    assert run.data["use"] == ["standing.csv@12:30"]
+    assert "use standing.csv@12:30" in inside("inspect", standing, "--vehicle", "pelican").out
+    assert inside("inspect", f"{standing}@12:30", "--json", "-").data["use"] == []
 
 
 def test_only_what_is_in_the_air_is_used_and_said_once(standing: Path) -> None:
     log = quadid.load(standing, vehicle="pelican")
     assert [w for w in log.warnings if "ground" in w] == [
-        "standing.csv: time on the ground is left out: fits use standing.csv@11:30; for all of it give standing.csv@0:"
+        "standing.csv: time on the ground is left out: fits use standing.csv@12:30; for all of it give standing.csv@0:"
     ]
     (flown,) = log.windows
-    (cut,) = quadid.load(f"{standing}@11:30", vehicle="pelican").windows
+    (cut,) = quadid.load(f"{standing}@12:30", vehicle="pelican").windows
     np.testing.assert_array_equal(flown.gyro, cut.gyro)
     (slower,) = log.at(25.0).windows
-    assert slower.t[0] >= log.recording.channels["gyro"].t[0] + 11.0 - 1e-6
+    assert slower.t[0] >= log.recording.channels["gyro"].t[0] + 12.0 - 1e-6
 
 
-@pytest.mark.parametrize("part", ["@0:", "@11:30"])
+@pytest.mark.parametrize("part", ["@0:", "@12:30"])
 def test_a_part_that_was_asked_for_is_used_as_it_is(standing: Path, part: str) -> None:
     log = quadid.load(f"{standing}{part}", vehicle="pelican")
     assert not [w for w in log.warnings if "ground" in w]
@@ -69,7 +69,7 @@ def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> No
     wrong = write_table(tmp_path / "wrong.csv", names, rows)
     with pytest.raises(LogError) as refused:
         quadid.load(wrong, vehicle="pelican")
-    assert "use wrong.csv@11:30" in str(refused.value.fix)
+    assert "use wrong.csv@12:30" in str(refused.value.fix)
 
 
 def test_a_recorded_flight(inside: Cli, data_dir: Path) -> None:

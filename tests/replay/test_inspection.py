@@ -328,6 +328,14 @@ def test_flying_spans_leave_out_the_ground(clean: Recording) -> None:
     assert inspect(replace(pulses, channels={"motor_command": armed})).flying == ()
 
 
+def test_a_flight_begins_when_the_rotors_carry_the_weight(clean: Recording) -> None:
+    t = clean.channels["rotor_speed"].t
+    slowly = np.clip((t - 4.0) / 4.0, 0.05, 1.0)  # thrust rises for four seconds, and carries the weight at the end
+    rising = changed(clean, "rotor_speed", lambda speed: np.sqrt(slowly)[:, None] * speed)
+    (span,) = inspect(rising, PELICAN).flying
+    assert 7.2 < span[0] < 8.2
+
+
 def test_lying_on_the_back_with_turning_motors_is_no_flight(clean: Recording, happened: Happened) -> None:
     late = clean.channels["accel"].t > 12.0
     crashed = changed(clean, "accel", lambda v: np.where(late[:, None], [0.0, 3.0, 9.0], v))
@@ -430,11 +438,11 @@ def test_a_flight_that_hardly_turns_is_not_called_wrong(profile: str, verdict: s
     [
         (((0.0, 60.0),), ()),
         (((1.0, 59.5),), ()),
-        (((12.0, 50.0),), ((13.0, 49.0),)),
-        (((0.2, 40.0),), ((0.0, 39.0),)),
-        (((12.0, 20.0), (20.6, 50.0)), ((13.0, 49.0),)),
-        (((5.0, 20.0), (30.0, 60.0)), ((6.0, 19.0), (31.0, 60.0))),
-        (((5.0, 8.0), (30.0, 60.0)), ((31.0, 60.0),)),
+        (((12.0, 50.0),), ((14.0, 48.0),)),
+        (((0.2, 40.0),), ((0.0, 38.0),)),
+        (((12.0, 20.0), (20.6, 50.0)), ((14.0, 48.0),)),
+        (((5.0, 20.0), (30.0, 60.0)), ((7.0, 18.0), (32.0, 60.0))),
+        (((5.0, 8.0), (30.0, 60.0)), ((32.0, 60.0),)),
         ((), ()),
     ],
 )
