@@ -13,7 +13,7 @@ from quadid.workflow.parts import Cut, first_imu_time, flown_parts, left_on_grou
 
 if TYPE_CHECKING:
     from quadid.grid import GridReport
-    from quadid.inspection import Spans
+    from quadid.inspection.airborne import Spans
     from quadid.vehicle import Vehicle
     from quadid.window import Recording, Window
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from quadid.errors import LogError
 
 if TYPE_CHECKING:
-    from quadid.inspection import Spans
+    from quadid.inspection.airborne import Spans
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
 
