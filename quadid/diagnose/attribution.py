@@ -12,7 +12,7 @@ ten-second blocks of the training log are left out in turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,19 +50,19 @@ class Benefit:
 class Validation:
     """Error on unseen data: flights given for validation, else blocks left out; noise floor 1.
 
-    Of the segments that decided the diagnosis; `stated_errors` has it in the measure of an identification.
-
     Attributes:
-        nominal, extended: mean squared error without and with the findings.
+        nominal, extended: mean squared error without and with the findings, as `stated_errors` has it.
         on: ``validation logs`` or ``held-out blocks``.
+        deciding: the same two of the segments that decided the diagnosis.
         refitted: extended, with per-log values refitted on the first half of each log and scored on the second; only
-            where it is stated, and there are such.
-        contradicted: the findings make the prediction of the validation logs worse, values of a flight refitted.
+            where there are such.
+        contradicted: the findings make the prediction of unseen data worse, values of a flight refitted.
     """
 
     nominal: float
     extended: float
     on: str
+    deciding: tuple[float, float]
     refitted: float | None = None
     contradicted: bool = False
 
@@ -131,7 +131,7 @@ class Worth:
 
 def validate(
     decisive: Shooting, nominal: Model, model: Model, logs: Sequence[Window], listed: Sequence[Candidate]
-) -> tuple[Validation, tuple[Worth, ...]]:
+) -> tuple[tuple[float, float], tuple[Worth, ...]]:
     """Scores nominal and extended model on unseen data, and each cause by leaving it out (`without_in_clutter`).
 
     Args:
@@ -142,15 +142,15 @@ def validate(
         listed: the catalogue.
 
     Returns:
-        The overall figures, and the worth of each cause: what is larger than on any vehicle first, then by gain.
+        The errors without and with all causes in the segments that decided, and the worth of each cause: what is larger
+        than on any vehicle first, then by gain.
     """
     models = {_NOMINAL: nominal, _FOUND: model, **_each_left_out(decisive, model, listed)}
     left_out: Errors = {key: (m.held_out, m.rows) for key, m in models.items()}
-    unseen, on, contradicted = left_out, "held-out blocks", False
+    unseen = left_out
     if logs:
         scorer = decisive.on(logs)
-        unseen, on = {key: block_deviance(scorer, m) for key, m in models.items()}, "validation logs"
-        contradicted = _contradicted(scorer, nominal, model, logs, unseen)
+        unseen = {key: block_deviance(scorer, m) for key, m in models.items()}
     before, after = (float(total.sum()) / rows for total, rows in (unseen[_NOMINAL], unseen[_FOUND]))
     worth = []
     for cause in model.causes:
@@ -158,7 +158,7 @@ def validate(
         errors = left_out if EFFECTS[cause.effect].per_log else unseen
         worth.append(_worth(cause, errors, ordinary(decisive, model, cause, listed), decisive.seconds))
     worth.sort(key=lambda w: (w.ordinary, -w.deviance))
-    return Validation(before, after, on, None, contradicted), tuple(worth)
+    return (before, after), tuple(worth)
 
 
 def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
@@ -178,39 +178,11 @@ def _worth(cause: Candidate, errors: Errors, ordinary: bool, seconds: float) -> 
     return Worth(cause, benefit, gain.total, ordinary)
 
 
-def _contradicted(scorer: Shooting, nominal: Model, model: Model, logs: Sequence[Window], unseen: Errors) -> bool:
-    """Whether the findings make the prediction of the validation logs worse, values of a flight refitted."""
-    if not model.causes or any(c.timed is not None for c in model.causes):
-        return False
-    gains = [
-        block_deviance(second, nominal)[0].sum() - block_deviance(second, model, theta)[0].sum()
-        for second, theta in second_halves(scorer, model, logs)
-    ]
-    return bool((sum(gains) if gains else unseen[_NOMINAL][0].sum() - unseen[_FOUND][0].sum()) < 0.0)
-
-
-def block_deviance(scorer: Shooting, model: Model, theta: FloatArray | None = None) -> tuple[FloatArray, float]:
+def block_deviance(scorer: Shooting, model: Model) -> tuple[FloatArray, float]:
     """Deviance of each block of unseen data with parameters as fitted, and the independent rows."""
-    point = model.theta if theta is None else theta
     names = [n for c in model.causes for n in c.names]
-    lin = settle_states(scorer, point, names)
+    lin = settle_states(scorer, model.theta, names)
     labels = block_labels(lin)
     total = np.zeros(int(labels.max()) + 1)
     np.add.at(total, labels, lin.cost + lin.occam)
     return total, lin.total_rows
-
-
-def second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> Iterator[tuple[Shooting, FloatArray]]:
-    """The second half of each log, and `model` with what belongs to a flight refitted on the first; none without such.
-
-    Args:
-        scorer: how halves are cut and weighted.
-        model: fitted to other flights.
-        logs: long enough ones count.
-    """
-    per_log = model.per_log_names
-    for window in logs:
-        middle = len(window) // 2
-        if per_log and middle >= 4 * scorer.length:
-            first, second = (scorer.on([w]) for w in (window.slice(0, middle), window.slice(middle, len(window))))
-            yield second, polish(first, model.theta, first.free(per_log), iterations=6).theta

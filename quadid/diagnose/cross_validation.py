@@ -13,6 +13,7 @@ share (Geisser and Eddy, J. Am. Stat. Assoc. 74 (1979) 153).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -41,28 +42,36 @@ def block_labels(lin: Linearised) -> IndexArray:
     return labels
 
 
-def held_out_deviance(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> FloatArray:
-    """Deviance of each block in the density that the other blocks predict, shape (blocks,).
+class HeldOut(NamedTuple):
+    """Deviances with the parameters of all blocks but one, for each in turn, shapes (blocks,).
+
+    Attributes:
+        block: of the block itself, in the density that the other blocks predict.
+        rest: of the other blocks, at their own optimum.
+    """
+
+    block: FloatArray
+    rest: FloatArray
+
+
+def held_out(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> HeldOut:
+    """Deviance of each block in the density that the other blocks predict, and of those.
 
     Twice the negative logarithm of N(r; r(z), I + B V B'), with z and V mean and covariance of the parameters from the
     other blocks and B the derivative of the block's residuals r; less that of the noise alone, N(0; 0, I).
     """
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     if grad.shape[1] == 0:
-        return cost
+        return HeldOut(cost, cost.sum() - cost)
     z = steps_without(gram, grad, prior_precision)
     moved = np.einsum("bpq,bq->bp", gram, z)
     slope, rest = grad + moved, _rest(gram, prior_precision)
     shared = np.einsum("bp,bp->b", slope, np.linalg.solve(rest + gram, slope[..., None])[..., 0])
     spread = np.linalg.slogdet(rest + gram)[1] - np.linalg.slogdet(rest)[1]
-    return np.asarray(cost + np.sum((grad + slope) * z, axis=1) - shared + spread)
-
-
-def deviance_without(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> FloatArray:
-    """Deviance of all blocks but one under parameters fitted to them, for each block in turn, shape (blocks,)."""
-    gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
-    z = steps_without(gram, grad, prior_precision) if grad.shape[1] else np.zeros_like(grad)
-    return np.asarray(cost.sum() - cost + np.sum((grad.sum(axis=0) - grad) * z, axis=1))
+    return HeldOut(
+        cost + np.sum((grad + slope) * z, axis=1) - shared + spread,
+        cost.sum() - cost + np.sum((grad.sum(axis=0) - grad) * z, axis=1),
+    )
 
 
 def steps_without(gram: FloatArray, grad: FloatArray, prior_precision: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import block_labels, deviance_without, held_out_deviance
+from quadid.diagnose.cross_validation import block_labels, held_out
 from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import EFFECTS, NEVER
 from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
@@ -112,10 +112,9 @@ def fit_model(
 def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
     """Wraps the result of a polish with the default prior, with its held-out deviance."""
     prior = default_prior(shooting, free)
-    blocks = block_labels(result.lin)
-    held_out, rest = (of(result.lin, prior.precision, blocks) for of in (held_out_deviance, deviance_without))
+    left_out = held_out(result.lin, prior.precision, block_labels(result.lin))
     return Model(
-        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, held_out, rest
+        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, *left_out
     )
 
 

@@ -18,6 +18,7 @@ from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remaind
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
+from quadid.diagnose.stated_errors import Identified, stated_errors
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import possible_moments
@@ -70,7 +71,7 @@ class Workings:
 
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False,
+    progress: Progress | None = None, swarm: bool = False, nominal: Identified | None = None,
 ) -> tuple[Diagnosis, Workings]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
@@ -81,6 +82,7 @@ def diagnose(
         seed: for the swarm, where asked for, and drawn noise.
         progress: called with a stage and a fraction.
         swarm: search globally first, for poor initial guesses.
+        nominal: identification of `windows` that errors are stated with; by default that of the selection.
 
     Raises:
         WindowError, NotIdentifiableError: as `quadid.identify.fit.fit`.
@@ -95,7 +97,9 @@ def diagnose(
     decisive = search.shooting
     left = remainder(decisive, search.model, seed)
     report("validation", 0.0)
-    outcome, per_finding = validate(decisive, search.nominal, search.model, validation, begun.listed)
+    deciding, per_finding = validate(decisive, search.nominal, search.model, validation, begun.listed)
+    nominal = nominal or Identified(vehicle, search.nominal.theta, decisive.noise)
+    outcome = stated_errors(nominal, search.model, windows, validation, deciding)
     doubts = impossible_causes(search.model) | inconstant_causes(search.model, left)
     unnamed = sum(max(w.deviance, 0.0) for w in per_finding if w.cause.label in doubts)
     verdict = judge(search.nominal, search.model, left, unnamed)

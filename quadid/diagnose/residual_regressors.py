@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import Gain, block_labels, held_out_deviance, paired_gain
+from quadid.diagnose.cross_validation import Gain, block_labels, held_out, paired_gain
 from quadid.diagnose.model import Model
 from quadid.identify.schur_complement import eliminated
 from quadid.identify.segment_jacobian import Columns
@@ -153,7 +153,7 @@ def _judge(
     precision = np.concatenate([model.prior.precision, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
     both = replace(model.lin, gram=gram, grad=grad)
     none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
-    gain = paired_gain(held_out_deviance(none, precision[:own], labels), held_out_deviance(both, precision, labels))
+    gain = paired_gain(held_out(none, precision[:own], labels).block, held_out(both, precision, labels).block)
     each = _chi_squares(gram.sum(axis=0), grad.sum(axis=0), precision, own)
     alone = [Alone(site.name, n, float(c)) for n, c in zip(names, each, strict=True)]
     return Follows(site, gain, names[int(np.argmax(each))]), alone

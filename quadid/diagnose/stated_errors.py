@@ -1,50 +1,65 @@
-"""Errors of a diagnosis as an identification of the same flights states them.
+"""Errors of a diagnosis as an identification of the same flights states them, by which its verdict is judged.
 
-What decides a diagnosis is the deviance of the longest segments that the model follows, around noise that is estimated
-anew as causes become known.  What it states is the measure of `quadid.identify.score`: runs of one second, in the noise
-that the identification estimated, from the parameters that the identification found.
+What decides between causes is the deviance of the longest segments that the model follows, around noise that is
+estimated anew as causes become known.  What is stated is the measure of `quadid.identify.score`: runs of one second, in
+the noise that the identification estimated, from the parameters that the identification found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from quadid.diagnose.attribution import Validation, second_halves
+from quadid.diagnose.attribution import Validation
 from quadid.diagnose.cross_validation import block_labels, steps_without, sum_by_block
 from quadid.diagnose.model import Model, free_names
-from quadid.identify.fit import Fit
+from quadid.identify.gauss_newton import polish
+from quadid.identify.noise_model import NoiseModel
 from quadid.identify.priors import default_prior, posterior_covariance
 from quadid.identify.score import SCORE_SECONDS, Tally, covering, mse_score, settle_states, tallied
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 
+class Identified(NamedTuple):
+    """The nominal model and the noise that errors are stated with: vehicle, full vector, noise."""
+
+    vehicle: Vehicle
+    theta: FloatArray
+    noise: NoiseModel
+
+
 def stated_errors(
-    fit: Fit, model: Model, windows: Sequence[Window], validation: Sequence[Window], decided: Validation
-) -> Validation:
+    nominal: Identified, model: Model, windows: Sequence[Window], validation: Sequence[Window],
+    deciding: tuple[float, float],
+) -> Validation:  # fmt: skip
     """Errors without and with the findings, as `mse_score` has them; without validation logs, of blocks left out.
 
     Args:
-        fit: identification of `windows`: the nominal model, and the noise.
+        nominal: identification of `windows`.
         model: the extended one.
         windows: what was diagnosed.
         validation: flights that were not.
-        decided: the figures that decided.
+        deciding: errors without and with the findings in the segments that decided.
     """
+    both, refitted = (nominal.theta, model.theta), None
     if validation:
-        before, after = (mse_score(validation, fit.vehicle, theta, fit.noise).mse for theta in (fit.theta, model.theta))
-        return replace(decided, nominal=before, extended=after, refitted=_refitted(fit, model, validation))
-    names = list(NOMINAL_NAMES), free_names(model.causes)
-    before, after = (
-        left_out_error(_scorer(fit, windows), theta, free)
-        for theta, free in zip((fit.theta, model.theta), names, strict=True)
-    )
-    return replace(decided, nominal=before, extended=after)
+        on = "validation logs"
+        before, after = (mse_score(validation, nominal.vehicle, theta, nominal.noise).mse for theta in both)
+        refitted = _refitted(nominal, model, validation)
+    else:
+        on, scorer = "held-out blocks", _scorer(nominal, windows)
+        names = list(NOMINAL_NAMES), free_names(model.causes)
+        before, after = (left_out_error(scorer, theta, free) for theta, free in zip(both, names, strict=True))
+    # What happens at a moment of one flight happens at none of another.
+    comparable = bool(model.causes) and not (validation and any(c.timed is not None for c in model.causes))
+    unseen = after if refitted is None else refitted
+    return Validation(before, after, on, deciding, refitted, comparable and unseen > before)
 
 
 def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) -> float:
@@ -72,15 +87,31 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
     return float("inf") if total is None else total.mse
 
 
-def _scorer(fit: Fit, windows: Sequence[Window]) -> Shooting:
-    shooting = Shooting.cut(windows, fit.vehicle, SCORE_SECONDS)
-    return shooting.with_noise(covering(fit.noise, shooting.channels, fit.vehicle))
+def _scorer(nominal: Identified, windows: Sequence[Window]) -> Shooting:
+    shooting = Shooting.cut(windows, nominal.vehicle, SCORE_SECONDS)
+    return shooting.with_noise(covering(nominal.noise, shooting.channels, nominal.vehicle))
 
 
-def _refitted(fit: Fit, model: Model, logs: Sequence[Window]) -> float | None:
+def _refitted(nominal: Identified, model: Model, logs: Sequence[Window]) -> float | None:
     """Error of the second half of each log, what belongs to a flight refitted on its first; None without such."""
     total: Tally | None = None
-    for second, theta in second_halves(_scorer(fit, logs), model, logs):
+    for second, theta in _second_halves(_scorer(nominal, logs), model, logs):
         part = tallied(second, theta)
         total = part if total is None else total + part
     return None if total is None else total.mse
+
+
+def _second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> Iterator[tuple[Shooting, FloatArray]]:
+    """The second half of each log, and `model` with what belongs to a flight refitted on the first; none without such.
+
+    Args:
+        scorer: how halves are cut and weighted.
+        model: fitted to other flights.
+        logs: long enough ones count.
+    """
+    per_log = model.per_log_names
+    for window in logs:
+        middle = len(window) // 2
+        if per_log and middle >= 4 * scorer.length:
+            first, second = (scorer.on([w]) for w in (window.slice(0, middle), window.slice(middle, len(window))))
+            yield second, polish(first, model.theta, first.free(per_log), iterations=6).theta

@@ -166,26 +166,25 @@ def diagnose(
         LogError: a log that does not fit the vehicle.
     """
     from quadid.diagnose.pipeline import diagnose as diagnose_windows
-    from quadid.diagnose.stated_errors import stated_errors
+    from quadid.diagnose.stated_errors import Identified
     from quadid.model.supply import with_reference_voltage
 
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
     check_length(windows)
-    found, workings = diagnose_windows(windows, described, unseen, seed, advance)
     unreachable = out_of_reach(train)
     # One flight has one error: what `quadid identify` states for it, and what the findings make of that.
     fit = search(
         OPTIMIZERS[0], windows, with_reference_voltage(described, windows), seed,
         lambda _, share: advance("nominal fit", share), unreachable,
     )  # fmt: skip
-    decided, model = found.validation, workings.search.model
-    stated = stated_errors(fit, model, windows, unseen, decided)
-    found = replace(_within_reach(found, unreachable), validation=stated)
-    result = found.to_dict()
+    nominal = Identified(fit.vehicle, fit.theta, fit.noise)
+    found, workings = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
+    found, model = _within_reach(found, unreachable), workings.search.model
+    result, (before, after) = found.to_dict(), found.validation.deciding
     result["validation"]["deciding"] = {
-        "seconds": workings.decisive.seconds, "mse_nominal": decided.nominal, "mse_extended": decided.extended
+        "seconds": workings.decisive.seconds, "mse_nominal": before, "mse_extended": after
     }  # fmt: skip
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed

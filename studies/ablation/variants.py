@@ -12,13 +12,13 @@ from types import ModuleType
 from typing import Any
 
 import quadid.diagnose
-from quadid.diagnose.attribution import validate
 from quadid.diagnose.cross_validation import paired_gain
 from quadid.diagnose.hypotheses import candidates
 from quadid.diagnose.log_evidence import RELEVANT
 from quadid.diagnose.model import Model, fit_model
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
+from quadid.diagnose.stated_errors import stated_errors
 from quadid.identify.noise_estimation import flexible_fit
 from quadid.identify.shooting import Shooting
 from studies.ablation.house import measured
@@ -131,8 +131,7 @@ def _as_scanned(shooting: object, model: Any, candidate: object) -> Any:
 
 
 def _uncontradicted(*given: Any) -> Any:
-    figures, worth = validate(*given)
-    return replace(figures, contradicted=False), worth
+    return replace(stated_errors(*given), contradicted=False)
 
 
 def _first_guess(*given: Any) -> Any:
@@ -160,7 +159,7 @@ RULES: dict[str, dict[str, Any]] = {
     "longest segments where velocity is found": {"is_long": _given(False)},
     "clutter in what a cause is worth": {"untidy_names": _given([])},
     "ordinary sizes last": {"ordinary": _given(False)},
-    "contradiction by validation flights": {"validate": _uncontradicted},
+    "contradiction by unseen data": {"stated_errors": _uncontradicted},
     "what the rest follows": {"follows": _given(((), ()))},
 }
 """Rules that are functions, and what stands in their place."""
