@@ -29,7 +29,7 @@ from quadid.identify.global_search import swarm_search
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, noise_floor, residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
-from quadid.identify.reliability import MISFIT, reliability
+from quadid.identify.reliability import reliability
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
 from quadid.identify.shooting import Shooting
 from quadid.model.supply import with_reference_voltage
@@ -149,17 +149,14 @@ def _nominal_parameters(
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
-    Where the model misses something, estimates must agree as those of an identification, and with those without each
-    cause in `doubts` (labels): it stands for something else, which may do to them what it does.  Where the cause of the
-    error is unknown, so is what it does to them: none is identified; nor an inertia beside a doubtful moment.
+    Estimates must agree as those of an identification, and with those without each cause in `doubts` (labels): it
+    stands for something else, which may do to them what it does.  Where the cause of the error is unknown, so is what
+    it does to them: none is identified; nor an inertia beside a doubtful moment.
     """
-    uncertain, initial = model.uncertainty, decisive.layout.initial(decisive.vehicle)
-    reasons: tuple[str, ...] = ()
-    if model.reduced_chi_square > MISFIT:
-        trust = reliability(
-            decisive, model, model.free, model.prior, polish(short, model.theta, model.free, model.prior, iterations=8)
-        )
-        uncertain, reasons = trust.widened(uncertain), trust.reasons(model.free, uncertain)
+    brief = polish(short, model.theta, model.free, model.prior, iterations=8)
+    trust = reliability(decisive, model, model.free, model.prior, brief)
+    uncertain, reasons = trust.widened(model.uncertainty), trust.reasons(model.free, model.uncertainty)
+    initial = decisive.layout.initial(decisive.vehicle)
     steps = {label: model.free.step(model.theta, without(decisive, model, c).theta)
              for c in model.causes if (label := c.label) in doubts}  # fmt: skip
     uncertain = uncertain.differing(list(steps.values()))

@@ -1,9 +1,9 @@
 """Whether a number deserves its name: estimates of one parameter that agree wherever the model is right.
 
-Blocks of time, short segments beside long ones, and models with each cause added that the residual asks for, all
-estimate the same parameters.  What they differ by beyond chance belongs to the model, not to the noise: intervals are
-widened by it, between blocks as random effects (DerSimonian and Laird, Controlled Clinical Trials 7 (1986) 177), and
-beyond `SPREAD_LIMIT` the number is not to be used.
+Blocks of time, short segments beside long ones, every second row (`coarse_grid`), and models with each cause added
+that the residual asks for, all estimate the same parameters.  What they differ by beyond chance belongs to the
+model, not to the noise: intervals are widened by it, between blocks as random effects (DerSimonian and Laird,
+Controlled Clinical Trials 7 (1986) 177), and beyond `SPREAD_LIMIT` the number is not to be used.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.chi_square import exceeded
+from quadid.identify.coarse_grid import SHARE, on_coarse_grid
 from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, uncertainty
 from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
@@ -113,7 +114,10 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         steps = [free.step(found.theta, theta) for theta in (short.theta, longer.theta)]
         names = ["without the slow moments set aside", "in longer segments"]
     else:
-        steps, names = [_other_band(found, free, own, short, prior)], ["in short segments"]
+        steps, names = [_beyond_chance(found, free, own, short, prior)], ["in short segments"]
+    if (rows := on_coarse_grid(problem, found, free, prior)) is not None:
+        steps.append(SHARE * _beyond_chance(found, free, own, rows, prior))
+        names.append("on a finer grid")
     for name, step, remains in _with_causes(problem, found, free, prior):
         steps.append(step)
         names.append(f"with {name} in the model")
@@ -152,12 +156,12 @@ def _longer(problem: Shooting, short: Polished, free: Free, prior: Prior) -> Pol
     return polish(cut.at_most(MOST_SEGMENTS), short.theta, free, prior) if cut.count else short
 
 
-def _other_band(found: Polished, free: Free, own: Uncertainty, short: Polished, prior: Prior) -> FloatArray:
-    """Scaled step to the estimate of short segments, zero where chance explains it, shape (P,)."""
-    if not np.isfinite(short.cost):
+def _beyond_chance(found: Polished, free: Free, own: Uncertainty, other: Polished, prior: Prior) -> FloatArray:
+    """Scaled step to another estimate of the same data, zero where chance explains it, shape (P,)."""
+    if not np.isfinite(other.cost):
         return np.zeros(len(free.entries))
-    step = free.difference(short.theta[free.index], found.theta[free.index])
-    chance = exceeded(CHANCE, 1) * (uncertainty(short.lin, prior).sigma ** 2 + own.sigma**2)
+    step = free.difference(other.theta[free.index], found.theta[free.index])
+    chance = exceeded(CHANCE, 1) * (uncertainty(other.lin, prior).sigma ** 2 + own.sigma**2)
     return np.where(step**2 > chance, step, 0.0)
 
 
