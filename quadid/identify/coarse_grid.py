@@ -9,6 +9,7 @@ therefore shows three times what the rows at hand may be off by (Richardson, Phi
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def on_coarse_grid(problem: Shooting, found: Polished, free: Free, prior: Prior)
 def coarse(window: Window) -> Window:
     """Every second row of `window`; forces and held speeds are means over the longer rows."""
     n = len(window) // 2 * 2
-    even = {name: None if (x := getattr(window, name)) is None else x[:n:2] for name in _INSTANTS}
+    even: dict[str, Any] = {name: None if (x := getattr(window, name)) is None else x[:n:2] for name in _INSTANTS}
     accel = None if window.accel is None else _smoothed(window.accel)[:n:2]
     speed, slope = window.rotor_speed[:n:2], None
     if window.sampling == "held":

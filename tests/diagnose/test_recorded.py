@@ -49,3 +49,15 @@ def test_inertias_beside_causes_that_leave_much_are_identified_only_where_estima
     doubted = [p.name for p in found.parameters if p.status is Status.UNRELIABLE]
     assert doubted
     assert all(any(name in warning for warning in found.warnings) for name in doubted), found.warnings
+
+
+def test_causes_that_make_the_stated_error_worse_explain_nothing(data_dir: Path) -> None:
+    """In segments that find states of their own they leave a third of the error; from measured states they run away."""
+    folder = data_dir / "arpl"
+    found = quadid.diagnose(quadid.load(f"{folder / 'log15.csv'}@:18", vehicle=folder / "vehicle.yaml"))
+    stated = found.result["validation"]
+    assert stated["deciding"]["mse_extended"] < 0.5 * stated["deciding"]["mse_nominal"]
+    assert stated["mse_extended"] > stated["mse_nominal"]
+    assert found.result["verdict"] == "unknown"
+    assert not any(f["confident"] for f in found.result["findings"])
+    assert not any(p["status"] == "identified" for p in found.result["parameters"])

@@ -1,0 +1,68 @@
+"""Every second row of a flight: what it holds, and what it says of inputs that run on within a row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.flight import draw_truth, fly
+from quadid.identify.coarse_grid import coarse
+from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.parameters import NOMINAL_NAMES, Status
+from quadid.types import FloatArray
+from quadid.window import Window
+from tests.identify.flights import PELICAN, guessed, values_of
+
+LATE = {"command_delay": {"delay": 0.027}}
+"""Behind a delay nothing in the motion tells what the commands did within their samples."""
+
+
+def test_instants_are_every_second_row_and_forces_means_over_the_longer_ones() -> None:
+    t = 0.02 * np.arange(101)
+    wave = np.column_stack([np.sin(3.0 * t), np.cos(2.0 * t), t])
+    window = Window(1.0, 0.02, np.full((101, 4), 400.0), gyro=wave, accel=wave, sampling="instant")
+    half = coarse(window)
+    np.testing.assert_array_equal(half.t, window.t[:100:2])
+    np.testing.assert_array_equal(half.gyro, wave[:100:2])
+    np.testing.assert_allclose(half.accel[1:], 0.25 * wave[1:98:2] + 0.5 * wave[2:99:2] + 0.25 * wave[3:100:2])  # type: ignore[index]
+
+
+def test_held_speeds_keep_their_thrust_and_a_straight_line_its_slope() -> None:
+    jump = np.repeat([[400.0], [500.0]], 4, axis=1)
+    half = coarse(Window(0.0, 0.02, np.tile(jump, (10, 1)), gyro=np.zeros((20, 3))))
+    np.testing.assert_allclose(half.rotor_speed**2, np.full((10, 4), 0.5 * (400.0**2 + 500.0**2)))
+    assert half.rotor_slope is None
+    ramp = 400.0 + 30.0 * 0.02 * (np.arange(20.0)[:, None] + 0.5) * np.ones(4)
+    line = Window(0.0, 0.02, ramp, gyro=np.zeros((20, 3)), rotor_slope=np.full((20, 4), 30.0))
+    np.testing.assert_allclose(coarse(line).rotor_slope, np.full((10, 4), 30.0))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def behind_a_delay() -> list[tuple[Fit, FloatArray]]:
+    """Fits of the nominal parameters and the delay to flights whose stabiliser acts at 1 kHz, and the truth."""
+    out = []
+    for seed in (31, 32, 33):
+        truth = draw_truth(PELICAN, seed)
+        window = fly(PELICAN, truth, 120.0, seed, effects=LATE, command_rate=1000.0).window
+        names = [*NOMINAL_NAMES, "command_delay.delay"]
+        found = fit([replace(window, rotor_slope=None)], guessed(truth, seed), FitOptions(iterations=0), names=names)
+        out.append((found, values_of(truth)))
+    return out
+
+
+def test_intervals_hold_what_commands_do_within_their_samples(behind_a_delay: list[tuple[Fit, FloatArray]]) -> None:
+    """Noise alone explains less than half of the errors of J_xx and J_yy."""
+    away = np.array([np.log(f.theta[2:4] / truth[2:4]) for f, truth in behind_a_delay])
+    wide, narrow = (
+        np.array([of(f)[2:4] for f, _ in behind_a_delay])
+        for of in (lambda f: f.uncertainty.sigma, lambda f: f.uncertainty.from_noise)
+    )
+    assert np.sqrt(np.mean((away / narrow) ** 2)) > 3.0
+    assert np.sqrt(np.mean((away / wide) ** 2)) < 1.4
+    assert np.all(wide < 0.005)
+
+
+def test_all_stay_identified(behind_a_delay: list[tuple[Fit, FloatArray]]) -> None:
+    assert {p.status for f, _ in behind_a_delay for p in f.parameters} == {Status.IDENTIFIED}
