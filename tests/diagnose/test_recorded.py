@@ -6,6 +6,7 @@ from pathlib import Path
 
 from quadid_replay import open_log
 
+import quadid
 from quadid.diagnose import diagnose
 from quadid.grid import to_windows
 from quadid.parameters import Status

@@ -55,10 +55,8 @@ def behind_a_delay() -> list[tuple[Fit, FloatArray]]:
 def test_intervals_hold_what_commands_do_within_their_samples(behind_a_delay: list[tuple[Fit, FloatArray]]) -> None:
     """Noise alone explains less than half of the errors of J_xx and J_yy."""
     away = np.array([np.log(f.theta[2:4] / truth[2:4]) for f, truth in behind_a_delay])
-    wide, narrow = (
-        np.array([of(f)[2:4] for f, _ in behind_a_delay])
-        for of in (lambda f: f.uncertainty.sigma, lambda f: f.uncertainty.from_noise)
-    )
+    wide = np.array([f.uncertainty.sigma[2:4] for f, _ in behind_a_delay])
+    narrow = np.array([f.uncertainty.from_noise[2:4] for f, _ in behind_a_delay])
     assert np.sqrt(np.mean((away / narrow) ** 2)) > 3.0
     assert np.sqrt(np.mean((away / wide) ** 2)) < 1.4
     assert np.all(wide < 0.005)
