@@ -235,7 +235,9 @@ class Vehicle(Strict):
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
-            raise VehicleError(f"{origin}: {_first_problem(error)}", fix="correct that entry") from error
+            problem = _first_problem(error)
+            fix = "add it, as docs/new-vehicle.md shows" if problem.startswith("no '") else "correct that entry"
+            raise VehicleError(f"{origin}: {problem}", fix=fix) from error
 
     @classmethod
     def shipped(cls, name: str) -> Vehicle:
@@ -278,6 +280,8 @@ def _first_problem(error: ValidationError) -> str:
     place = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
         return f"unknown key '{place}'; {nearest(str(detail['loc'][-1]), _valid_keys(detail['loc'][:-1]))}"
+    if detail["type"] == "missing":
+        return f"no '{place}'"
     message = detail["msg"].removeprefix("Value error, ")
     return f"{place}: {message} (found {detail['input']!r:.60})" if place else message
 

@@ -54,7 +54,12 @@ def read_mapping(text: str, origin: str, wanted: str = "a YAML mapping") -> dict
         raise VehicleError(f"{origin}: {plain(error.why, 200)}", fix=error.instead) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         first = (str(error).splitlines() or [""])[0]
-        raise VehicleError(f"{origin}: not YAML ({plain(first, 160)})", "a YAML mapping") from error
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f" in line {mark.line + 1}"
+        raise VehicleError(
+            f"{origin}: not YAML{where} ({plain(getattr(error, 'problem', None) or first, 160)})", "a YAML mapping",
+            "indent with spaces, and write `name: value`",
+        ) from error  # fmt: skip
     if not isinstance(value, dict):
         kind = "nothing" if value is None else "a list" if isinstance(value, list) else "one value"
         raise VehicleError(f"{origin}: holds {kind}", wanted)
@@ -68,7 +73,7 @@ def _check_depth(text: str) -> None:
             raise _RefusedError("anchors and aliases (& and *)", "write the values out")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
-            raise _RefusedError(f"nested deeper than {DEEPEST} levels", "see docs/vehicle-file.md")
+            raise _RefusedError(f"nested deeper than {DEEPEST} levels", "see docs/new-vehicle.md")
 
 
 def _value(node: yaml.Node, place: str) -> Any:

@@ -74,6 +74,7 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
 
 def conclude(done: Identified, target: Path, report: Path | None, series: Sequence[str], json: str | None) -> None:
     """Writes the vehicle file, the report, series and JSON, and prints the result."""
+    from quadid.workflow.reporting import known
     from quadid_cli import output, tables, terminal
 
     done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))
@@ -83,4 +84,6 @@ def conclude(done: Identified, target: Path, report: Path | None, series: Sequen
     if series:
         done.result["series"] = [str(path) for path in done.save_series(target.parent, series)]
     output.write_json(done.result, json)
-    tables.print_outcome(terminal.console(quiet=json == "-"), done)
+    console = terminal.console(quiet=json == "-")
+    console.print(f"{done.vehicle.name}: {known(done.vehicle)}, by its file. Every value rests on these.")
+    tables.print_outcome(console, done)

@@ -91,9 +91,21 @@ def reader(
 ) -> Callable[[Sequence[str]], list[Log]]:  # fmt: skip
     """What reads the logs of a command whose options these are; see `quadid.workflow.loading.load`."""
     from quadid.workflow.loading import load, parse_columns
+    from quadid_cli import terminal
 
     named = parse_columns(columns or [])
-    return lambda logs: [
-        load(text, vehicle, rate=rate, start=start, stop=stop, preset=preset, unchecked=unchecked, columns=named)
-        for text in logs
-    ]
+
+    def read(logs: Sequence[str]) -> list[Log]:
+        with terminal.progress(compiled=()) as advance:
+            out = []
+            for k, text in enumerate(logs):
+                advance(f"reading {Path(text).name}", k / len(logs))
+                out.append(
+                    load(
+                        text, vehicle, rate=rate, start=start, stop=stop, preset=preset, unchecked=unchecked,
+                        columns=named,
+                    )
+                )  # fmt: skip
+            return out
+
+    return read

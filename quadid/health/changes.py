@@ -212,13 +212,18 @@ def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple
     loss, loss_ci = _interval(one, 2 * k)
     drag, drag_ci = _interval(one, 2 * k + 1)
     sentence = (
-        f"Rotor {rotor} needs {100.0 * loss:.0f} % more command for its share of the load than in the baseline, "
-        f"and its drag torque is {100.0 * abs(drag):.0f} % {'lower' if drag >= 0.0 else 'higher'}."
+        f"For the same command rotor {rotor} gives {_less(loss)} thrust and {_less(drag)} drag torque than in the "
+        "baseline."
     )
     parameters = (
         ("rotor", "", float(rotor), None), ("loss", "", loss, loss_ci), ("drag_loss", "", drag, drag_ci),
     )  # fmt: skip
     return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
+
+
+def _less(share: float) -> str:
+    """A loss in words: ``22 % less``."""
+    return f"{100.0 * abs(share):.0f} % {'less' if share >= 0.0 else 'more'}"
 
 
 def _of_mass(

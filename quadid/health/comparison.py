@@ -18,6 +18,8 @@ from quadid.vehicle import Vehicle
 
 _DRAWS = 8192
 """Healthy flights that are drawn to tell how rare an evidence of change is among them."""
+LEAST_CHANCE = 1.0 / (_DRAWS + 1)
+"""The smallest `p_unchanged`: no drawn flight speaks for a change as much."""
 
 
 class Explained(NamedTuple):
@@ -126,7 +128,7 @@ def _changed_over_unchanged(
 
 
 def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> float:
-    """Chance that healthy flights speak for a change as much as `change` of trim does, or more; no less than 1/8193.
+    """Chance that healthy flights speak for a change as much as `change` of trim does; at least `LEAST_CHANCE`.
 
     What is compared is the evidence of all explanations together over that of no change: among all tests with as many
     false alarms, this one finds the most of what the priors expect (Neyman and Pearson).  Healthy flights are `_DRAWS`

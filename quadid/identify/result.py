@@ -70,7 +70,7 @@ def identify_result(
         "parameters": [parameter_entry(p) for p in fit.parameters],
         "sets": [_set_entry(s) for s in sets],
         "vehicle_file": vehicle_file,
-        "warnings": [*fit.warnings, *inertia_warnings(fit.parameters), *warnings],
+        "warnings": [*warnings, *fit.warnings, *inertia_warnings(fit.parameters)],
     }
 
 

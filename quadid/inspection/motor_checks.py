@@ -53,9 +53,10 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         if low <= needed / factor**2 <= high:
             return Check(
                 "hover", Verdict.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
-                f"multiply rotor speeds by {factor:.6g}, if the vehicle file is that of this log", numbers,
+                f"multiply rotor speeds by {factor:.6g}, or give this log's own vehicle file", numbers,
             )  # fmt: skip
-    fix = "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
+    few = "did it fly? Else " if needed > high else ""
+    fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
     return Check("hover", Verdict.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
 
 

@@ -93,6 +93,11 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
     gyro = recording.channels.get("gyro")
     t, values = signal.t[inside], signal.values[inside]
     low, high = np.min(values), np.max(values)
+    if np.ptp(values, axis=0).max() == 0.0 and gyro is not None and _moves(gyro, t[0], t[-1]):
+        return (
+            "no rotor ever changes its speed, though the vehicle moves: the speed signal is stuck",
+            {"stuck_s": float(t[-1] - t[0])},
+        )  # fmt: skip
     for rotor, column in enumerate(values.T):
         same = np.append(column[1:] == column[:-1], False) & (column > low) & (column < high)
         begin, end = _longest(t, same)

@@ -24,6 +24,8 @@ GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
 PARAMETERS = ("current parameters", "proposed parameters")
 MODELS = ("model without the findings", "model with the findings")
 LABELS = {"phi": "φ", "theta": "θ", "psi": "ψ"}
+DECADES = 30.0
+"""Ratio of bars from which they are drawn on a logarithmic axis."""
 WHOLE_POINTS = 800
 """Points a trace over a whole log keeps at most."""
 DETAIL_POINTS = 600
@@ -213,9 +215,13 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
         {"role": role, "name": name, "type": "bar", "orientation": "h", "x": [value], "y": [name], "showlegend": False}
         for name, value, role in rows[::-1]
     ]
-    highest = max([v for _, v, _ in rows if v is not None and math.isfinite(v)], default=floor)
+    sizes = [v for _, v, _ in rows if v is not None and math.isfinite(v) and v > 0.0] or [floor]
+    lowest, highest = min(*sizes, floor), 1.05 * max(sizes)
+    # Bars that differ much are drawn in decades, else the short ones would not be seen.
+    decades = {"type": "log", "range": [math.log10(0.5 * lowest), math.log10(highest)]}
+    scale = decades if highest > DECADES * lowest else {"range": [0.0, highest]}
     layout = {
-        "xaxis": axis(f"error, {finding['gain']['seconds']:g} s runs (noise = 1)", range=[0.0, 1.05 * highest]),
+        "xaxis": axis(f"error, {finding['gain']['seconds']:g} s runs (noise = 1)", **scale),
         "yaxis": {"type": "category"},
         "hovermode": "closest",
         "shapes": [upright(floor)],

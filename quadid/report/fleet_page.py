@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -39,7 +40,7 @@ def fleet_page(
         "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
         "verdict": asdict(fleet_verdict(summary, health)),
         "sections": [s for s in (
-            _health(health), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
+            _health(health, logs), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
             _common(summary), _unusable(summary), _logs(logs),
         ) if s is not None],
         "provenance": provenance,
@@ -87,20 +88,37 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
     return Verdict(level, headline, tuple(details), tuple(steps))
 
 
-def _health(rows: Sequence[JsonDict]) -> dict[str, Any] | None:
+def _when(logs: Sequence[JsonDict]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Where each log lies on an axis of time, and that axis.
+
+    Dates of files are mostly those of a copy: then flights are counted, in the order of their dates and names.
+    """
+    if all(log["dated_by"] == "log" for log in logs):
+        return {log["name"]: _date(log["started"]) for log in logs}, {"type": "date"}
+    count: Counter[str] = Counter()
+    places = {}
+    for log in sorted(logs, key=lambda log: (log["started"], log["name"])):
+        count[log["unit"]] += 1
+        places[log["name"]] = count[log["unit"]]
+    whole = {"tickformat": "d", "dtick": 1} if max(count.values()) <= 12 else {"tickformat": "d"}
+    return places, {**axis("flight of the vehicle, in the order of the files' dates"), **whole}
+
+
+def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any] | None:
     """Score of every flight over time, and what changed."""
     judged = [row for row in rows if not row["baseline"]]
     if not judged:
         return None
     units = sorted({row["unit"] for row in judged})[:MOST_UNITS]
+    places, time = _when(logs)
     data = []
     for i, unit in enumerate(units):
         own = [row for row in judged if row["unit"] == unit]
         score = np.array([row["score"] for row in own])
         line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=[row["log"] for row in own])
-        data.append({**line, "x": [_date(row["started"]) for row in own]})
+        data.append({**line, "x": [places[row["log"]] for row in own]})
     layout = {
-        "xaxis": {"type": "date"}, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
+        "xaxis": time, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
         "showlegend": True, "shapes": [level(HEALTHY_SCORE)],
     }  # fmt: skip
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
@@ -125,8 +143,11 @@ def _what_changed(row: JsonDict) -> str:
 
 def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:
     started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
+    when = _when(logs)
     rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
-    figures = [f for name in dict.fromkeys(p["parameter"] for p in rows) if (f := _one_figure(name, rows, started))]
+    figures = [
+        f for name in dict.fromkeys(p["parameter"] for p in rows) if (f := _one_figure(name, rows, started, *when))
+    ]
     if not figures:
         return None
     intro = "Every flight with its 95 % interval; a vehicle is a folder."
@@ -134,7 +155,7 @@ def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict
 
 
 def _one_figure(
-    name: str, rows: Sequence[JsonDict], started: Mapping[str, tuple[float, str]]
+    name: str, rows: Sequence[JsonDict], started: Mapping[str, tuple[float, str]], places: JsonDict, time: JsonDict
 ) -> dict[str, Any] | None:  # fmt: skip
     mine = sorted((p for p in rows if p["parameter"] == name), key=lambda p: started[p["log"]][0])
     units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
@@ -145,14 +166,13 @@ def _one_figure(
         value = np.array([p["value"] for p in own])
         upper = np.array([_gap(p["high"], p["value"]) for p in own])
         lower = np.array([_gap(p["value"], p["low"]) for p in own])
-        dates = [_date(started[p["log"]][0]) for p in own]
         bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
         line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
-        data.append({**line, "x": dates})
+        data.append({**line, "x": [places[p["log"]] for p in own]})
     if not data:
         return None
     layout = {
-        "xaxis": {"type": "date"}, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
+        "xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
         "showlegend": True,
     }  # fmt: skip
     return figure(f"fleet-{name}", name, data, layout, 280)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from quadid.health.comparison import LEAST_CHANCE
 from quadid.report.airframe_picture import change_value
 from quadid.report.parts import axis, figure, rows_of, section
 from quadid.report.text_table import Cell, Column, TextTable
@@ -45,9 +46,9 @@ def change_words(change: JsonDict) -> str:
 
 
 def rival_words(rival: JsonDict) -> str:
-    """An explanation that lost, with its probability: ``weak rotor 3, 4 (0.08)``."""
+    """An explanation that lost, with its probability: ``weak rotor 3 and 4 (0.08)``."""
     names = " and ".join([rival["effect"], *rival.get("with", ())]).replace("_", " ")
-    rotors = ", ".join(map(str, rival.get("rotors", ())))
+    rotors = " and ".join(map(str, rival.get("rotors", ())))
     return f"{names} {rotors}".rstrip() + f" ({rival['probability']:.2f})"
 
 
@@ -55,7 +56,7 @@ def health_verdict(result: JsonDict) -> Verdict:
     """Judges a result of the form ``quadid.health/1``."""
     verdict, changes = result["verdict"], result["changes"]
     n = len(result["baseline"])
-    chance = f"Chance that a healthy flight looks as changed: {result['p_value']:.2g}"
+    chance = f"Chance that a healthy flight looks as changed: {_chance(result['p_value'])}"
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
     details = [f"{chance} ({against})."]
     if verdict == "unchanged":
@@ -73,6 +74,11 @@ def health_verdict(result: JsonDict) -> Verdict:
     details += [f"Less certain: {'; '.join(change_words(c) for c in rest)}."] if rest else []
     steps = dict.fromkeys(_step(c) for c in sure)
     return Verdict(_LEVELS[verdict], headline, tuple(details), tuple(steps))
+
+
+def _chance(p_value: float) -> str:
+    """A chance; at `LEAST_CHANCE` the bound that 95 % of such draws keep to (rule of three)."""
+    return f"below {3.0 * LEAST_CHANCE:.1g}" if p_value <= LEAST_CHANCE else f"{p_value:.2g}"
 
 
 def _step(change: JsonDict) -> str:
@@ -117,7 +123,11 @@ def trim_table(result: JsonDict) -> TextTable:
         )
         for t in result["trim"]
     )  # fmt: skip
-    return TextTable("Trim, as shares of the load (effort: logarithm); distance in healthy spreads", columns, rows)
+    title = (
+        "Trim: roll, pitch and yaw as shares of all command, effort as logarithm of command per force; distance in "
+        "standard deviations of healthy flights"
+    )
+    return TextTable(title, columns, rows)
 
 
 def health_page(
@@ -135,8 +145,8 @@ def health_page(
 
     n, m = len(result["logs"]), len(result["baseline"])
     caption = (
-        "From above, nose up. Dashed: the load that each rotor carries in the baseline flights. Filled: now, a pixel a "
-        "per cent. Red: damaged; yellow: suspected."
+        "From above, nose up. Dashed: the command of each rotor in the baseline flights. Filled, with its change: now. "
+        "Red: damaged; yellow: suspected."
     )
     found = [
         (change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."), _rivals(c))

@@ -32,7 +32,7 @@ def health_trend(logs: Sequence[Row], trims: Sequence[Row], vehicles: Mapping[st
     """
     flown = {row["log"]: flight_from_dict(json.loads(row["trim"])) for row in trims}
     by_unit: dict[str, list[Row]] = {}
-    for log in sorted(logs, key=lambda row: float(row["started"])):
+    for log in sorted(logs, key=lambda row: (float(row["started"]), row["name"])):
         if log["name"] in flown and log["unit"] in vehicles:
             by_unit.setdefault(log["unit"], []).append(log)
     out = []

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid.errors import LogError
+from quadid.errors import LogError, NotIdentifiableError
 from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording
 from quadid.workflow.outcome import Outcome
 from quadid.workflow.parts import parse_cut
 
 if TYPE_CHECKING:
+    from quadid.health import FlightTrim
     from quadid.health.changes import Health
     from quadid.report.text_table import TextTable
     from quadid.report.verdict import Verdict
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
 
+LEAST_THRUST = 0.25
+"""No vehicle flies on less of its baseline's thrust per command, whatever it dropped and however new its propellers."""
 Flight = str | Path | Log
 """A log: its path, with a span if wanted, or as `quadid.load` returns it."""
 
@@ -103,6 +107,8 @@ def health(
     opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
     trims = [[flight_trim(recording, described) for recording in part] for part in opened]
     _distinct(*opened)
+    for trim in trims[0]:
+        _check_flown(trim, trims[1])
     found = assess(trims[0], trims[1], described)
     if len(trims[1]) < 3:
         warnings.append(
@@ -114,6 +120,16 @@ def health(
     result["logs"], result["baseline"] = ([recording.name for recording in part] for part in opened)
     result["warnings"] = warnings
     return HealthOutcome(result, found, described, tuple(opened[0] + opened[1]))
+
+
+def _check_flown(trim: FlightTrim, healthy: Sequence[FlightTrim]) -> None:
+    """Raises NotIdentifiableError where rotors give far less thrust than the healthy vehicle weighs."""
+    share = math.exp(trim.mean[-1] - sum(one.mean[-1] for one in healthy) / len(healthy))
+    if share < LEAST_THRUST:
+        raise NotIdentifiableError(
+            f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: it did not fly",
+            "flights", "give a flight, a hover will do",
+        )  # fmt: skip
 
 
 def _several(given: Flight | Sequence[Flight]) -> list[Flight]:

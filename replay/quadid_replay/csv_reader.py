@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,7 +53,7 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     layout, ignored = _layout(names, path.name)
     table, notes = _table(path, len(names), delimiter)
     if len(table) == 0:
-        raise _no_rows(path, len(names), delimiter)
+        raise _no_rows(path, names, delimiter)
     if ignored:
         notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
     _check_seconds(table[:, names.index("t")], path.name)
@@ -73,13 +73,31 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     return replace(recording, grid=_uniform_step(recording.channels))
 
 
-def _no_rows(path: Path, width: int, delimiter: str) -> LogError:
+def _no_rows(path: Path, names: Sequence[str], delimiter: str) -> LogError:
     _, lines, _ = next(_blocks(path))
+    width = len(names)
     commas = lines[0].count(",") if lines else 0
     if (delimiter != "," and commas) or (delimiter == "," and width < commas + 1 <= 2 * width):
         found = f"{path.name}: decimal commas ({plain(lines[0], 40)})"
         return LogError(found, "decimal points: 0.02", "export with decimal points, or in an English locale")
+    cells = lines[0].rstrip("\r\n").split(delimiter) if lines else []
+    words = [(name, cell) for name, cell in zip(names, cells, strict=False) if not _is_number(cell)]
+    if len(cells) == width and words:
+        name, cell = words[0]
+        return LogError(
+            f"{path.name}: column {plain(name, 40)} holds '{plain(cell.strip(), 40)}', no number",
+            "numbers in every row",
+            "write times as seconds: 0.02, 0.04 …" if name == "t" else "leave that column out, or export numbers",
+        )  # fmt: skip
     return LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _number(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_radians(angles: FloatArray, origin: str) -> None:
@@ -94,8 +112,15 @@ def _check_radians(angles: FloatArray, origin: str) -> None:
 
 
 def _check_seconds(t: FloatArray, origin: str) -> None:
-    """Logs have many rows a second; raises LogError for times in milli- or microseconds."""
+    """Logs have many rows a second; raises LogError for times that do not rise, or in milli- or microseconds."""
     step = sample_period(t)
+    known = t[np.isfinite(t)]
+    if len(known) >= _FEW_ROWS and np.median(np.diff(known)) <= 0.0:
+        falls = known[-1] < known[0]
+        raise LogError(
+            f"{origin}: column t {'falls' if falls else 'stays the same'} from row to row",
+            "the time [s] of each row, rising", "sort the rows by time" if falls else "check the export of t",
+        )  # fmt: skip
     if len(t) < _FEW_ROWS or not step >= _SLOWEST_ROW:
         return
     unit, factor = ("milliseconds", 1e-3) if step < 500.0 else ("microseconds", 1e-6)

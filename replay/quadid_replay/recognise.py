@@ -30,6 +30,8 @@ _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"\x89HDF\r\n", "HDF5", "export it as CSV"),
     (b"MATLAB 5.0", "a MATLAB file", "export it as CSV, or give the .bin it was made from"),
     (b"FMT, 128,", "a DataFlash text log", "give the binary .bin log"),
+    (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
+    (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
     (b"\xbc\x01\x00", "a Crazyflie µSD log of version 1", "record it with newer firmware"),
 )
 _FEW_COLUMNS = 3

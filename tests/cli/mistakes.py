@@ -52,11 +52,18 @@ class Place:
         np.savetxt(path, rows, delimiter=separator, header=separator.join(names), comments="", fmt="%.10g")
         return path
 
-    def scaled(self, columns: str, factor: float) -> Path:
-        """The flight with some columns multiplied."""
+    def scaled(self, columns: str, factor: float, more: float = 0.0) -> Path:
+        """The flight with some columns multiplied, and a number added to them."""
         names, rows = self.table()
-        rows[:, [names.index(n) for n in columns.split()]] *= factor
+        places = [names.index(n) for n in columns.split()]
+        rows[:, places] = factor * rows[:, places] + more
         return self.write(names, rows)
+
+    def dated(self) -> Path:
+        """The flight with dates in place of seconds."""
+        head, *lines = self.scaled("t", 1.0).read_text().splitlines()
+        dates = [f"2026-07-01 12:00:{line}" for line in lines]
+        return self.bytes("log.csv", "\n".join([head, *dates]).encode())
 
     def moved(self, columns: str, taken: str) -> Path:
         """The flight with the values of other columns in some columns; ``-q`` for the negative of q."""
@@ -159,11 +166,14 @@ MISTAKES = (
         "ENU",
     ),
     Mistake("quaternion with its scalar last", fit(lambda p: p.moved("qw qx qy qz", "qx qy qz qw")), "qw|scalar|order"),
-    Mistake(
-        "normalised commands as rad/s",
-        fit(lambda p: p.scaled("w1 w2 w3 w4", 1e-3)),
-        "normali[sz]ed|command",
-    ),
+    Mistake("normalised commands as rad/s", fit(lambda p: p.scaled("w1 w2 w3 w4", 1e-3)), "normali[sz]ed|command"),
+    Mistake("times as dates", fit(lambda p: p.dated()), "column t holds '2026"),
+    Mistake("rows in the wrong order", fit(lambda p: p.write(p.table()[0], p.table()[1][::-1])), "column t falls"),
+    Mistake("time that stands still", fit(lambda p: p.scaled("t", 0.0)), "column t stays"),
+    Mistake("rotor speeds that never change", fit(lambda p: p.scaled("w1 w2 w3 w4", 0.0, 400.0)), "stuck"),
+    Mistake("gravity taken out", fit(lambda p: p.scaled("az", 1.0, 9.81)), "gravity is missing"),
+    Mistake("attitude the other way round", fit(lambda p: p.scaled("qx qy qz", -1.0)), "world to body"),
+    Mistake("a table saved as UTF-16", fit(lambda p: p.bytes("log.csv", p.log.read_text().encode("utf-16"))), "UTF-8"),
     Mistake("decimal commas", fit(lambda p: p.commas()), "comma"),
     Mistake("other column names", fit(lambda p: p.named(p="gyro_x", q="gyro_y", r="gyro_z")), "gyro_x"),
     Mistake("time column called time", fit(lambda p: p.named(t="time")), "time=t"),
@@ -180,7 +190,7 @@ MISTAKES = (
     Mistake("a span outside the log", fit(lambda p: f"{p.log}@50:60"), "nothing"),
     Mistake("a span backwards", fit(lambda p: f"{p.log}@9:3"), "swap"),
     Mistake("a second of flight", fit(lambda p: f"{p.log}@3:4.8"), "2 s", 3),
-    Mistake("never off the ground", fit(lambda p: p.still()), "rotor|hover|say nothing|fly", 3, vague=True),
+    Mistake("never off the ground", fit(lambda p: p.still()), "did it fly", 3),
     Mistake(
         "the fitted log as validation", lambda p: (*fit(lambda p: p.log)(p), "--validate", p.log), "proves nothing"
     ),
@@ -190,9 +200,13 @@ MISTAKES = (
         "proves nothing",
     ),
     Mistake("mass in grams", of(lambda p: p.vehicle(mass=1300.0)), "gram|mass"),
-    Mistake("mass half as much again", of(lambda p: p.vehicle(mass=1.95)), "mass", 0, vague=True),
+    Mistake("mass half as much again", of(lambda p: p.vehicle(mass=1.95)), "mass 1.95 kg", 0),
     Mistake("arms in millimetres", of(lambda p: p.arms(1000.0)), "arm|mm|position"),
     Mistake("arms ten times too short", of(lambda p: p.arms(0.1)), "rotors 0.021 m"),
+    Mistake("arms in centimetres", of(lambda p: p.arms(100.0)), "centimetres"),
+    Mistake("no mass", of(lambda p: p.vehicle(mass=None)), "no 'mass'"),
+    Mistake("tabs in a vehicle file", of(lambda p: p.bytes("vehicle.yaml", b"name: x\n\tmass: 1\n")), "line 2"),
+    Mistake("a vehicle file of another size", of(lambda p: "crazyflie"), "own vehicle file"),
     Mistake("a key misspelt", of(lambda p: p.vehicle(mass=None, mas=1.3)), "did you mean 'mass'"),
     Mistake("a vehicle name misspelt", of(lambda p: "pelicn"), "pelican"),
     Mistake("a vehicle file that is not there", of(lambda p: p.folder / "none.yaml"), "no vehicle file"),
@@ -208,6 +222,17 @@ MISTAKES = (
         "triangle",
     ),
     Mistake("an effect misspelt", lambda p: ("simulate", p.folder / "x.csv", "--effect", "rotor_drg"), "rotor_drag"),
+    Mistake(
+        "a column named that is not there",
+        lambda p: (*fit(lambda p: p.log)(p), "--columns", "gyrox=p"),
+        "no column gyrox",
+    ),
+    Mistake(
+        "health of a flight that did not fly",
+        lambda p: ("health", p.still(), "--baseline", p.log, "--vehicle", "pelican"),
+        "did not fly",
+        3,
+    ),
     Mistake("no vehicle given", lambda p: ("identify", p.log), "--vehicle"),
     Mistake("a search misspelt", lambda p: (*fit(lambda p: p.log)(p), "--optimizer", "psoo"), "did you mean 'pso'"),
     Mistake(
@@ -236,7 +261,7 @@ def prepare(folder: Path) -> Place:
 
 
 def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
-    """Exit code, and the first line of stderr, else the verdict; folders left out."""
+    """Exit code, and the first line of stderr, else of what was printed; folders left out."""
     from quadid_cli.main import app_main
 
     out, err, kept = io.StringIO(), io.StringIO(), sys.argv
@@ -246,7 +271,7 @@ def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
             code = app_main()
     finally:
         sys.argv = kept
-    lines = [line for line in err.getvalue().splitlines() if line.strip()] or out.getvalue().splitlines()[-1:]
+    lines = [line for line in err.getvalue().splitlines() if line.strip()] or out.getvalue().splitlines()[:1]
     return code, re.sub(r"/\S*/(?=[^/\s]*)", "", lines[0])
 
 
