@@ -115,9 +115,8 @@ class Place:
 
     def commas(self) -> Path:
         """The flight with decimal commas, separated by semicolons."""
-        path = self.write(*self.table(), separator=";")
-        path.write_text(path.read_text().replace(".", ","), encoding="utf-8")
-        return path
+        text = self.write(*self.table(), separator=";").read_text()
+        return self.bytes("log.csv", text.replace(".", ",").encode())
 
     def still(self) -> Path:
         """Ten seconds on the ground with idling rotors."""
@@ -254,6 +253,7 @@ MISTAKES = (
 def prepare(folder: Path) -> Place:
     """Flies the flight that the mistakes are made with."""
     flown = quadid.simulate(seconds=20.0, seed=12, extras=("velocity", "position"))
+    folder.mkdir(exist_ok=True)
     place = Place(folder)
     flown.save(place.log)
     flown.save(place.mcap)
@@ -291,7 +291,7 @@ def page() -> str:
         "| mistake | first line |", "|---|---|",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        place = prepare(Path(folder))
+        place = prepare(Path(folder, "flights"))
         rows = [f"| {m.what}{' *' * m.vague} | `{shown(first_line(m, place)[1])}` |" for m in MISTAKES]
     return "\n".join([*head, *rows]) + "\n"
 

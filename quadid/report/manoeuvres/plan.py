@@ -39,6 +39,7 @@ class Plan:
         e = self.envelope
         return [
             f"{self.vehicle}: {what}. Proposed by `quadid excite`; read it before you fly it.",
+            "Neither a simulated autopilot (SITL) nor a vehicle has flown it yet: try it in SITL first.",
             f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the "
             f"start, tilt {e['abort_tilt_deg']:.0f} deg, {e['battery_percent']:g} % of the battery left.",
             f"Promised 95 % intervals: {', '.join(f'{n} {half_width(v)}' for n, v in promise.items())}.",
