@@ -46,7 +46,8 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
     each = " and ".join(f"{healthy.count(name)} of {name}" for name in sorted(set(healthy)))
     return (
         f"## Recorded flights\n`make health`; {len(judged)} flights of two Crazyflies, each against the healthy "
-        f"flights of its airframe ({each}, both kinds of log), itself left out.\n\n"
+        f"flights of its airframe ({each}, both kinds of log), itself left out. Intervals: exact binomial "
+        "(Clopper and Pearson), flights taken for independent.\n\n"
         f"{recorded.table(judged)}\n\n### Answers\n{recorded.confusion(judged)}\n\n"
         f"### Score against size\n![Score against millimetres cut]({picture.name})"
     )

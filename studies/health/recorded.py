@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import binomtest, spearmanr
 
 from quadid.health import FlightTrim, Health, assess, flight_trim
 from quadid.vehicle import Vehicle
@@ -114,7 +114,10 @@ def is_single(one: Judged, low: float, high: float) -> bool:
 
 def _share(of: Sequence[Judged], right: Callable[[Judged], bool]) -> str:
     hits = sum(right(one) for one in of)
-    return f"{hits} of {len(of)} ({100.0 * hits / len(of):.0f} %)" if of else "none here"
+    if not of:
+        return "none here"
+    low, high = (100.0 * bound for bound in binomtest(hits, len(of)).proportion_ci())
+    return f"{hits} of {len(of)} ({100.0 * hits / len(of):.0f} %, 95 % interval {low:.0f} to {high:.0f})"
 
 
 def _balanced(judged: Sequence[Judged]) -> str:
