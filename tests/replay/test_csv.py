@@ -123,7 +123,7 @@ def test_columns_nobody_knows_are_reported(tmp_path: Path) -> None:
         ("t,p,p,r\n0,1,2,3\n", "p appears twice"),
         ("t,foo\n0,1\n", "none of the columns"),
         ("t,p,q,r\n", "no usable row"),
-        ("t,p,q,r\nx,y,z,w\n", "no usable row"),
+        ("t,p,q,r\nx,y,z,w\n", "column t holds 'x', no number"),
         ("t,p,q,r\nnan,1,2,3\n", "no usable flight data"),
     ],
 )
