@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_valid
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
-from quadid.parameters import NOMINAL_NAMES, impossible_inertia
+from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, impossible_inertia
 from quadid.proof import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
@@ -36,6 +36,8 @@ from quadid.yaml_text import read_mapping
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
+VANISHED = 1e-3
+"""Share of its guess at which a parameter that may vanish has."""
 STAND_ERROR = 0.02
 """Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
 MOST_ROTORS = 16
@@ -212,8 +214,14 @@ class Vehicle(Strict):
 
     @property
     def bounds(self) -> FloatArray:
-        """Bounds of the six, shape (6, 2)."""
+        """Where to look for the six: the file's bounds, else a factor of 4 each way, shape (6, 2)."""
         return np.array([self.parameters[n].limits for n in NOMINAL_NAMES])
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Bounds of a nominal parameter in a fit: those of the file, else a factor of 4 each way; J_r may vanish."""
+        given = self.parameters[name]
+        low, high = given.limits
+        return (VANISHED * given.initial if name == MAY_VANISH and given.bounds is None else low), high
 
     def hover_speed(self, b: float | None = None) -> float:
         """Rotor speed [rad/s] at which thrust equals weight, for thrust coefficient `b` (default: initial guess)."""

@@ -124,7 +124,7 @@ def extended_vehicle(vehicle: Vehicle, layout: Layout, model: Model, parameters:
     """
     priors = {}
     for p in parameters:
-        low, high = vehicle.parameters[p.name].limits
+        low, high = vehicle.limits(p.name)
         priors[p.name] = ParameterPrior(
             initial=p.value, bounds=(min(low, p.value), max(high, p.value)),
             sigma=None if p.status is Status.UNRELIABLE else p.sigma,

@@ -11,11 +11,13 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.identify.priors import Prior, posterior_covariance
 from quadid.identify.shooting import Free, Linearised
-from quadid.parameters import Parameter, ParameterSet, Status, at_bound
+from quadid.parameters import MAY_VANISH, Parameter, ParameterSet, Status, at_bound
 from quadid.types import FloatArray
 
 LAG_SECONDS = 2.0
 """Scores of segments up to this far apart may be correlated."""
+NOT_NOTHING = 1.0 / 3.0
+"""Relative standard deviation above which what may vanish is not told from nothing."""
 KNOWN = 0.03
 """A log-scale standard deviation below this is identified whatever its correlations."""
 RATIO_SIGMA = 0.05
@@ -126,11 +128,12 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
     for j, e in enumerate(free.entries):
         value, ci = float(at[j]), (float(low[j]), float(high[j]))
         status, partner = _status(j, free, unc, value, ci)
+        guess = float(initial[e.index])
+        loose = 0.98 * min(math.log(e.upper / guess), math.log(guess / e.lower)) if free.is_log[j] else 0.0
         out.append(
             Parameter(
-                e.name, e.unit, value, float(sigma[j]), float(initial[e.index]),
-                (e.lower, e.upper), status, partner, ci, float(unc.prior_share[j]),
-                bool(free.is_log[j]) and float(unc.prior_sigma[j]) < 0.49 * math.log(e.upper / e.lower),
+                e.name, e.unit, value, float(sigma[j]), guess, (e.lower, e.upper), status, partner, ci,
+                float(unc.prior_share[j]), float(unc.prior_sigma[j]) < loose,
             )
         )  # fmt: skip
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
@@ -142,7 +145,7 @@ def _status(
     sigma, entry = unc.sigma, free.entries[j]
     if at_bound(value, entry.lower, entry.upper):
         return Status.UNRELIABLE, None
-    if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j]:
+    if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j] or (entry.name == MAY_VANISH and sigma[j] > NOT_NOTHING):
         return Status.PRIOR_DOMINATED, None
     if free.is_log[j] and not (entry.lower <= ci[0] and ci[1] <= entry.upper):  # then the bound has a say in the value
         return Status.UNRELIABLE, None

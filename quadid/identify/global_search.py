@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.shooting import RIDGE, Free, Shooting
+from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 
 Progress = Callable[[str, float], None]
@@ -37,7 +38,9 @@ def swarm_search(
     Returns:
         Full vector of the best particle, and the number of parameter vectors simulated.
     """
-    lower, upper = (free.scaled(bound) for bound in free.bounds)
+    stated = dict(zip(NOMINAL_NAMES, shooting.vehicle.bounds, strict=True))
+    box = np.array([stated.get(e.name, (e.lower, e.upper)) for e in free.entries])
+    lower, upper = (free.scaled(bound) for bound in box.T)
     cost = projected_cost(shooting, theta, free, SWARM_SEGMENTS)
     guess = np.clip(free.scaled(theta[free.index]), lower, upper)[None]
     settings = replace(options, initial_points=guess)

@@ -75,7 +75,7 @@ class PaperProblem:
         self._measured = [measured_outputs(w) for w in usable]
         layout = Layout(vehicle)
         self._theta, self._free = layout.initial(vehicle), Free(tuple(layout.entry(n) for n in NOMINAL_NAMES))
-        self.lower, self.upper = (self._free.scaled(bound) for bound in self._free.bounds)
+        self.lower, self.upper = np.log(vehicle.bounds).T
         self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
         rows = np.concatenate(self._measured)
         # Every output counts alike, however many of its samples are missing.

@@ -47,7 +47,7 @@ class BoxProblem:
         self._bases = [np.ascontiguousarray(c.basis) for c in shooting.columns(self._theta, none)]
         self._n_pre = shooting.start_of(self._theta, none)[0]
         self._x0 = [x.copy() for x in shooting.starts(self._n_pre).x0]
-        self.lower, self.upper = (self._free.scaled(bound) for bound in self._free.bounds)
+        self.lower, self.upper = np.log(vehicle.bounds).T
         self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
 
     def theta(self, point: FloatArray) -> FloatArray:

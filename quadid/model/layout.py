@@ -89,7 +89,7 @@ class Layout:
         scale = _scales(vehicle)
         entries: list[Entry] = []
         for index, name in enumerate(NOMINAL_NAMES):
-            low, high = vehicle.parameters[name].limits
+            low, high = vehicle.limits(name)
             entries.append(
                 Entry(name, index, NOMINAL_UNITS[name], math.nan, low, high, vehicle.parameters[name].initial)
             )

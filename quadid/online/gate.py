@@ -14,13 +14,10 @@ from quadid.chi_square import Z95
 from quadid.identify.covariance import PRIOR_SHARE
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, SetState
-from quadid.parameters import NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
+from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
 
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
-
-MAY_VANISH = "J_r"
-"""Rotors too light to be seen turning the vehicle: this may rest on its lower bound, and is then unreliable."""
 
 
 class GateSettings(BaseModel):
