@@ -97,11 +97,17 @@ def _when(logs: Sequence[JsonDict]) -> tuple[dict[str, Any], dict[str, Any]]:
         return {log["name"]: _date(log["started"]) for log in logs}, {"type": "date"}
     count: Counter[str] = Counter()
     places = {}
-    for log in sorted(logs, key=lambda log: (log["started"], log["name"])):
+    readable = (log for log in logs if log["status"] != "unreadable")
+    for log in sorted(readable, key=lambda log: (log["started"], log["name"])):
         count[log["unit"]] += 1
         places[log["name"]] = count[log["unit"]]
-    whole = {"tickformat": "d", "dtick": 1} if max(count.values()) <= 12 else {"tickformat": "d"}
-    return places, {**axis("flight of the vehicle, in the order of the files' dates"), **whole}
+    whole = {"tickformat": "d", "dtick": 1} if max(count.values(), default=0) <= 12 else {"tickformat": "d"}
+    return places, {**axis("flight"), **whole}
+
+
+def _counted(time: JsonDict) -> str:
+    """A sentence where flights are counted."""
+    return "" if time.get("type") == "date" else " Flights are counted in the order of their files' dates."
 
 
 def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any] | None:
@@ -133,6 +139,7 @@ def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any
     intro = (
         f"Each flight against the first {most} of its vehicle, which are taken "
         f"for healthy. 99 of 100 healthy flights stay below {HEALTHY_SCORE:.1f}, the line."
+        f"{_counted(time)}"
     )
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
 
@@ -150,7 +157,7 @@ def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict
     ]
     if not figures:
         return None
-    intro = "Every flight with its 95 % interval; a vehicle is a folder."
+    intro = f"Every flight with its 95 % interval; a vehicle is a folder.{_counted(when[1])}"
     return section("over-time", "Parameters over time", intro, figures)
 
 

@@ -119,3 +119,14 @@ def test_a_fleet_of_bad_fits_is_not_green() -> None:
     verdict = fleet_verdict(summarise(logs, parameters, []))
     assert verdict.level == "poor"
     assert "3 miss much of their flight" in verdict.details[0]
+
+
+def test_flights_are_counted_where_dates_are_those_of_copies() -> None:
+    logs, parameters = rows({"a": np.ones(3)})
+    for log in logs:
+        log |= {"dated_by": "file", "started": 1.6e9}
+    logs.append({**logs[0], "name": "a/-.csv", "status": "unreadable"})
+    page = fleet_page(summarise(logs, parameters, []), logs, parameters, [], "Fleet")
+    (section,) = [s for s in page["sections"] if s["id"] == "over-time"]
+    assert "counted" in section["intro"]
+    assert [trace["x"] for trace in section["figures"][0]["views"][0]["data"]] == [[1, 2, 3]]
