@@ -13,7 +13,7 @@ from quadid.diagnose.cross_validation import FEWEST_BLOCKS
 from quadid.diagnose.findings import describe, extended_vehicle
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model, free_names, without
-from quadid.diagnose.plausibility import impossible_causes, late_unknown
+from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Verdict
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
@@ -21,7 +21,7 @@ from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.diagnose.stated_errors import Identified, stated_errors
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
-from quadid.identify.answer import possible_moments
+from quadid.identify.answer import on_bounds, possible_moments, tied
 from quadid.identify.covariance import SPREAD_LIMIT, parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
@@ -109,13 +109,13 @@ def diagnose(
     alike = {c.family for c in search.model.causes if c.label in doubts}
     parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict, doubts)
     parameters, moved = possible_moments(parameters)
-    late = late_unknown(search.model, parameters)
+    weak = late_unknown(search.model, parameters) | slight_changes(search.model)
     believed = [] if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
-    findings = describe(decisive, search, per_finding, [c for c in believed if c.label not in late])
+    findings = describe(decisive, search, per_finding, [c for c in believed if c.label not in weak])
     warnings = [
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
-        *(f"{label} is not named with confidence: {reason}" for label, reason in late.items()),
+        *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
         *reasons, *([] if moved is None else [moved]),
     ]  # fmt: skip
     text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
@@ -166,6 +166,9 @@ def _nominal_parameters(
             reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
     everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    reasons = (*on_bounds(nominal), *reasons)
+    for cause in model.causes:
+        nominal = tied(nominal, EFFECTS[cause.effect].ties)
     told = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
     if turning := [c.label for c in model.causes if c.label in doubts and EFFECTS[c.effect].turns]:
         told |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}

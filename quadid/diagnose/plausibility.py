@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from quadid.chi_square import Z95
+from quadid.diagnose.attribution import UNTIDY
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
@@ -38,6 +41,25 @@ def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str
         return {}
     reason = f"{' and '.join(p.name for p in turning)}, beside which rotation shows it, are not to be used"
     return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
+
+
+def slight_changes(model: Model) -> dict[str, str]:
+    """Causes of `model` that begin at a moment and are no event, by label, and why.
+
+    Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
+    thrust differs by as much on any vehicle, and a step at the border takes that up.
+    """
+    told = {}
+    for cause in (c for c in model.causes if c.timed is not None):
+        own = [e for e in model.free.entries if e.name in cause.names]
+        sizes = [abs(float(model.theta[e.index]) - e.neutral) / e.typical for e in own]
+        if max(sizes, default=np.inf) <= UNTIDY:
+            most = max(own, key=lambda e: abs(float(model.theta[e.index])))
+            told[cause.label] = (
+                f"{most.name} = {float(model.theta[most.index]):.3g} is no larger than parts of a flight differ by on "
+                f"any vehicle ({UNTIDY * most.typical:.3g})"
+            )
+    return told
 
 
 def impossible(model: Model, cause: Candidate) -> str:

@@ -69,6 +69,7 @@ class Effect:
             a time.
         sized: a data sheet bounds it.
         constant_on: kind of channel on which it claims a constant offset.
+        ties: two nominal parameters of which no more than the ratio shows where this acts.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Effect:
     flexible: Literal["always", "with_velocity", "never"] = "always"
     sized: bool = False
     constant_on: str = ""
+    ties: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """An effect without look-alikes is a family of its own."""

@@ -197,7 +197,7 @@ TABLE: tuple[Effect, ...] = (
         summary="Rotation about one axis does not couple into the others.",
         sentence="{share:.0f} % of the gyroscopic coupling of the body's rotation is missing",
         advice="No vehicle does this: the data come from a simulator that leaves the term out.",
-        flexible="never", shows=("p': q", "q': r", "r': p"),
+        flexible="never", shows=("p': q", "q': r", "r': p"), ties=("d", "J_zz"),
     ),
     Effect(
         "product_of_inertia", "body", _axes("J_xy J_xz J_yz", "kg m^2", 1e-2, 1e-3, scale="inertia"),

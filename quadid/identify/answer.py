@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,16 @@ import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.parameters import (
+    INERTIAS,
+    NOMINAL_NAMES,
+    UNKNOWN,
+    Parameter,
+    ParameterSet,
+    Status,
+    at_bound,
+    impossible_inertia,
+)
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -97,3 +106,26 @@ def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter
         "the other two moments of inertia"
     )
     return tuple(moved if p.name == name else p for p in parameters), said
+
+
+def on_bounds(parameters: Iterable[Parameter]) -> list[str]:
+    """Which parameters rest on a bound, and which nominal ones have an interval that reaches one, in words."""
+    out = []
+    for p in parameters:
+        low, high = p.bounds
+        if at_bound(p.value, low, high):
+            out.append(f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]")
+        elif p.name in NOMINAL_NAMES and p.status is Status.UNRELIABLE and not (low <= p.ci95[0] and p.ci95[1] <= high):
+            out.append(f"the interval of {p.name} reaches its bound [{low:.4g}, {high:.4g}]: check what is assumed")
+    return out
+
+
+def tied(parameters: Sequence[Parameter], names: Sequence[str]) -> tuple[Parameter, ...]:
+    """Parameters; of two `names` those that are identified are known relative to the other one only."""
+    other = dict(zip(names, reversed(names), strict=True))
+    return tuple(
+        replace(p, status=Status.RATIO_ONLY, relative_to=other[p.name])
+        if p.name in other and p.status is Status.IDENTIFIED
+        else p
+        for p in parameters
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from quadid.errors import WindowError
-from quadid.identify.answer import final_answer
+from quadid.identify.answer import final_answer, on_bounds
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, polish
@@ -26,7 +26,7 @@ from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, Status, at_bound
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -230,13 +230,7 @@ def _finish(
 
 
 def _warnings(free: Free, parameters: ParameterSet, unc: Uncertainty) -> tuple[str, ...]:
-    out = []
-    for p, log in zip(parameters, free.is_log, strict=True):
-        low, high = p.bounds
-        if at_bound(p.value, low, high):
-            out.append(f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]")
-        elif log and p.status is Status.UNRELIABLE and not (low <= p.ci95[0] and p.ci95[1] <= high):
-            out.append(f"the interval of {p.name} reaches its bound [{low:.4g}, {high:.4g}]: check what is assumed")
+    out = on_bounds(parameters)
     grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
     if grown:
         out.append(

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quadid.diagnose.findings import extended_vehicle
-from quadid.diagnose.model import Model, extend
+from quadid.diagnose.model import Model, extend, free_names
 from quadid.diagnose.pipeline import _nominal_parameters
-from quadid.diagnose.plausibility import impossible_causes, late_unknown
+from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
 from quadid.diagnose.result import Verdict
 from quadid.identify.answer import possible_moments
@@ -157,3 +157,34 @@ def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> 
     assert list(late_unknown(model, useless)) == ["motor_lag"]
     one = [replace(p, status=Status.UNRELIABLE) if p.name == "J_xx" else p for p in numbers]
     assert late_unknown(model, one) == {}
+
+
+@pytest.mark.parametrize(("fraction", "believed"), [(0.015, False), (-0.015, False), (0.05, True)])
+def test_a_change_as_between_parts_of_any_flight_is_no_event(fraction: float, believed: bool) -> None:
+    problem = clean()
+    drop = cause(problem, "thrust_drop")
+    theta = problem.nominal.theta.copy()
+    theta[problem.shooting.layout.entry("thrust_drop.fraction").index] = fraction
+    model = replace(problem.nominal, theta=theta, causes=(drop,), free=problem.shooting.free(free_names((drop,))))
+    assert (slight_changes(model) == {}) == believed
+
+
+def test_without_gyroscopic_coupling_yaw_inertia_is_known_relative_to_the_drag_torque() -> None:
+    problem = fitted(window_with({"no_gyroscopic_coupling": {"share": 1.0}}), clean().shooting.noise)
+    model = extend(problem.shooting, problem.nominal, cause(problem, "no_gyroscopic_coupling"), iterations=12)
+    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Verdict.EXPLAINED)
+    yaw = next(p for p in numbers if p.name == "J_zz")
+    assert yaw.status is not Status.IDENTIFIED
+    assert yaw.relative_to in ("d", None)
+    assert {p.name: p.status for p in numbers}["J_xx"] is Status.IDENTIFIED
+
+
+def test_why_a_number_on_its_bound_is_not_to_be_used_is_said() -> None:
+    problem = clean()
+    theta = problem.nominal.theta.copy()
+    entry = problem.shooting.layout.entry("J_xx")
+    theta[entry.index] = entry.lower
+    low = replace(problem.nominal, theta=theta)
+    numbers, reasons = _nominal_parameters(problem.shooting, problem.shooting, low, Verdict.EXPLAINED)
+    assert {p.name: p.status for p in numbers}["J_xx"] is Status.UNRELIABLE
+    assert any(r.startswith("J_xx = ") and "rests on its bound" in r for r in reasons)
