@@ -14,6 +14,7 @@ from quadid.model.layout import B, Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online.fusion import DRIFT, Fusion, WindowEstimate
 from quadid.online.gate import Case
+from quadid.online.grid_buffer import Cut
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
@@ -128,13 +129,13 @@ class Estimator:
         self.fusion.forget()
         self.start, self.rows, self._search, self.learned = math.nan, 0, True, False
 
-    def request(self, number: int, windows: tuple[Window, ...], start: float, stop: float) -> FitRequest:
+    def request(self, number: int, cut: Cut, start: float, stop: float) -> FitRequest:
         """The fit of a window."""
-        self._asked = windows
+        self._asked = cut.windows
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
-            number, self.model, windows, start, stop, self.theta, self.noise, self._search, self._seed, measure,
-            self.flexible,
+            number, self.model, cut.windows, start, stop, self.theta, self.noise, self._search, self._seed, measure,
+            self.flexible, cut.spacing,
         )  # fmt: skip
 
     def take(self, reply: FitReply, trusted: bool) -> None:

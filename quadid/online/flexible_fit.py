@@ -7,9 +7,9 @@ Segments are short, because what no effect describes grows with their length.
 What is left of a window is a quadratic model in the nominal six, the effects eliminated (Schur complement).  Its b is
 that of thrust b w^2 at hover, which all windows share, unlike the steepness of a curve (`ThrustModel.secant`).
 
-What the rotors do between two rows is not seen.  Where a rate loop rings at half the rate of the rows, torque over
-inertia is several per cent off and no residual says so; so the fit is repeated with every second row of the rotors left
-out, and how far that moves the estimate counts as its error.
+What the rotors do between two readings is not seen.  Where a rate loop rings at half their rate, torque over inertia is
+several per cent off and no residual says so; so every second row of the rotors is left out, and how far that moves the
+estimate tells its error.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
+from quadid.window import Sampling, Window
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""
@@ -43,11 +43,10 @@ ROUNDS = 4
 """Fits after which the noise that the fit leaves has settled, where none is known."""
 STEP = 1e-5
 """Of differences, in scaled parameters."""
-HALVED = 3.0
-"""Lines between samples miss four times as much at twice the distance (Richardson): leaving every second one out moves
-the estimate by three times its error."""
-SPARSE_ITERATIONS = 4
-"""Linearisations of a fit with every second row: how far it moves is wanted, to its size."""
+ORDER: dict[Sampling, int] = {"held": 1, "instant": 2}
+"""What is missed between readings grows with this power of their distance (Richardson): steps miss twice as much at
+twice the distance, so that leaving every second reading out moves the estimate by its error; lines miss four times as
+much, and it moves by three times its error."""
 MOVING = ("command", "rotor", "air", "body")
 """Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
 
@@ -142,9 +141,12 @@ def halved(window: Window, first: int) -> Window:
 
 def sampling_error(
     estimate: WindowEstimate, windows: Sequence[Window], vehicle: Vehicle, free: Free, prior: Prior, best: Polished,
-    noise: NoiseModel,
+    noise: NoiseModel, spacing: float,
 ) -> FloatArray:  # fmt: skip
-    """Covariance of the nominal six, log scale, shape (6, 6), by what the rotors do between two rows.
+    """Variances of the nominal six, log scale, on the diagonal, shape (6, 6), by what the rotors do between readings.
+
+    Two trials do not tell which combinations are known better than their parts: a covariance out of them would be
+    infinitely sure of four of six, and windows fused with it of all.
 
     Args:
         estimate: of these windows.
@@ -154,15 +156,17 @@ def sampling_error(
         prior: of everything that was free.
         best: the optimum.
         noise: of the fit.
+        spacing: time between two readings of the rotors [rows].
     """
-    missed, tried, layout = np.zeros_like(estimate.information), 0, Layout(vehicle)
+    missed, layout, order = np.zeros_like(estimate.z), Layout(vehicle), ORDER[windows[0].sampling]
     for first in (0, 1):
         sparse = Shooting.cut([halved(w, first) for w in windows], vehicle, SEGMENT, noise, layout)
-        result = polish(sparse, best.theta, free, prior, best.states, iterations=SPARSE_ITERATIONS)
-        if np.isfinite(result.cost):
-            z = reduced(estimate.start, estimate.stop, layout, vehicle, free, prior, result).z
-            missed, tried = missed + np.outer(z - estimate.z, z - estimate.z) / HALVED**2, tried + 1
-    return np.asarray(missed / max(tried, 1))
+        # One linear step tells the size; a descent may refuse every step, and would then tell of no error at all.
+        lin = sparse.linearise(best.theta, free, best.states)
+        there = reduced(estimate.start, estimate.stop, layout, vehicle, free, prior, replace(best, lin=lin))
+        error = (there.optimum - estimate.optimum) * spacing**order / (2.0**order - 1.0)
+        missed += 0.5 * error**2
+    return np.diag(missed)
 
 
 def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:

@@ -59,6 +59,11 @@ class WindowEstimate:
         return 1.0 / max(self.mse, 1.0)
 
     @property
+    def optimum(self) -> FloatArray:
+        """Where its cost is least, shape (P,)."""
+        return np.asarray(self.z - np.linalg.solve(self.information, self.score))
+
+    @property
     def finite(self) -> bool:
         """Whether every number of it is one."""
         arrays = (self.z, self.information, self.score)

@@ -77,7 +77,7 @@ class Case:
         stated: value and standard deviation of the parameters that the vehicle file claims to know.
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
-        between_rows: relative standard deviation by what the rotors do between two rows, newest window, by name.
+        between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
     """
 
     parameters: ParameterSet
@@ -185,11 +185,9 @@ def _width(case: Case, settings: GateSettings) -> str | None:
         if p.name in MUST_BE_KNOWN:
             if p.status in UNKNOWN or half > settings.width:
                 missed = Z95 * case.between_rows.get(p.name, 0.0)
-                text = f"{p.name} is known to {half:.1%} only, wanted {settings.width:.1%}: keep flying"
-                unseen = (
-                    f"; what the rotors do between two rows moves it by {missed:.0%}: log faster, or fly more smoothly"
-                )
-                return text + unseen if missed > settings.width else text
+                text = f"{p.name} is known to {half:.2%} only, wanted {settings.width:.2%}: keep flying"
+                unseen = f"; what the rotors do between readings moves it by {missed:.0%}"
+                return f"{text}{unseen}: log faster, or fly more smoothly" if missed > settings.width else text
         elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
             return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
     return None

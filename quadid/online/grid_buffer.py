@@ -31,6 +31,7 @@ class Cut:
         gaps: number of places where the rows were cut.
         reason: what is wrong with them, empty when they are complete.
         blocked: whether that will not pass by itself.
+        spacing: longest time between two readings of the rotors in it [rows].
     """
 
     windows: tuple[Window, ...]
@@ -38,6 +39,7 @@ class Cut:
     gaps: int
     reason: str = ""
     blocked: bool = False
+    spacing: float = 1.0
 
 
 class GridBuffer:
@@ -107,7 +109,8 @@ class GridBuffer:
         seconds = sum(len(w) for w in windows) * self._step
         gaps = max(len(windows) - 1, 0)
         reason, blocked = self._incomplete(seconds, stop - start, problem, blocks)
-        return Cut(tuple(windows), seconds, gaps, reason, blocked)
+        spacing = max((b.spacing for b in blocks), default=1.0)
+        return Cut(tuple(windows), seconds, gaps, reason, blocked, spacing)
 
     def _incomplete(self, seconds: float, wanted: float, problem: str, blocks: list[Rows]) -> tuple[str, bool]:
         if seconds >= COMPLETE * wanted - 0.5 * self._step:

@@ -50,6 +50,7 @@ class Rows:
         sampling: meaning of the rotor rows; source: where the rotor speeds come from.
         fresh: True when the grid was anchored anew before the first row: nothing may be joined across.
         problem: why there are no rotor speeds, or empty.
+        spacing: time between two readings of the rotors [rows].
     """
 
     t: FloatArray
@@ -58,6 +59,7 @@ class Rows:
     source: str
     fresh: bool = False
     problem: str = ""
+    spacing: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,8 @@ class Resampler:
             return Rows(at, {"rotor_speed": empty}, "held", "", self._fresh, str(error))
         plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, 1.0 / self._step)
         columns = yield from columns_on_grid(plan, at)
-        return Rows(at, columns, plan.sampling, rotor.source, self._fresh)
+        spacing = plan.tracks["rotor_speed"].period / self._step
+        return Rows(at, columns, plan.sampling, rotor.source, self._fresh, "", spacing)
 
     def _rotor_signal(self, recording: Recording, at: FloatArray, arrived: Mapping[str, int]) -> RotorSignal:
         """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
@@ -294,6 +297,3 @@ def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
     if not 0.5 < norm < 2.0:
         return ()
     return q if abs(norm - 1.0) <= 1e-3 else tuple(c / norm for c in q)
-
-
-__all__ = ["BLOCK", "HISTORY", "SETTLE", "Resampler", "Rows"]

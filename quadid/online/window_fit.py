@@ -67,6 +67,7 @@ class FitRequest(Job):
         seed: of the swarm.
         measure: measure the sensor noise in this window too.
         flexible: fit every effect that moves the vehicle along.
+        spacing: time between two readings of the rotors [rows].
     """
 
     theta: FloatArray
@@ -75,6 +76,7 @@ class FitRequest(Job):
     seed: int
     measure: bool = False
     flexible: bool = False
+    spacing: float = 1.0
 
     def answer(self) -> FitReply:
         """Fits the windows."""
@@ -132,7 +134,7 @@ class FitReply(JobReply):
         lack: what effects of the catalogue would explain; with `misfit`, where they were not fitted along.
         vehicle: where every effect that moves the vehicle was fitted along, what it was fitted with: that of the
             request, with room for its bare guesses where effects joined.
-        between_rows: standard deviations, log scale, by what the rotors do between two rows, shape (6,); in `estimate`.
+        between_rows: standard deviations, log scale, by what the rotors do between readings, shape (6,); in `estimate`.
     """
 
     excitation: FloatArray | None = None
@@ -154,8 +156,7 @@ def prior_of(vehicle: Vehicle) -> Prior:
 
 
 def _fit(request: FitRequest) -> FitReply:
-    layout = Layout(request.vehicle)
-    theta, noise = request.theta, request.noise
+    layout, theta, noise = Layout(request.vehicle), request.theta, request.noise
     shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
     if shooting.count == 0:
         return request.failed("no stretch is long enough for one segment")
@@ -177,16 +178,15 @@ def _fit(request: FitRequest) -> FitReply:
     if not np.isfinite(result.cost):
         return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     lin = result.lin
-    information = lin.information
     estimate = WindowEstimate(
-        request.start, request.stop, free.scaled(result.theta[free.index]), information, lin.gradient,
+        request.start, request.stop, free.scaled(result.theta[free.index]), lin.information, lin.gradient,
         lin.total_cost, lin.total_rows,
     )  # fmt: skip
     measured = None
     if request.measure:
         measured = residual_noise(shooting, result)
         sensor = _sensor_noise(request, layout, result.theta, noise)
-    reply = FitReply(request.number, "", bounds_of(information), True, estimate, result.theta, noise, measured)
+    reply = FitReply(request.number, "", bounds_of(lin.information), True, estimate, result.theta, noise, measured)
     if sensor is None:
         return reply
     lack = _lack_of_fit(shooting, result)
@@ -209,7 +209,8 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
     # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
     bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
-    missed = sampling_error(estimate, request.windows, vehicle, free, prior, result, shooting.noise)
+    of_these = (vehicle, free, prior, result, shooting.noise, request.spacing)
+    missed = sampling_error(estimate, request.windows, *of_these)
     reply = FitReply(
         request.number, "", bounds, is_excited(bounds), widened(estimate, missed), result.theta, shooting.noise,
         vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),
@@ -239,8 +240,7 @@ def _lack_of_fit(problem: Shooting, result: Polished) -> LackOfFit:
 
 def is_excited(bounds: FloatArray) -> bool:
     """Whether a window reveals roll and pitch dynamics."""
-    place = [NOMINAL_NAMES.index(name) for name in RATED]
-    return bool(np.all(bounds[place] <= EXCITED))
+    return bool(np.all(bounds[[NOMINAL_NAMES.index(name) for name in RATED]] <= EXCITED))
 
 
 def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
@@ -290,10 +290,7 @@ def warm_up(vehicle: Vehicle) -> None:
     rows, dt = 150, 0.02
     speed = np.full((rows, len(vehicle.rotors)), vehicle.hover_speed())
     speed += 5.0 * np.sin(np.arange(rows)[:, None] * 0.3 + np.arange(speed.shape[1]))
-    attitude = np.zeros((rows, 4))
-    attitude[:, 0] = 1.0
-    accel = np.zeros((rows, 3))
-    accel[:, 2] = -9.80665
+    attitude, accel = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1)), np.tile([0.0, 0.0, -9.80665], (rows, 1))
     for sampling in ("held", "instant"):
         window = Window(0.0, dt, speed, np.zeros((rows, 3)), attitude, accel, sampling=sampling)
         layout = Layout(vehicle)

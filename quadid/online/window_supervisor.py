@@ -72,7 +72,7 @@ class WindowSupervisor:
         yield
         self._last_fit = tick
         start = max(start, tick - self._settings.window)
-        return estimator.request(number, self.cut.windows, start, tick)
+        return estimator.request(number, self.cut, start, tick)
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self.cut.blocked:

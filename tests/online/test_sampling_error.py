@@ -1,14 +1,23 @@
-"""What the rotors do between two rows widens the intervals of a window."""
+"""What the rotors do between two readings widens the intervals of a window."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from quadid.online.flexible_fit import halved, widened
-from quadid.online.fusion import WindowEstimate
+from quadid.model.layout import Layout
+from quadid.online.flexible_fit import flexible_fit, halved, reduced, sampling_error, widened
+from quadid.online.fusion import Fusion, WindowEstimate
+from quadid.online.resampler import Resampler
+from quadid.online.window_fit import prior_of
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid.window import Sampling, Window
+from tests.online.driving import flight, samples
+
+PELICAN = Vehicle.shipped("pelican")
 
 ROWS = 200
 DT = 0.02
@@ -60,3 +69,48 @@ def test_an_added_covariance_leaves_the_optimum_and_widens_by_itself() -> None:
     np.testing.assert_allclose(optimum(wide), optimum(own))
     added = np.linalg.inv(wide.scale * wide.information) - np.linalg.inv(own.scale * own.information)
     np.testing.assert_allclose(added, np.outer(shift, shift), atol=1e-12)
+
+
+def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -> None:
+    """A descent that refused every step once told of none, and that window outweighed all others."""
+    full = flight(24.0, 5).window.slice(0, 300)
+    for sampling, order in (("held", 1), ("instant", 2)):
+        windows = (replace(full, sampling=sampling),)
+        layout, start = Layout(PELICAN), Layout(PELICAN).initial(PELICAN)
+        problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
+        estimate = reduced(0.0, 6.0, layout, PELICAN, free, prior, best)
+        whole, half = (
+            sampling_error(estimate, windows, PELICAN, free, prior, best, problem.noise, spacing)
+            for spacing in (1.0, 0.5)
+        )
+        assert (np.diag(whole) > 0.0).all()
+        np.testing.assert_array_equal(whole, np.diag(np.diag(whole)))
+        np.testing.assert_allclose(np.sqrt(np.diag(whole) / np.diag(half)), 2.0**order)
+
+
+def test_windows_that_err_together_are_not_surer_for_it() -> None:
+    """Each window errs by its own mix of roll and pitch; no pair of them tells either to more than it knows."""
+    information = np.diag(np.full(6, 1e6))
+    fusion = Fusion(np.zeros(6), np.ones(6), 1e9)
+    for k, (roll, pitch) in enumerate([(0.06, 0.05), (0.05, 0.06), (0.04, 0.06)]):
+        missed = np.diag(np.array([0.0, 0.0, roll, pitch, 0.0, 0.0]) ** 2)
+        own = WindowEstimate(10.0 * k, 10.0 * k + 10.0, np.zeros(6), information, np.zeros(6), 900.0, 900.0)
+        fusion.add(widened(own, missed))
+    fused = fusion.estimate()
+    assert fused is not None
+    assert (fused.sigma[2:4] > 0.04 / np.sqrt(3.0)).all()
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_the_rows_tell_how_close_the_readings_are(every: int) -> None:
+    channels = dict(flight(24.0, 5).recording.channels)
+    rotors = channels["rotor_speed"]
+    channels["rotor_speed"] = replace(rotors, t=rotors.t[::every], values=rotors.values[::every])
+    resampler = Resampler(PELICAN, 50.0)
+    for sample in samples(replace(flight(24.0, 5).recording, channels=channels)):
+        resampler.push(sample)
+    spacing = set[float]()
+    while resampler.busy:
+        rows = resampler.work()
+        spacing |= {round(rows.spacing, 2)} if rows is not None else set()
+    assert spacing == {float(every)}

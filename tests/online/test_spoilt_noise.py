@@ -9,6 +9,7 @@ from quadid.grid import to_windows
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
+from quadid.online.grid_buffer import Cut
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -51,12 +52,12 @@ def test_a_spoilt_noise_is_found_anew_and_the_fit_done(windows: tuple[Window, ..
 
 def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, ...]) -> None:
     learner = Estimator(PELICAN, 60.0, 0)
-    learner.request(1, windows, 0.0, 10.0)
+    learner.request(1, Cut(windows, 10.0, 0), 0.0, 10.0)
     learner.take(fitted(windows, None, search=True), trusted=True)
     assert learner.noise is not None
     good = learner.noise
     learner.noise = spoilt(len(good.white))
-    asked = learner.request(2, windows, 0.0, 10.0)
+    asked = learner.request(2, Cut(windows, 10.0, 0), 0.0, 10.0)
     assert asked.noise is not None
     assert asked.noise.white[0] == 3.0
     learner.take(asked.answer(), trusted=True)
