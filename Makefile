@@ -54,7 +54,11 @@ $(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake m
 	tools/build_messages.sh $(VENV)
 	@touch $@
 
-.PHONY: venv dev messages
+.PHONY: venv dev messages node
+node: ## the node alone: NumPy 1.26 as beside ROS 2 Jazzy, no plots, Dask or pyarrow; it must identify a played flight
+	rm -rf build/node
+	tools/node_alone.sh build/node $(PYTHON)
+
 venv: $(RUNTIME) ## .venv with the quadid command
 dev: $(DEV) ## ... and what developers use: linters, types, tests
 messages: $(MESSAGES) ## ... and ROS 2 Jazzy with quadid_msgs

@@ -3,7 +3,7 @@
 A test asks for the fixture `happened` and says what it saw, in one sentence with figures, next to the assertion that
 holds it.  `pytest --faults-page FILE tests` (`make faults`) runs the tests that do so, and writes the table.  Only what
 a passed test said gets into it.  An account beside the page (JSON) keeps what was said when: a run of some of the tests
-replaces what these said, and takes out those that failed.
+replaces what these said, and takes out those that failed, and those whose test is gone.
 """
 
 from __future__ import annotations
@@ -83,11 +83,21 @@ class Collector:
             [Evidence(*entry) for entry in json.loads(account.read_text(encoding="utf-8"))] if account.exists() else []
         )
         ran = {e.test for e in self.evidence} | set(self.failed)
-        told = sorted([*(e for e in known if e.test not in ran), *self.evidence], key=lambda e: (e.row, e.test))
+        told = sorted(
+            [*(e for e in known if e.test not in ran and _stands(e.test)), *self.evidence],
+            key=lambda e: (e.row, e.test),
+        )
         self.page.parent.mkdir(parents=True, exist_ok=True)
         account.write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         text = page(told, self.failed, self.skipped, self.command) + judged(self.page)
         self.page.write_text(text, encoding="utf-8")
+
+
+def _stands(test: str) -> bool:
+    """Whether a test, as pytest names it, is still in its file."""
+    file, _, name = test.partition("::")
+    function = name.split("[")[0].rsplit("::", 1)[-1]
+    return Path(file).exists() and f"def {function}(" in Path(file).read_text(encoding="utf-8")
 
 
 def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[str], command: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,8 @@ def pytest_configure(config):
 def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, repository: Path) -> None:
     (tmp_path / "test_x.py").write_text(TESTS)
     (tmp_path / "conftest.py").write_text(CONFTEST)
+    known = [[4, "renamed since", "test_x.py::test_before[1]"], [5, "not run now", "test_x.py::test_silent[1]"]]
+    (tmp_path / "page.json").write_text(json.dumps(known))
     command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-c", str(tmp_path / "none.ini"), str(tmp_path)]
     (tmp_path / "none.ini").write_text("[pytest]\n" + f"pythonpath = {repository}\n")
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
@@ -40,7 +43,9 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     assert "cut at \\| 300 places of &lt;b>" in text
     assert "never true" not in text
     assert "never seen" not in text
-    assert f"1 of {len(FAULTS)} rows have evidence" in text
+    assert "renamed since" not in text
+    assert "not run now" in text
+    assert f"2 of {len(FAULTS)} rows have evidence" in text
     assert "Failed: `test_x.py::test_red`" in text
     assert "Skipped: `test_x.py::test_absent`" in text
 

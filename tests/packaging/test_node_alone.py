@@ -1,0 +1,50 @@
+"""The node lives on its own list of requirements, beside NumPy 1.26; `make node` installs it so and runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "nfoursid", "dask", "pyarrow"}
+"""Plots, reports, other optimisers, many logs at once."""
+IMPORTED = (*sorted(LEFT_OUT), "distributed", "pandas")
+NEEDS_ROS = ("quadid_node.node", "quadid_node.polling", "quadid_node.speaker", "quadid_node.topic_player")
+
+
+@pytest.fixture(scope="module")
+def core(repository: Path) -> dict[str, Requirement]:
+    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return {r.name: r for r in map(Requirement, project["dependencies"])}
+
+
+def test_the_list_is_that_of_the_core_without_what_the_node_never_uses(
+    core: dict[str, Requirement], repository: Path
+) -> None:
+    lines = (repository / "quadid_node" / "requirements.txt").read_text(encoding="utf-8").splitlines()
+    listed = {r.name: r for r in (Requirement(line) for line in lines if not line.startswith("#"))}
+    assert {n: r.specifier for n, r in listed.items()} == {n: r.specifier for n, r in core.items() if n not in LEFT_OUT}
+    assert core["numpy"].specifier.contains("1.26.4")
+
+
+def test_all_that_the_node_imports_comes_without_what_is_left_out() -> None:
+    code = f"""
+import importlib, pkgutil, sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in {IMPORTED!r}:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Block())
+import quadid, quadid_node, quadid_replay
+for top in (quadid, quadid_node, quadid_replay):
+    for module in pkgutil.walk_packages(top.__path__, top.__name__ + "."):
+        if module.name.split(".")[1] != "report" and module.name not in {NEEDS_ROS!r}:
+            importlib.import_module(module.name)
+import quadid_cli.serve, quadid_cli.replay, quadid_cli.history, quadid_cli.watch, quadid_cli.worker
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
