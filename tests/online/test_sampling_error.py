@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.model.layout import Layout
-from quadid.online.flexible_fit import flexible_fit, halved, reduced, sampling_error, widened
+from quadid.online.flexible_fit import ORDER, flexible_fit, halved, reduced, sampling_error, widened
 from quadid.online.fusion import Fusion, WindowEstimate
 from quadid.online.resampler import Resampler
 from quadid.online.window_fit import prior_of
@@ -74,7 +74,7 @@ def test_an_added_covariance_leaves_the_optimum_and_widens_by_itself() -> None:
 def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -> None:
     """A descent that refused every step once told of none, and that window outweighed all others."""
     full = flight(24.0, 5).window.slice(0, 300)
-    for sampling, order in (("held", 1), ("instant", 2)):
+    for sampling, order in ORDER.items():
         windows = (replace(full, sampling=sampling),)
         layout, start = Layout(PELICAN), Layout(PELICAN).initial(PELICAN)
         problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
