@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from quadid.identify.score import INFINITE
 from quadid.identify.shooting import Linearised
 from quadid.types import FloatArray, IndexArray
 
@@ -54,6 +55,7 @@ class HeldOut(NamedTuple):
     rest: FloatArray
 
 
+@INFINITE
 def held_out(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> HeldOut:
     """Deviance of each block in the density that the other blocks predict, and of those.
 
@@ -120,6 +122,7 @@ class Gain:
         return self.total - half, self.total + half
 
 
+@INFINITE
 def paired_gain(before: FloatArray, after: FloatArray) -> Gain:
     """Gain of `after` over `before`, both block deviances of the same blocks."""
     difference = before - after

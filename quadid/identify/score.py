@@ -81,11 +81,11 @@ class SetScore:
     series: Series
 
 
-_INFINITE = np.errstate(over="ignore", invalid="ignore")
+INFINITE = np.errstate(over="ignore", invalid="ignore")
 """A simulation that runs away overflows to infinity or NaN, which is its score and needs no warning."""
 
 
-@_INFINITE
+@INFINITE
 def mse_score(
     windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel | None = None
 ) -> SetScore:
@@ -150,7 +150,7 @@ class Tally:
         return float(np.sum(weight * np.nan_to_num(ratio)) / weight.sum())
 
 
-@_INFINITE
+@INFINITE
 def tallied(shooting: Shooting, theta: FloatArray, lin: Linearised | None = None, known: int | None = None) -> Tally:
     """The tally of `theta` on a problem; `known` channels at most have a known noise, all by default."""
     lin = settle_states(shooting, theta) if lin is None else lin
@@ -190,7 +190,7 @@ def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> Noise
     return replace(noise, white=white, slow=slow, shape=shape)
 
 
-@_INFINITE
+@INFINITE
 def settle_states(
     shooting: Shooting, theta: FloatArray, names: Sequence[str] = (), states: InitialStates | None = None
 ) -> Linearised:
