@@ -7,7 +7,9 @@ the noise that the identification estimated, from the parameters that the identi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import reduce
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -47,19 +49,19 @@ def stated_errors(
         validation: flights that were not.
         deciding: errors without and with the findings in the segments that decided.
     """
-    both, refitted = (nominal.theta, model.theta), None
+    both, halves = (nominal.theta, model.theta), None
     if validation:
         on = "validation logs"
         before, after = (mse_score(validation, nominal.vehicle, theta, nominal.noise).mse for theta in both)
-        refitted = _refitted(nominal, model, validation)
+        halves = _second_halves(nominal, model, validation)
     else:
         on, scorer = "held-out blocks", _scorer(nominal, windows)
         names = list(NOMINAL_NAMES), free_names(model.causes)
         before, after = (left_out_error(scorer, theta, free) for theta, free in zip(both, names, strict=True))
     # What happens at a moment of one flight happens at none of another.
     comparable = bool(model.causes) and not (validation and any(c.timed is not None for c in model.causes))
-    unseen = after if refitted is None else refitted
-    return Validation(before, after, on, deciding, refitted, comparable and unseen > before)
+    without, refitted = halves or (before, after)
+    return Validation(before, after, on, deciding, refitted if halves else None, comparable and refitted > without)
 
 
 def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) -> float:
@@ -92,26 +94,20 @@ def _scorer(nominal: Identified, windows: Sequence[Window]) -> Shooting:
     return shooting.with_noise(covering(nominal.noise, shooting.channels, nominal.vehicle))
 
 
-def _refitted(nominal: Identified, model: Model, logs: Sequence[Window]) -> float | None:
-    """Error of the second half of each log, what belongs to a flight refitted on its first; None without such."""
-    total: Tally | None = None
-    for second, theta in _second_halves(_scorer(nominal, logs), model, logs):
-        part = tallied(second, theta)
-        total = part if total is None else total + part
-    return None if total is None else total.mse
+def _second_halves(nominal: Identified, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
+    """Errors of second halves of logs without and with the findings, what belongs to a flight refitted on the first.
 
-
-def _second_halves(scorer: Shooting, model: Model, logs: Sequence[Window]) -> Iterator[tuple[Shooting, FloatArray]]:
-    """The second half of each log, and `model` with what belongs to a flight refitted on the first; none without such.
-
-    Args:
-        scorer: how halves are cut and weighted.
-        model: fitted to other flights.
-        logs: long enough ones count.
+    None where nothing belongs to a flight, or no log is long enough.
     """
-    per_log = model.per_log_names
+    scorer, per_log = _scorer(nominal, logs), model.per_log_names
+    totals: list[tuple[Tally, Tally]] = []
     for window in logs:
         middle = len(window) // 2
         if per_log and middle >= 4 * scorer.length:
             first, second = (scorer.on([w]) for w in (window.slice(0, middle), window.slice(middle, len(window))))
-            yield second, polish(first, model.theta, first.free(per_log), iterations=6).theta
+            refitted = polish(first, model.theta, first.free(per_log), iterations=6).theta
+            totals.append((tallied(second, nominal.theta), tallied(second, refitted)))
+    if not totals:
+        return None
+    without, found = (reduce(add, part) for part in zip(*totals, strict=True))
+    return without.mse, found.mse
