@@ -56,7 +56,7 @@ class Validation:
         deciding: the same two of the segments that decided the diagnosis.
         refitted: extended, with per-log values refitted on the first half of each log and scored on the second; only
             where there are such.
-        contradicted: the findings make the prediction of unseen data worse, values of a flight refitted.
+        contradicted: the findings make the stated error of unseen data worse by more than a tenth, refitted as above.
     """
 
     nominal: float

@@ -20,6 +20,7 @@ from quadid.diagnose.model import Model, free_names
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.priors import default_prior, posterior_covariance
+from quadid.identify.reliability import MISFIT
 from quadid.identify.score import SCORE_SECONDS, Tally, covering, mse_score, settle_states, tallied
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -61,7 +62,8 @@ def stated_errors(
     # What happens at a moment of one flight happens at none of another.
     comparable = bool(model.causes) and not (validation and any(c.timed is not None for c in model.causes))
     without, refitted = halves or (before, after)
-    return Validation(before, after, on, deciding, refitted if halves else None, comparable and refitted > without)
+    contradicted = comparable and refitted > MISFIT * without
+    return Validation(before, after, on, deciding, refitted if halves else None, contradicted)
 
 
 def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) -> float:

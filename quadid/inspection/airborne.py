@@ -46,7 +46,7 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
         if "accel" in channels and len(channels["accel"].t) > 10:
             on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
         carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
-        return tuple(narrow for span in _spans(t, on) if (narrow := _within(span, carried)))
+        return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))
     return ()
@@ -115,10 +115,10 @@ def _vibrates(accel: Channel) -> BoolArray:
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
 
 
-def _within(span: tuple[float, float], times: FloatArray) -> tuple[float, float] | None:
-    """First and last of the rising `times` [s] in a span; None where that is too short."""
-    inside = times[np.searchsorted(times, span[0]) : np.searchsorted(times, span[1], "right")]
-    return (float(inside[0]), float(inside[-1])) if len(inside) and np.ptp(inside) >= _SHORTEST else None
+def _from_carried(span: tuple[float, float], carried: FloatArray) -> tuple[float, float] | None:
+    """A span from the first of the rising times [s] in it at which rotors carry; None where that is too short."""
+    first = float(carried[at]) if (at := int(np.searchsorted(carried, span[0]))) < len(carried) else np.inf
+    return (first, span[1]) if span[1] - first >= _SHORTEST else None
 
 
 def _spans(t: FloatArray, on: BoolArray) -> Spans:

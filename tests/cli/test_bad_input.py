@@ -30,7 +30,7 @@ def _pelican(**changes: object) -> str:
         (b"t,p,q\n0,1,2\n", "lacks column r"),
         (b"t,speed\n0,1\n", "none of the columns"),
         (b"t,p,q,r,w1,w2,w3,w4\n", "no usable row"),
-        (b"t,p,q,r,w1,w2,w3,w4\nx,x,x,x,x,x,x,x\n", "no usable row"),
+        (b"t,p,q,r,w1,w2,w3,w4\nx,x,x,x,x,x,x,x\n", "column t holds 'x', no number"),
         (b"t,p,q,r,w1,w3,w4\n0,0,0,0,1,1,1\n", "without a hole"),
     ],
 )
