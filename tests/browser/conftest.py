@@ -99,7 +99,9 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(1)
     worn = 1.0 - 0.002 * np.arange(60)
     logs, parameters = rows({n: s + 0.01 * rng.standard_normal(60) for n, s in (("one", np.ones(60)), ("two", worn))})
-    health = health_trend(*fleet(), dict.fromkeys("ab", PELICAN_X.to_yaml()))
+    gentle, trims = fleet()
+    health = health_trend(gentle, trims, dict.fromkeys("ab", PELICAN_X.to_yaml()))
+    logs += gentle
     file = tmp_path_factory.mktemp("fleet") / "fleet.html"
     file.write_text(render(build(summarise(logs, parameters, []), logs, parameters, [], "Report of a fleet", health)))
     return file
