@@ -46,6 +46,8 @@ NOMINAL_UNITS: dict[str, str] = {
 NOMINAL_NAMES: tuple[str, ...] = tuple(NOMINAL_UNITS)
 MAY_VANISH = "J_r"
 """Light rotors hardly turn the vehicle, and simulators leave their inertia out: this may be as good as nothing."""
+VANISHED = 1e-3
+"""Share of its guess at which such a parameter is as good as nothing."""
 
 
 @dataclass(frozen=True)

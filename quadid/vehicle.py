@@ -13,12 +13,13 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_valid
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
-from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, impossible_inertia
+from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.proof import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray
 from quadid.vehicle_parts import (
+    MIXERS,
     Command,
     Coordinate,
     Mounting,
@@ -36,16 +37,9 @@ from quadid.yaml_text import read_mapping
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
-VANISHED = 1e-3
-"""Share of its guess at which a parameter that may vanish has."""
 STAND_ERROR = 0.02
 """Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
 MOST_ROTORS = 16
-
-MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
-    "crazyflie": ((1.0, -0.5, 0.5, 1.0), (1.0, -0.5, -0.5, -1.0), (1.0, 0.5, -0.5, 1.0), (1.0, 0.5, 0.5, -1.0)),
-}
-"""Mixers by name: rows are rotors, columns the inputs.  Crazyflie takes thrust, roll, pitch, yaw."""
 
 
 class Vehicle(Strict):
@@ -243,8 +237,7 @@ class Vehicle(Strict):
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
-            problem = _first_problem(error)
-            fix = "add it, as docs/new-vehicle.md shows" if problem.startswith("no '") else "correct that entry"
+            problem, fix = _first_problem(error)
             raise VehicleError(f"{origin}: {problem}", fix=fix) from error
 
     @classmethod
@@ -282,16 +275,19 @@ class Vehicle(Strict):
         return target
 
 
-def _first_problem(error: ValidationError) -> str:
+def _first_problem(error: ValidationError) -> tuple[str, str]:
+    """What is wrong first of all, and what to do about it."""
     details = error.errors()
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])  # a slip explains what is missing
     place = ".".join(str(part) for part in detail["loc"])
-    if detail["type"] == "extra_forbidden":
-        return f"unknown key '{place}'; {nearest(str(detail['loc'][-1]), _valid_keys(detail['loc'][:-1]))}"
     if detail["type"] == "missing":
-        return f"no '{place}'"
-    message = detail["msg"].removeprefix("Value error, ")
-    return f"{place}: {message} (found {detail['input']!r:.60})" if place else message
+        return f"no '{place}'", "add it, as docs/new-vehicle.md shows"
+    problem = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] == "extra_forbidden":
+        problem = f"unknown key '{place}'; {nearest(str(detail['loc'][-1]), _valid_keys(detail['loc'][:-1]))}"
+    elif place:
+        problem = f"{place}: {problem} (found {detail['input']!r:.60})"
+    return problem, "correct that entry"
 
 
 def _valid_keys(path: tuple[int | str, ...]) -> list[str]:

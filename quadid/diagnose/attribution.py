@@ -92,9 +92,12 @@ def without_in_clutter(shooting: Shooting, model: Model, cause: Candidate | None
 
 def ordinary(shooting: Shooting, model: Model, cause: Candidate, listed: Sequence[Candidate]) -> bool:
     """Whether `cause` is no larger in `model` than it may be on any vehicle."""
-    entries = shooting.free(cause.names)
-    near = np.abs(entries.from_neutral(model.theta)) <= UNTIDY
-    return bool(near.all()) and set(cause.names) <= set(untidy_names(listed))
+    return untidy_sized(shooting.free(cause.names), model.theta) and set(cause.names) <= set(untidy_names(listed))
+
+
+def untidy_sized(effects: Free, theta: FloatArray) -> bool:
+    """Whether no number of `effects` is further from neutral at `theta` than it may be on any vehicle."""
+    return bool(np.all(np.abs(effects.from_neutral(theta)) <= UNTIDY))
 
 
 def clutter_names(model: Model, listed: Sequence[Candidate]) -> list[str]:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from quadid.chi_square import Z95
-from quadid.diagnose.attribution import UNTIDY
+from quadid.diagnose.attribution import UNTIDY, untidy_sized
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
+from quadid.identify.parameterization import Free
 from quadid.model.layout import Entry
 from quadid.parameters import Parameter, Status, at_bound
 
@@ -51,10 +50,9 @@ def slight_changes(model: Model) -> dict[str, str]:
     """
     told = {}
     for cause in (c for c in model.causes if c.timed is not None):
-        own = [e for e in model.free.entries if e.name in cause.names]
-        sizes = [abs(float(model.theta[e.index]) - e.neutral) / e.typical for e in own]
-        if max(sizes, default=np.inf) <= UNTIDY:
-            most = max(own, key=lambda e: abs(float(model.theta[e.index])))
+        own = Free(tuple(e for e in model.free.entries if e.name in cause.names))
+        if untidy_sized(own, model.theta):
+            most = max(own.entries, key=lambda e: abs(float(model.theta[e.index])))
             told[cause.label] = (
                 f"{most.name} = {float(model.theta[most.index]):.3g} is no larger than parts of a flight differ by on "
                 f"any vehicle ({UNTIDY * most.typical:.3g})"

@@ -82,13 +82,12 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
     gram, grad = (sum_by_block(a, labels) for a in (lin.gram, lin.grad))
     prior = default_prior(scorer, free)
     step = posterior_covariance(lin.information, prior) @ lin.gradient + steps_without(gram, grad, prior.precision)
-    total: Tally | None = None
+    parts = []
     for block, moved in enumerate(step):
         kept = [np.flatnonzero(labels[lin.window == i] == block) for i in range(len(scorer.rollouts))]
         if any(len(k) for k in kept):
-            part = tallied(scorer.taking(kept), free.move(theta, moved))
-            total = part if total is None else total + part
-    return float("inf") if total is None else total.mse
+            parts.append(tallied(scorer.taking(kept), free.move(theta, moved)))
+    return reduce(add, parts).mse if parts else float("inf")
 
 
 def _scorer(nominal: Identified, windows: Sequence[Window]) -> Shooting:
@@ -111,5 +110,5 @@ def _second_halves(nominal: Identified, model: Model, logs: Sequence[Window]) ->
             totals.append((tallied(second, nominal.theta), tallied(second, refitted)))
     if not totals:
         return None
-    without, found = (reduce(add, part) for part in zip(*totals, strict=True))
-    return without.mse, found.mse
+    without, found = (reduce(add, parts).mse for parts in zip(*totals, strict=True))
+    return without, found

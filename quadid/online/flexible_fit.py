@@ -140,30 +140,29 @@ def halved(window: Window, first: int) -> Window:
 
 
 def sampling_error(
-    estimate: WindowEstimate, windows: Sequence[Window], vehicle: Vehicle, free: Free, prior: Prior, best: Polished,
-    noise: NoiseModel, spacing: float,
-) -> FloatArray:  # fmt: skip
+    estimate: WindowEstimate, problem: Shooting, free: Free, prior: Prior, best: Polished, spacing: float
+) -> FloatArray:
     """Variances of the nominal six, log scale, on the diagonal, shape (6, 6), by what the rotors do between readings.
 
     Two trials do not tell which combinations are known better than their parts: a covariance out of them would be
     infinitely sure of four of six, and windows fused with it of all.
 
     Args:
-        estimate: of these windows.
-        windows: data.
-        vehicle: the vehicle.
+        estimate: of the windows of `problem`.
+        problem: data in segments, with the noise of the fit.
         free: what was free, with `prior`.
         prior: of everything that was free.
         best: the optimum.
-        noise: of the fit.
         spacing: time between two readings of the rotors [rows].
     """
-    missed, layout, order = np.zeros_like(estimate.z), Layout(vehicle), ORDER[windows[0].sampling]
+    windows = [r.window for r in problem.rollouts]
+    missed, order = np.zeros_like(estimate.z), ORDER[windows[0].sampling]
     for first in (0, 1):
-        sparse = Shooting.cut([halved(w, first) for w in windows], vehicle, SEGMENT, noise, layout)
+        sparse = problem.on([halved(w, first) for w in windows])
         # One linear step tells the size; a descent may refuse every step, and would then tell of no error at all.
         lin = sparse.linearise(best.theta, free, best.states)
-        there = reduced(estimate.start, estimate.stop, layout, vehicle, free, prior, replace(best, lin=lin))
+        moved = replace(best, lin=lin)
+        there = reduced(estimate.start, estimate.stop, problem.layout, problem.vehicle, free, prior, moved)
         error = (there.optimum - estimate.optimum) * spacing**order / (2.0**order - 1.0)
         missed += 0.5 * error**2
     return np.diag(missed)

@@ -209,8 +209,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
     # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
     bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
-    of_these = (vehicle, free, prior, result, shooting.noise, request.spacing)
-    missed = sampling_error(estimate, request.windows, *of_these)
+    missed = sampling_error(estimate, shooting, free, prior, result, request.spacing)
     reply = FitReply(
         request.number, "", bounds, is_excited(bounds), widened(estimate, missed), result.theta, shooting.noise,
         vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),

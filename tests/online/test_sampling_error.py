@@ -79,10 +79,7 @@ def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -
         layout, start = Layout(PELICAN), Layout(PELICAN).initial(PELICAN)
         problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
         estimate = reduced(0.0, 6.0, layout, PELICAN, free, prior, best)
-        whole, half = (
-            sampling_error(estimate, windows, PELICAN, free, prior, best, problem.noise, spacing)
-            for spacing in (1.0, 0.5)
-        )
+        whole, half = (sampling_error(estimate, problem, free, prior, best, spacing) for spacing in (1.0, 0.5))
         assert (np.diag(whole) > 0.0).all()
         np.testing.assert_array_equal(whole, np.diag(np.diag(whole)))
         np.testing.assert_allclose(np.sqrt(np.diag(whole) / np.diag(half)), 2.0**order)
