@@ -89,7 +89,7 @@ def _beside(data: str, parameters: Iterable[Parameter], truth: Mapping[str, floa
 
 
 def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")) -> str:
-    """Markdown: the share of identified numbers that hold their truth, then each number.
+    """Markdown: the share of identified numbers that hold their truth, then each of them.
 
     Of data whose name begins with one of `short` only those that do not.
     """
@@ -99,27 +99,20 @@ def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")
     held = sum(n.inside for n in named)
     lines = [
         f"Of {len(named)} numbers called identified whose truth is known {held} hold it inside 95 % "
-        f"({held / len(named):.0%}; wanted 90 %).",
+        f"({held / len(named):.0%}; wanted 90 %). Numbers of another status stand in `foreign.json` only.",
         "",
     ]
     for group in short:
         mine = [n for n in named if n.data.startswith(group)]
         if mine:
             lines += [f"{group}: {sum(n.inside for n in mine)} of {len(mine)} inside.", ""]
-    lines += ["| data | by | number | status | estimate [95 %] | truth | |", "|---|---|---|---|---|---|---|"]
-    for n in numbers:
-        outside = n.identified and not n.inside
-        if n.data.startswith(tuple(short)) and not outside:
+    lines += ["| data | by | number | estimate [95 %] | truth | |", "|---|---|---|---|---|---|"]
+    for n in named:
+        if n.data.startswith(tuple(short)) and n.inside:
             continue
         low, high = n.truth
         truth = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        mark = (
-            f"**outside**, {n.value / min(max(n.value, low), high) - 1.0:+.2%}"
-            if outside
-            else "inside"
-            if n.identified
-            else ""
-        )
+        mark = "inside" if n.inside else f"**outside**, {n.value / min(max(n.value, low), high) - 1.0:+.2%}"
         interval = f"{n.value:.3g} [{n.interval[0]:.3g}, {n.interval[1]:.3g}]"
-        lines.append(f"| {n.data} | {n.by} | {n.name} | {n.status} | {interval} | {truth} | {mark} |")
+        lines.append(f"| {n.data} | {n.by} | {n.name} | {interval} | {truth} | {mark} |")
     return "\n".join(lines)
