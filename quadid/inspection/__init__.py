@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from quadid.inspection.airborne import Spans, flying_spans, proposed_cuts
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
@@ -33,20 +30,17 @@ __all__ = [
 ]
 
 
-def inspect(
-    recording: Recording, vehicle: Vehicle | None = None, excitation: Sequence[Mapping[str, Any]] | None = None
-) -> Inspection:
-    """Inspects a recording.
+def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
+    """Inspects a recording; what its motion excites is computed elsewhere (`quadid.identify`).
 
     Args:
         recording: a log in core units and frames, as the reader believes.
         vehicle: with it, hover thrust, motor order and rotor columns are checked too.
-        excitation: rows per parameter computed elsewhere (`quadid.identify`); passed on as they are.
     """
-    facts = channel_facts(recording)
     turned = recording if vehicle is None else in_body_axes(recording, vehicle)
     spans = flying_spans(turned, vehicle)
-    checks = timing_checks(recording, facts, sum(b - a for a, b in spans))
+    facts = channel_facts(recording, spans)
+    checks = timing_checks(recording, facts)
     checks += [
         gravity_check(turned, spans),
         attitude_check(turned),
@@ -66,7 +60,6 @@ def inspect(
         checks=tuple(checks),
         missing=missing_signals(recording.format, facts),
         parameters=parameter_outlook(facts),
-        excitation=tuple(excitation or ()),
         warnings=recording.warnings,
     )
 

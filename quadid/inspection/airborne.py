@@ -19,6 +19,8 @@ _CARRIES = 0.9
 """… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
 _IDLE = 0.15
 """Commands that never exceed this fraction of full are idling motors."""
+_NOTHING = 0.1
+"""A rotor below this share of the median speed of all says nothing."""
 _GROUND = 3.0
 """Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
 _MARGIN = 2.0
@@ -86,6 +88,7 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
     if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
         low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
         values = np.clip((values - low) / (high - low), 0.0, None)
+    values = _beside_others(values)
     thrust = np.asarray(np.sum(values**2, axis=1))
     if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
         return thrust, 0.0
@@ -98,6 +101,12 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
             return modelled, hover
     powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
     return thrust, float(np.median(powered)) if len(powered) else 0.0
+
+
+def _beside_others(speeds: FloatArray) -> FloatArray:
+    """Speeds with the others' median for a rotor that says nothing: it is dead, or its signal is; no ground carries."""
+    usual = np.median(speeds, axis=1, keepdims=True)
+    return np.asarray(np.where(speeds < _NOTHING * usual, usual, speeds))
 
 
 def _felt(accel: Channel) -> FloatArray:

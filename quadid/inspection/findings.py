@@ -40,7 +40,7 @@ class ChannelFacts:
         longest_gap: [s], 0 when there is none.
         bridged: lost samples too few for a gap.
         repeated: fraction of rows equal to the row before.
-        stuck: longest time without any change [s].
+        stuck: longest time in flight without any change [s]; 0 where nothing tells when it flies.
         saturated: samples at a limit that the channel hits several times.
         dropped: samples the reader dropped, by reason.
     """

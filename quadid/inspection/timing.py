@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import ChannelFacts, Check, Verdict
 from quadid.resample import measured_period, true_runs
 from quadid.resampling_plan import holes, longest_step
@@ -21,12 +22,17 @@ _UNSTEADY = 0.25
 """Jitter above which the log's timing is worth a warning."""
 
 
-def channel_facts(recording: Recording) -> tuple[ChannelFacts, ...]:
-    """Returns the facts of all channels of a recording."""
-    return tuple(_facts(recording.channels[name]) for name in CHANNELS if name in recording.channels)
+def channel_facts(recording: Recording, flying: Spans = ()) -> tuple[ChannelFacts, ...]:
+    """Returns the facts of all channels of a recording.
+
+    Args:
+        recording: the log.
+        flying: when it flies [s]; at rest a sensor may well repeat itself.
+    """
+    return tuple(_facts(recording.channels[name], flying) for name in CHANNELS if name in recording.channels)
 
 
-def _facts(channel: Channel) -> ChannelFacts:
+def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
     steps = np.diff(channel.t)
     median = float(np.median(steps)) if len(steps) else np.nan
     long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
@@ -45,7 +51,7 @@ def _facts(channel: Channel) -> ChannelFacts:
         bridged=holes(channel.t, _GRID) if len(steps) else 0,
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
-        stuck=_longest_rest(channel.t, same),
+        stuck=_longest_rest(channel.t, same & within(channel.t[:-1], flying) & within(channel.t[1:], flying)),
         saturated=sum(end.samples for end in at_limit(channel.values))
         if channel.name in ("gyro", "accel", "motor_command")
         else 0,
@@ -59,13 +65,12 @@ def _longest_rest(t: FloatArray, same: BoolArray) -> float:
     return float(np.max(t[end] - t[first], initial=0.0))
 
 
-def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying: float) -> list[Check]:
+def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list[Check]:
     """Checks clocks, gaps, jitter and stuck sensors.
 
     Args:
         recording: the log.
         facts: of its channels.
-        flying: time in flight [s].
     """
     checks = [_clock_check(recording, facts)]
     for f in facts:
@@ -91,8 +96,8 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...], flying:
         message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
         checks.append(Check("timing", Verdict.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
     for f in facts:
-        if f.name in ("gyro", "accel") and f.stuck > _STUCK and flying > 1.0:
-            message = f"{f.name}: does not change for {f.stuck:.2g} s ({f.source})"
+        if f.name in ("gyro", "accel") and f.stuck > _STUCK:
+            message = f"{f.name}: does not change for {f.stuck:.2g} s of flight ({f.source})"
             checks.append(Check("stuck", Verdict.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck}))
         if f.name in ("gyro", "accel") and f.saturated:
             message = f"{f.name}: {f.saturated} samples at the limit of its range"

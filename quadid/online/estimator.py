@@ -86,7 +86,7 @@ class Estimator:
 
     @property
     def _yaw_missed(self) -> bool:
-        return bool(self.misfit.max() > YAW_MISFIT)
+        return self.flexible or bool(self.misfit.max() > YAW_MISFIT)
 
     @property
     def thrust(self) -> ThrustModel:
@@ -147,7 +147,7 @@ class Estimator:
         self._pool_noise(reply)
         if reply.misfit is not None:
             self.misfit = reply.misfit
-            self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
+        self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
         for window in self._asked:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
             self.start = window.t0 if math.isnan(self.start) else self.start
@@ -201,6 +201,7 @@ class Estimator:
         """What couples into yaw alone is as uncertain as before the flight where the model misses it.
 
         Roll and pitch rest on torque over inertia; d, J_zz and J_r on small couplings, which what is missed outweighs.
+        Where every effect is fitted along, the coupling itself is free, and yaw knows their ratios only.
         """
         theta, covariance, place = theta.copy(), covariance.copy(), _YAW_PLACES
         theta[place] = self.vehicle.initial[place]

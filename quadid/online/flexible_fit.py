@@ -7,9 +7,10 @@ Segments are short, because what no effect describes grows with their length.
 What is left of a window is a quadratic model in the nominal six, the effects eliminated (Schur complement).  Its b is
 that of thrust b w^2 at hover, which all windows share, unlike the steepness of a curve (`ThrustModel.secant`).
 
-What the rotors do between two readings is not seen.  Where a rate loop rings at half their rate, torque over inertia is
-several per cent off and no residual says so; so every second row of the rotors is left out, and how far that moves the
-estimate tells its error.
+What the rotors do between two readings is not seen.  Where sticks move in steps and a rate loop rings, torque over
+inertia is several per cent off and no residual says so; so every second row of the rotors is left out, and how far that
+moves the estimate tells its error.  What was missed enters twice: in step with the motion, with a sign that depends on
+which rows were left out, and by its square, as noise of an input does, which makes every inertia look larger.
 """
 
 from __future__ import annotations
@@ -45,8 +46,12 @@ STEP = 1e-5
 """Of differences, in scaled parameters."""
 ORDER: dict[Sampling, int] = {"held": 1, "instant": 2}
 """What is missed between readings grows with this power of their distance (Richardson): steps miss twice as much at
-twice the distance, so that leaving every second reading out moves the estimate by its error; lines miss four times as
-much, and it moves by three times its error."""
+twice the distance, lines four times."""
+LASTING = 75.0
+"""A pilot's style and the place of the readings between the sticks' steps stay for more than a minute [s]: for that
+long windows err alike, and what they miss counts once."""
+ROLL_PITCH = [NOMINAL_NAMES.index(name) for name in ("J_xx", "J_yy")]
+"""One set of sticks, loops and readings: two tries at the size of one error."""
 MOVING = ("command", "rotor", "air", "body")
 """Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
 
@@ -74,9 +79,8 @@ def flexible_prior(nominal: Prior, free: Free, vehicle: Vehicle, layout: Layout)
 
 
 def flexible_fit(
-    windows: Sequence[Window], vehicle: Vehicle, nominal: Prior, theta: FloatArray, noise: NoiseModel | None,
-    seconds: float = SEGMENT,
-) -> tuple[Shooting, Free, Prior, Polished]:  # fmt: skip
+    windows: Sequence[Window], vehicle: Vehicle, nominal: Prior, theta: FloatArray, noise: NoiseModel | None
+) -> tuple[Shooting, Free, Prior, Polished]:
     """Fits everything; the problem with its noise, what is free, its prior, and the optimum.
 
     Args:
@@ -85,10 +89,9 @@ def flexible_fit(
         nominal: prior of the nominal six.
         theta: start, full vector.
         noise: None lets the fit find it, all structure that remains counted as noise.
-        seconds: length of the segments.
     """
     layout = Layout(vehicle)
-    problem = Shooting.cut(windows, vehicle, seconds, noise, layout)
+    problem = Shooting.cut(windows, vehicle, SEGMENT, noise, layout)
     free = problem.free(moving_names(problem))
     prior = flexible_prior(nominal, free, vehicle, layout)
     result = polish(problem, theta, free, prior, iterations=12)
@@ -145,7 +148,9 @@ def sampling_error(
     """Variances of the nominal six, log scale, on the diagonal, shape (6, 6), by what the rotors do between readings.
 
     Two trials do not tell which combinations are known better than their parts: a covariance out of them would be
-    infinitely sure of four of six, and windows fused with it of all.
+    infinitely sure of four of six, and windows fused with it of all.  Half of the trials' difference is what is in step
+    with the motion, their mean what grows with the square; the former falls with the readings' distance to the power
+    `ORDER`, the latter to twice that.
 
     Args:
         estimate: of the windows of `problem`.
@@ -156,16 +161,18 @@ def sampling_error(
         spacing: time between two readings of the rotors [rows].
     """
     windows = [r.window for r in problem.rollouts]
-    missed, order = np.zeros_like(estimate.z), ORDER[windows[0].sampling]
+    shifts = []
     for first in (0, 1):
         sparse = problem.on([halved(w, first) for w in windows])
         # One linear step tells the size; a descent may refuse every step, and would then tell of no error at all.
         lin = sparse.linearise(best.theta, free, best.states)
         moved = replace(best, lin=lin)
         there = reduced(estimate.start, estimate.stop, problem.layout, problem.vehicle, free, prior, moved)
-        error = (there.optimum - estimate.optimum) * spacing**order / (2.0**order - 1.0)
-        missed += 0.5 * error**2
-    return np.diag(missed)
+        shifts.append(there.optimum - estimate.optimum)
+    share = (0.5 * spacing) ** ORDER[windows[0].sampling]
+    missed = (share * 0.5 * (shifts[0] - shifts[1])) ** 2 + (share**2 * 0.5 * (shifts[0] + shifts[1])) ** 2
+    missed[ROLL_PITCH] = np.mean(missed[ROLL_PITCH])
+    return np.diag(missed) * max(LASTING / (estimate.stop - estimate.start), 1.0)
 
 
 def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:

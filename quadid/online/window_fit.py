@@ -130,8 +130,9 @@ class FitReply(JobReply):
             segment counts as noise.
         measured: noise measured in this window, when that was asked for.
         misfit: variance of gyro (x, y, z) and accelerometer residuals over that of the sensors' own noise, shape (6,):
-            1 where the model misses nothing; with `measured`, or where noise was found anew.
-        lack: what effects of the catalogue would explain; with `misfit`, where they were not fitted along.
+            1 where the model misses nothing; with `measured`, or where noise was found anew, and effects were not
+            fitted along.
+        lack: what effects of the catalogue would explain; with `misfit`.
         vehicle: where every effect that moves the vehicle was fitted along, what it was fitted with: that of the
             request, with room for its bare guesses where effects joined.
         between_rows: standard deviations, log scale, by what the rotors do between readings, shape (6,); in `estimate`.
@@ -214,11 +215,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
         request.number, "", bounds, is_excited(bounds), widened(estimate, missed), result.theta, shooting.noise,
         vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),
     )  # fmt: skip
-    if not request.measure:
-        return reply
-    measured = residual_noise(shooting, result)
-    short, *_, brief = flexible_fit(request.windows, vehicle, nominal, result.theta, measured, SWARM_SECONDS)
-    return replace(reply, measured=measured, misfit=_share_of(measured, residual_noise(short, brief)))
+    return replace(reply, measured=residual_noise(shooting, result)) if request.measure else reply
 
 
 def _lack_of_fit(problem: Shooting, result: Polished) -> LackOfFit:

@@ -143,7 +143,7 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
     else:
         cut = parse_cut(str(given))
         recording = open_recording(cut.path, preset, vehicle.columns)
-    doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut)
+    doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut).doubts
     warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]
     return cut.of(recording)
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
-from quadid.workflow.loading import LONGEST, Log, as_vehicle, open_recording
+from quadid.workflow.loading import GRID, LONGEST, Log, as_vehicle, gridded, open_recording
 from quadid.workflow.outcome import Outcome
-from quadid.workflow.parts import flown_parts, left_on_ground, names_of, parse_cut
+from quadid.workflow.parts import Cut, flown_parts, left_on_ground, names_of, parse_cut
 
 if TYPE_CHECKING:
     from quadid.inspection import Inspection
+    from quadid.inspection.airborne import Spans
     from quadid.report.text_table import TextTable
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
@@ -72,22 +73,22 @@ def inspect(
     if whole is None:
         named = {} if described is None else described.columns
         whole = open_recording(cut.path, preset, {**named, **(columns or {})})
-    recording = cut.of(whole)
-    rows = () if described is None else _excitation(recording, described)
-    found = inspect_recording(recording, described, rows)
-    use = names_of(cut, flown_parts(whole, described, cut))
+    found = inspect_recording(cut.of(whole), described)
+    flown = flown_parts(whole, found.flying, cut)
+    if described is not None:
+        found = replace(found, excitation=_excitation(whole, described, cut, flown))
+    use = names_of(cut, flown)
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
 
 
-def _excitation(recording: Recording, vehicle: Vehicle) -> tuple[dict[str, Any], ...]:
+def _excitation(recording: Recording, vehicle: Vehicle, cut: Cut, flown: Spans) -> tuple[dict[str, Any], ...]:
     """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
-    from quadid.grid import to_windows
     from quadid.identify.excitation import excitation
     from quadid.parameters import NOMINAL_UNITS
     from quadid.window import beginning
 
     try:
-        windows, _ = beginning(to_windows(recording, vehicle), LONGEST)
+        windows, _ = beginning(gridded(recording, vehicle, GRID, cut, flown)[0], LONGEST)
         found = excitation(windows, vehicle)
     except QuadidError:
         return ()  # the inspection itself says what is missing or too slow

@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from quadid.errors import LogError, VehicleError
 from quadid.workflow.parts import Cut, first_imu_time, flown_parts, left_on_ground, names_of, parse_cut
@@ -61,7 +61,7 @@ class Log:
 
     def at(self, rate: float | None) -> Log:
         """The same log on a grid of another rate [Hz]; None for the log's own."""
-        windows, grid = _gridded(self.recording, self.vehicle, rate, self.cut, self.flown)
+        windows, grid = gridded(self.recording, self.vehicle, rate, self.cut, self.flown)
         return replace(self, windows=windows, grid=grid)
 
     def of(self, vehicle: str | Path | Vehicle) -> Log:
@@ -157,16 +157,16 @@ def write_recording(path: str | Path, recording: Recording) -> Path:
 
 def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> Log:
     """A log checked and on the grid; of one that also stands on the ground, what is in the air."""
-    doubts = check_conventions(recording, vehicle, cut) if cut.checked else ()
-    flown = flown_parts(recording, vehicle, cut) if cut.checked else ()
-    windows, report = _gridded(recording, vehicle, rate, cut, flown)
+    doubts, flown = check_conventions(recording, vehicle, cut) if cut.checked else Checked()
+    windows, report = gridded(recording, vehicle, rate, cut, flown)
     left_out = [left_on_ground(names_of(cut, flown))] if flown else []
     return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown)
 
 
-def _gridded(
+def gridded(
     recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut, flown: Spans
 ) -> tuple[list[Window], GridReport]:
+    """What is flown of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
     from quadid.grid import grid_recording
 
     zero = first_imu_time(recording)
@@ -189,7 +189,14 @@ def parse_columns(texts: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple[str, ...]:
+class Checked(NamedTuple):
+    """A log that means what is believed: what looks wrong but need not be, and its parts to use (`Log.flown`)."""
+
+    doubts: tuple[str, ...] = ()
+    flown: Spans = ()
+
+
+def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> Checked:
     """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
 
     Args:
@@ -197,22 +204,20 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> tuple
         vehicle: whose log it is.
         cut: the part that is asked for; an error about a whole log proposes what is in the air.
 
-    Returns:
-        What looks wrong but need not be.
-
     Raises:
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
     from quadid.inspection import FATAL, Verdict, inspect
 
-    doubts = []
-    for check in inspect(recording, vehicle).checks:
+    found, doubts = inspect(recording, vehicle), []
+    flown = flown_parts(recording, found.flying, cut)
+    for check in found.checks:
         # A check without numbers could not be made; what comes next says why, and better.
         if check.verdict is Verdict.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
-            parts = " ".join(names_of(cut, flown_parts(recording, vehicle, cut)))
+            parts = " ".join(names_of(cut, flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
         if check.verdict in (Verdict.ERROR, Verdict.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
-    return tuple(doubts)
+    return Checked(tuple(doubts), flown)

@@ -13,7 +13,6 @@ from quadid.errors import LogError
 
 if TYPE_CHECKING:
     from quadid.inspection.airborne import Spans
-    from quadid.vehicle import Vehicle
     from quadid.window import Recording
 
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
@@ -71,20 +70,22 @@ def parse_cut(text: str, start: float | None = None, stop: float | None = None) 
     return cut
 
 
-def flown_parts(recording: Recording, vehicle: Vehicle | None, cut: Cut) -> Spans:
+def flown_parts(recording: Recording, flying: Spans, cut: Cut) -> Spans:
     """What to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
 
     A part that was asked for is used as it is.
+
+    Args:
+        recording: the whole log.
+        flying: when it flies [s, in the time of the recording].
+        cut: the part that is asked for.
     """
-    from quadid.inspection import flying_spans, proposed_cuts
-    from quadid.mounting import in_body_axes
+    from quadid.inspection import proposed_cuts
 
     imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
     if cut.start is not None or cut.stop is not None or not imu:
         return ()
-    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
-    first, last = first_imu_time(recording), max(float(t[-1]) for t in imu)
-    return proposed_cuts(flying_spans(turned, vehicle), first, last)
+    return proposed_cuts(flying, first_imu_time(recording), max(float(t[-1]) for t in imu))
 
 
 def names_of(cut: Cut, parts: Spans) -> list[str]:

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 import quadid
+import quadid.inspection
 from quadid.errors import LogError
+from quadid.inspection.airborne import Spans, flying_spans
+from quadid.vehicle import Vehicle
+from quadid.window import Recording
 from tests.cli.conftest import Cli, Flights, table, write_table
 
 
@@ -41,6 +45,27 @@ def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> Non
     assert run.data["use"] == ["standing.csv@12:30"]
     assert "use standing.csv@12:30" in inside("inspect", standing, "--vehicle", "pelican").out
     assert inside("inspect", f"{standing}@12:30", "--json", "-").data["use"] == []
+
+
+def test_excitation_is_that_of_the_flight(inside: Cli, standing: Path) -> None:
+    whole, cut, all_of_it = (
+        inside("inspect", f"{standing}{part}", "--vehicle", "pelican", "--json", "-").data["excitation"]
+        for part in ("", "@12:30", "@0:")
+    )
+    assert whole == cut
+    assert whole != all_of_it
+
+
+def test_when_it_flies_is_worked_out_once(standing: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def counted(recording: Recording, vehicle: Vehicle | None) -> Spans:
+        asked.append(recording.name)
+        return flying_spans(recording, vehicle)
+
+    monkeypatch.setattr(quadid.inspection, "flying_spans", counted)
+    quadid.load(standing, vehicle="pelican")
+    assert len(asked) == 1
 
 
 def test_only_what_is_in_the_air_is_used_and_said_once(standing: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+import quadid.online.flexible_fit as flexible_fit_room
+from quadid.identify.gauss_newton import polish
+from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
-from quadid.online.flexible_fit import ORDER, flexible_fit, halved, reduced, sampling_error, widened
+from quadid.online.flexible_fit import LASTING, ORDER, flexible_fit, halved, reduced, sampling_error, widened
 from quadid.online.fusion import Fusion, WindowEstimate
 from quadid.online.resampler import Resampler
 from quadid.online.window_fit import prior_of
+from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling, Window
@@ -71,6 +75,55 @@ def test_an_added_covariance_leaves_the_optimum_and_widens_by_itself() -> None:
     np.testing.assert_allclose(added, np.outer(shift, shift), atol=1e-12)
 
 
+@dataclass(frozen=True)
+class Moved:
+    """Says that leaving rows out moves the estimate by `shifts`, whatever the data."""
+
+    shifts: tuple[FloatArray, FloatArray]
+
+    def __call__(
+        self, monkeypatch: pytest.MonkeyPatch, sampling: Sampling, spacing: float, seconds: float
+    ) -> FloatArray:
+        own = WindowEstimate(0.0, seconds, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0)
+        moved = iter([replace(own, score=-shift) for shift in self.shifts])
+        monkeypatch.setattr(flexible_fit_room, "reduced", lambda *_: next(moved))
+        windows = (window(1.0, sampling),)
+        problem = Shooting.cut(windows, PELICAN, 0.5, None, Layout(PELICAN))
+        free = problem.free(list(NOMINAL_NAMES))
+        start = Layout(PELICAN).initial(PELICAN)
+        best = polish(problem, start, free, prior_of(PELICAN), iterations=1)
+        missed = sampling_error(own, problem, free, prior_of(PELICAN), best, spacing)
+        np.testing.assert_array_equal(missed, np.diag(np.diag(missed)))
+        return np.sqrt(np.diag(missed))
+
+
+@pytest.mark.parametrize(("sampling", "order"), ORDER.items())
+def test_what_is_in_step_falls_with_the_distance_and_noise_with_its_square(
+    sampling: Sampling, order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials that move apart tell of torque in step with the motion, trials that move alike of noise of the input."""
+    shift = np.array([0.01, 0.0, 0.08, 0.08, 0.0, 0.0])
+    for other, power in ((-shift, 1), (shift, 2)):
+        said = [Moved((shift, other))(monkeypatch, sampling, spacing, LASTING) for spacing in (2.0, 1.0, 0.5)]
+        np.testing.assert_allclose(said[0], shift)
+        np.testing.assert_allclose(said[1], shift / 2.0 ** (power * order))
+        np.testing.assert_allclose(said[2], shift / 4.0 ** (power * order))
+
+
+def test_roll_and_pitch_are_two_tries_at_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    shift = np.array([0.0, 0.0, 0.08, 0.0, 0.0, 0.0])
+    said = Moved((shift, -shift))(monkeypatch, "held", 2.0, LASTING)
+    np.testing.assert_allclose(said[2:4], 0.08 / np.sqrt(2.0))
+
+
+def test_windows_of_one_minute_say_an_error_that_lasts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    shift = np.array([0.0, 0.0, 0.08, 0.08, 0.0, 0.0])
+    said = Moved((shift, -shift))(monkeypatch, "held", 2.0, 10.0)
+    np.testing.assert_allclose(
+        said / np.sqrt(LASTING / 10.0), Moved((shift, -shift))(monkeypatch, "held", 2.0, LASTING)
+    )
+
+
 def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -> None:
     """A descent that refused every step once told of none, and that window outweighed all others."""
     full = flight(24.0, 5).window.slice(0, 300)
@@ -79,10 +132,12 @@ def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -
         layout, start = Layout(PELICAN), Layout(PELICAN).initial(PELICAN)
         problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
         estimate = reduced(0.0, 6.0, layout, PELICAN, free, prior, best)
-        whole, half = (sampling_error(estimate, problem, free, prior, best, spacing) for spacing in (1.0, 0.5))
-        assert (np.diag(whole) > 0.0).all()
-        np.testing.assert_array_equal(whole, np.diag(np.diag(whole)))
-        np.testing.assert_allclose(np.sqrt(np.diag(whole) / np.diag(half)), 2.0**order)
+        whole, half = (
+            np.sqrt(np.diag(sampling_error(estimate, problem, free, prior, best, spacing))) for spacing in (1.0, 0.5)
+        )
+        assert (whole > 0.0).all()
+        assert (whole / half >= 2.0**order * (1.0 - 1e-9)).all()
+        assert (whole / half <= 4.0**order * (1.0 + 1e-9)).all()
 
 
 def test_windows_that_err_together_are_not_surer_for_it() -> None:

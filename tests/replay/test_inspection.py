@@ -359,6 +359,20 @@ def test_stuck_clipped_and_jumping_sensors(clean: Recording, happened: Happened)
     happened(6, "inspection names a stuck gyro ('does not change for 2 s') and a clipped one")
 
 
+def test_a_sensor_that_repeats_itself_on_the_ground_is_not_stuck(clean: Recording) -> None:
+    """A simulator's gyro, and one of few bits, repeat themselves while the vehicle stands; in flight none does."""
+    t = clean.channels["gyro"].t
+
+    def still(until: float) -> Recording:
+        stands = changed(clean, "rotor_speed", lambda v: np.where(t[:, None] < 5.0, 60.0, v))
+        return changed(stands, "gyro", lambda v: np.where(t[:, None] < until, 0.0, v))
+
+    assert not [c for c in inspect(still(5.0), PELICAN).checks if c.name == "stuck"]
+    assert check(inspect(still(7.0), PELICAN), "stuck").message.startswith("gyro: does not change for 2 s of flight")
+    nowhere = changed(still(20.0), "rotor_speed", lambda v: 0.0 * v)
+    assert not [c for c in inspect(nowhere, PELICAN).checks if c.name == "stuck"], "it stands all the time"
+
+
 def test_a_signal_brought_to_a_faster_rate_counts_as_slow_as_it_was(clean: Recording) -> None:
     speed = clean.channels["rotor_speed"]
     few = np.column_stack([np.interp(speed.t, speed.t[::5], column[::5]) for column in speed.values.T])
@@ -377,7 +391,7 @@ def test_faults_of_the_reader_are_counted(clean: Recording) -> None:
 
 def test_json_holds_only_what_json_knows(clean: Recording) -> None:
     rows = ({"name": "b", "relative_sigma": 0.01},)
-    data = inspect(clean, PELICAN, rows).to_dict()
+    data = replace(inspect(clean, PELICAN), excitation=rows).to_dict()
     text = json.dumps(data, allow_nan=False)
     assert json.loads(text)["schema"] == "quadid.inspect/1"
     assert data["excitation"] == [{"name": "b", "relative_sigma": 0.01}]

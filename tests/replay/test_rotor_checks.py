@@ -51,6 +51,18 @@ def test_a_dead_rotor_signal_is_named(flight: tuple[Recording, Vehicle], rotor: 
     assert f"rotor {rotor} reads nothing for 30%" in check.message
 
 
+@pytest.mark.parametrize("rotor", [1, 4])
+def test_a_rotor_that_is_dead_at_first_is_named_and_not_taken_for_ground(
+    flight: tuple[Recording, Vehicle], rotor: int
+) -> None:
+    """Three of four rotors carry less than before a flight counts as begun, but nothing stands on one leg less."""
+    check = judged(
+        flight, lambda c: column(c, rotor, lambda x: np.where(np.arange(len(x)) < 0.2 * len(x), 0.0, x)), "rotor_speed"
+    )
+    assert check.verdict is Verdict.ERROR
+    assert f"rotor {rotor} reads nothing for 20%" in check.message
+
+
 def test_a_stuck_rotor_signal_is_named(flight: tuple[Recording, Vehicle]) -> None:
     check = judged(flight, lambda c: column(c, 3, part(0.02, lambda x: np.full_like(x, x[0]))), "rotor_speed")
     assert check.verdict is Verdict.ERROR
