@@ -47,7 +47,7 @@ def check_table(found: Inspection) -> TextTable:
 
 
 def parameter_outlook_table(found: Inspection) -> TextTable:
-    """Which parameters the log can show, and how sharply."""
+    """Which parameters the log can show, and how sharply; motion says nothing where a channel lacks or is too slow."""
     expected = {str(row["name"]): float(row["relative_sigma"]) for row in found.excitation}
     columns = [Column("parameter"), Column("possible")]
     if expected:
@@ -58,7 +58,8 @@ def parameter_outlook_table(found: Inspection) -> TextTable:
         cells = [parameter_name(outlook.parameter), "yes" if outlook.possible else "no"]
         if expected:
             sigma = expected.get(outlook.parameter, float("nan"))
-            cells.append(f"{100.0 * sigma:.2g} %" if sigma < 10.0 else "not excited")
+            excited = f"{100.0 * sigma:.2g} %" if sigma < 10.0 else "not excited"
+            cells.append(excited if outlook.possible else "")
         rows.append((*cells, _clean(outlook.reason)))
     return TextTable("What can be identified", tuple(columns), tuple(rows))
 

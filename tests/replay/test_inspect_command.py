@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from quadid_cli.main import app_main
 from quadid_replay import write_csv
 
+from quadid.inspection import inspect
+from quadid.parameters import NOMINAL_NAMES
+from quadid.report.inspect_tables import parameter_outlook_table
 from quadid.window import Recording
 from tests.replay.synthetic import Flight
 
@@ -95,3 +99,14 @@ def test_a_single_sample_has_no_rate(
     assert "nan" not in out
     assert "one sample is too little" in out
     assert "1 line with missing" in out
+
+
+def test_motion_is_not_told_where_the_rotors_come_too_slowly() -> None:
+    whole = Flight().recording(seconds=10.0)
+    speed = whole.channels["rotor_speed"]
+    few = replace(speed, t=speed.t[::5], values=speed.values[::5])
+    rows = tuple({"name": name, "relative_sigma": 0.001} for name in NOMINAL_NAMES)
+    for channel, shown in ((speed, 6), (few, 1)):
+        found = inspect(replace(whole, channels={**whole.channels, "rotor_speed": channel}))
+        table = parameter_outlook_table(replace(found, excitation=rows))
+        assert [row[2] for row in table.rows].count("0.1 %") == shown
