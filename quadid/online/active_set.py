@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from quadid.online.records import Event, OnlineSet, Publish, SetState
+from quadid.online.records import WAITS, Event, OnlineSet, Publish, SetState
 
 Action = Publish | Event
 MOST_HELD = 60
@@ -121,7 +121,7 @@ class ActiveSet:
                 False, f"set {number} does not wait for approval; the newest that does is {self.pending.sequence}"
             )
         waited, stop = self._held[number]
-        item = replace(waited, reason=f"approved by {by}: {waited.reason}")
+        item = replace(waited, reason=f"approved by {by}: {waited.reason.removeprefix(WAITS)}")
         actions = self.accept(item, by, t, stop)
         assert self.in_force is not None
         return Answer(True, f"set {number} approved, in force as set {self.in_force.sequence}", tuple(actions))

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from quadid.chi_square import Z95
 from quadid.identify.covariance import PRIOR_SHARE
 from quadid.online.quality import Quality
-from quadid.online.records import OnlineSet, SetState
+from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
 
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
@@ -124,7 +124,7 @@ def decide(case: Case, settings: GateSettings) -> Decision:
         return Decision(SetState.PENDING, "reference", f"{moved}: a person must approve it")
     story = f"{case.agreeing} windows agree; {_gain_text(case)}"
     if case.approval != "auto":
-        return Decision(SetState.PENDING, "approval", f"waits for approval: {story}")
+        return Decision(SetState.PENDING, "approval", f"{WAITS}{story}")
     return Decision(SetState.ACCEPTED, "approval", story)
 
 

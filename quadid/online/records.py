@@ -9,6 +9,9 @@ from enum import StrEnum
 from quadid.health.trims import FlightTrim
 from quadid.parameters import ParameterSet
 
+WAITS = "waits for approval: "
+"""Begins the reason of a set that passed every check; what follows stays true once it is approved."""
+
 
 class Phase(StrEnum):
     """What a session is doing; the values read as sentences."""

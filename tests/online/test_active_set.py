@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from quadid.online.active_set import MOST_HELD, ActiveSet, Answer
-from quadid.online.records import Event, Publish, SetState
+from quadid.online.records import WAITS, Event, Publish, SetState
 from tests.online.test_gate import TRUE, online_set
 
 
@@ -67,7 +67,7 @@ def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
     ledger = ActiveSet("manual")
     assert ledger.approve(1.0, "ann") == Answer(False, "nothing waits for approval")
     assert ledger.roll_back(1.0, "ann") == Answer(False, "there is no earlier set to return to")
-    waits = ledger.hold(replace(online_set(TRUE), reason="3 windows agree"), 30.0)
+    waits = ledger.hold(replace(online_set(TRUE), reason=f"{WAITS}3 windows agree"), 30.0)
     assert ledger.approve(1.0, "ann", 7) == Answer(False, "set 7 does not wait for approval; the newest that does is 1")
     told = ledger.approve(31.0, "ann")
     first = ledger.in_force
