@@ -60,7 +60,7 @@ def _gates(workings: Workings) -> dict[str, Any]:
 
     A null rarely has a cause worth a refit, so the best three of the screening are refitted here whatever they promise.
     """
-    decisive, model = workings.decisive, workings.search.model
+    decisive, model = workings.search.shooting, workings.search.model
     listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
     scores = [s for s in Everything.of(decisive, model, listed).scores(listed) if s.candidate.timed is None]
     trials = [_refit(decisive, model, s.candidate, len(scores)) for s in scores[:3]]

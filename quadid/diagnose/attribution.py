@@ -148,7 +148,10 @@ def validate(
         The errors without and with all causes in the segments that decided, and the worth of each cause: what is larger
         than on any vehicle first, then by gain.
     """
-    models = {_NOMINAL: nominal, _FOUND: model, **_each_left_out(decisive, model, listed)}
+    models = {_NOMINAL: nominal, _FOUND: model}
+    if model.causes:
+        models[_AMID] = without_in_clutter(decisive, model, None, listed)
+        models |= {c.label: without_in_clutter(decisive, model, c, listed) for c in model.causes}
     left_out: Errors = {key: (m.held_out, m.rows) for key, m in models.items()}
     unseen = left_out
     if logs:
@@ -162,14 +165,6 @@ def validate(
         worth.append(_worth(cause, errors, ordinary(decisive, model, cause, listed), decisive.seconds))
     worth.sort(key=lambda w: (w.ordinary, -w.deviance))
     return (before, after), tuple(worth)
-
-
-def _each_left_out(decisive: Shooting, model: Model, listed: Sequence[Candidate]) -> dict[str, Model]:
-    if not model.causes:
-        return {}
-    return {
-        _AMID if c is None else c.label: without_in_clutter(decisive, model, c, listed) for c in (None, *model.causes)
-    }
 
 
 def _worth(cause: Candidate, errors: Errors, ordinary: bool, seconds: float) -> Worth:

@@ -43,17 +43,12 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         confident=confident,
         parameters=numbers,
         gain=benefit,
-        p_value=_p_value(search, cause),
+        p_value=min(1.0, survival(search.model.wald(cause), len(cause.names)) * search.tests),
         alternatives=_alternatives(search, cause, benefit.mse_after),
         evidence=_sentence(cause.effect, values, benefit),
         per_log=EFFECTS[cause.effect].per_log,
         ordinary=worth.ordinary,
     )
-
-
-def _p_value(search: Search, cause: Candidate) -> float:
-    """Chance of numbers so far from neutral without the effect, by the robust Wald statistic, for all causes tried."""
-    return min(1.0, survival(search.model.wald(cause), len(cause.names)) * search.tests)
 
 
 def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str, float]) -> tuple[FoundParameter, ...]:
@@ -103,13 +98,7 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
 
 
 def _sentence(effect: str, values: Mapping[str, float], benefit: Benefit) -> str:
-    """Sentence of one finding.
-
-    Args:
-        effect: contract name.
-        values: its numbers in contract units.
-        benefit: errors on unseen data without and with it.
-    """
+    """Sentence of one finding with `values` in contract units."""
     body = EFFECTS[effect].told(values)
     return (
         f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "

@@ -60,12 +60,10 @@ class Workings:
     """Everything a report or a test may want to look into.
 
     Attributes:
-        search: the selection; decisive: the problem that decided.
-        remainder: what is left.
+        search: the selection; remainder: what it leaves.
     """
 
     search: Search
-    decisive: Shooting
     remainder: Remainder
 
 
@@ -128,7 +126,7 @@ def diagnose(
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)
-    return result, Workings(search, decisive, left)
+    return result, Workings(search, left)
 
 
 def _prediction(
@@ -184,16 +182,20 @@ class _Begun:
     """What the selection starts from.
 
     Attributes:
-        short: short segments; schedule: the lengths that may decide, short ones last.
+        schedule: the lengths of segments that may decide, short ones last.
         nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
         listed: the catalogue.
     """
 
-    short: Shooting
     schedule: list[Shooting]
     nominal: FloatArray
     flexible: FloatArray
     listed: list[Candidate]
+
+    @property
+    def short(self) -> Shooting:
+        """Short segments."""
+        return self.schedule[-1]
 
 
 def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
@@ -218,7 +220,7 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     schedule = [*(s for s in schedule if s.count >= FEWEST_BLOCKS), short]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
-    return _Begun(short, schedule, first.theta, flexible.theta, listed)
+    return _Begun(schedule, first.theta, flexible.theta, listed)
 
 
 def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
@@ -244,7 +246,7 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple
         if np.mean(np.log(growth)) > 0.0:
             break  # around the causes there is no less noise than before
         begun, search = _with_noise(noise, begun, search)
-        if np.all(noise.variance > NOISE_FELL * before):
+        if np.all(growth > NOISE_FELL):
             break
         again = select(begun.schedule, begun.nominal, begun.listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
@@ -262,8 +264,7 @@ def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> N
 
 def _with_noise(noise: NoiseModel, begun: _Begun, search: Search) -> tuple[_Begun, Search]:
     """Problems under another noise model, nominal and selected model refitted there."""
-    schedule = [s.with_noise(noise) for s in begun.schedule]
-    begun = replace(begun, schedule=schedule, short=schedule[-1])
+    begun = replace(begun, schedule=[s.with_noise(noise) for s in begun.schedule])
     decisive = search.shooting.with_noise(noise)
     model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
     nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)

@@ -39,13 +39,11 @@ class Site:
 
     Attributes:
         name: for people.
-        axis: 0, 1, 2: body x, y, z.
         channels: residual channels that it moves, with how often the signal is integrated before it shows there.
         group: sites that cannot be told apart from afar; only the best of a group counts.
     """
 
     name: str
-    axis: int
     channels: tuple[tuple[int, int], ...]
     group: str
 
@@ -79,18 +77,16 @@ class Alone:
     chi_square: float
 
 
-def _sites() -> tuple[Site, ...]:
-    out = []
-    for i, axis in enumerate(_AXES):
-        group = f"rotation {axis}"
-        out.append(Site(f"moment {axis}", i, ((i, 1), (3 + i, 2)), group))
-        out.append(Site(f"gyro {axis}", i, ((i, 0),), group))
-        out.append(Site(f"attitude {axis}", i, ((3 + i, 0),), group))
-        out.append(Site(f"force {axis}", i, ((6 + i, 0),), f"force {axis}"))
-    return tuple(out)
-
-
-SITES = _sites()
+SITES = tuple(
+    site
+    for i, axis in enumerate(_AXES)
+    for site in (
+        Site(f"moment {axis}", ((i, 1), (3 + i, 2)), f"rotation {axis}"),
+        Site(f"gyro {axis}", ((i, 0),), f"rotation {axis}"),
+        Site(f"attitude {axis}", ((3 + i, 0),), f"rotation {axis}"),
+        Site(f"force {axis}", ((6 + i, 0),), f"force {axis}"),
+    )
+)
 
 
 def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tuple[Alone, ...]]:

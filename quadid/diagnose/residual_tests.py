@@ -150,15 +150,12 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
     if not kind:
         return ""
     group = {s.name: s.group for s in SITES}
+    most: dict[tuple[str, str], Alone] = {}
+    for a in sorted(left.alone, key=lambda a: a.chi_square):
+        most[group[a.site], a.signal] = a  # at the best of the sites that look alike from afar
     least = max(ALARM**2, CHANGE_SHARE * model.wald(cause))
-    here = [a for a in left.alone if a.site.startswith(kind) and a.signal.startswith(CHANGES)]
-    here = [a for a in here if a.chi_square > least and a.chi_square >= _elsewhere(left, a, group)]
-    if not here:
+    here = [a for a in most.values() if a.site.startswith(kind) and a.signal.startswith(CHANGES)]
+    worst = max(here, key=lambda a: a.chi_square, default=None)
+    if worst is None or worst.chi_square <= least:
         return ""
-    worst = max(here, key=lambda a: a.chi_square)
     return f"{cause.effect} is not constant (what remains at {worst.site} follows {worst.signal})"
-
-
-def _elsewhere(left: Remainder, found: Alone, group: dict[str, str]) -> float:
-    """The most that the same signal explains at any site that looks alike from afar."""
-    return max(a.chi_square for a in left.alone if a.signal == found.signal and group[a.site] == group[found.site])

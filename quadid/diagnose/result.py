@@ -27,8 +27,8 @@ class Verdict(StrEnum):
         """The verdict in plain words."""
         return {
             Verdict.NOTHING_FOUND: "The simulation agrees with the flight: nothing was found that it gets wrong.",
-            Verdict.EXPLAINED: "What the simulation gets wrong is explained by the causes below.",
-            Verdict.PARTLY_EXPLAINED: "The causes below explain most of what the simulation gets wrong; some remains.",
+            Verdict.EXPLAINED: "These causes explain all of the model error.",
+            Verdict.PARTLY_EXPLAINED: "These causes explain most of the model error; some remains.",
             Verdict.UNKNOWN: "The simulation gets something wrong that no known cause explains.",
         }[self]
 

@@ -28,7 +28,6 @@ class Score:
     Attributes:
         candidate: the cause that comes in.
         drop: predicted fall of the deviance on the fitted data, negative for a rise.
-        z: scaled parameters of `candidate` at the predicted optimum, shape (its names,).
         time: best moment of onset [s] for timed causes.
         trials: how many alternatives were looked at: causes, and onsets of them.
         gone: the cause that leaves; None: none does.
@@ -36,7 +35,6 @@ class Score:
 
     candidate: Candidate
     drop: float
-    z: FloatArray
     time: float | None = None
     trials: int = 1
     gone: Candidate | None = None
@@ -161,8 +159,8 @@ def missed(model: Model, least: float) -> tuple[Candidate, ...]:
     return tuple(kept)
 
 
-def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> tuple[FloatArray, FloatArray]:
-    """Predicted fall of the deviance and step of candidates' parameters, the model's own refitted.
+def _fall(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> FloatArray:
+    """Predicted fall of the deviance with candidates' parameters free, the model's own refitted, shape (n,).
 
     Args:
         h_mm: products of the parameters with themselves, (n, m, m).
@@ -174,14 +172,13 @@ def _reduced(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> 
     g, m = g_m - gain @ own.g, range(h_mm.shape[-1])
     # Directions the model's own parameters already explain carry no information; keep them finite.
     h[:, m, m] += 1e-9 * h_mm[:, m, m] + 1e-2
-    z = -np.asarray(np.linalg.solve(h, g[..., None]))[..., 0]
-    return own.fall - np.sum(g * z, axis=1), z
+    return np.asarray(own.fall + np.sum(g * np.linalg.solve(h, g[..., None])[..., 0], axis=1))
 
 
 def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
     h, g = lin.information, lin.gradient
-    drop, z = _reduced(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
-    return Score(candidate, float(drop[0]), z[0])
+    drop = _fall(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
+    return Score(candidate, float(drop[0]))
 
 
 def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
@@ -193,8 +190,8 @@ def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) ->
     g_m = np.cumsum(lin.grad[order][:, mine][from_end], axis=0)[from_end]
     margin = max(len(order) // 40, 3)
     tried = slice(margin, len(order) - margin)
-    drop, z = _reduced(h_mm[tried], h_mo[tried], g_m[tried], own)
+    drop = _fall(h_mm[tried], h_mo[tried], g_m[tried], own)
     if not len(drop):
-        return Score(candidate, -np.inf, np.zeros(len(mine)))
+        return Score(candidate, -np.inf)
     best = int(np.argmax(drop))
-    return Score(candidate, float(drop[best]), z[best], float(lin.time[order[margin + best]]), len(order))
+    return Score(candidate, float(drop[best]), float(lin.time[order[margin + best]]), len(order))

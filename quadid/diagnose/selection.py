@@ -177,15 +177,14 @@ def _adds_and_drops(
 
 
 def _swaps(shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float) -> Iterator[Trial]:
-    """Look-alikes in the place of each cause; anything at all in the place of one with an impossible number."""
-    model, told = everything.model, impossible_causes(everything.model)
+    """Look-alikes in the place of each cause."""
+    model = everything.model
     for cause in _removable(model):
         lost = everything.loss(cause)
-        share = 0.0 if cause.label in told else ALIKE
         rivals = [
-            s for s in everything.scores(listed, cause) if _rivals(s, cause, lost + s.drop > max(share * lost, least))
+            s for s in everything.scores(listed, cause) if _rivals(s, cause, lost + s.drop > max(ALIKE * lost, least))
         ]
-        yield from _refits(shooting, taken_out(shooting, model, cause), rivals, least, share, lost)
+        yield from _refits(shooting, taken_out(shooting, model, cause), rivals, least, ALIKE, lost)
 
 
 def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:

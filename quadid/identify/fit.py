@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from quadid.errors import WindowError
+from quadid.errors import NotIdentifiableError, WindowError
 from quadid.identify.answer import final_answer, on_bounds
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
@@ -99,15 +99,11 @@ LEAST_SECONDS = 2.0
 
 def check_windows(windows: Sequence[Window]) -> None:
     """Raises when `windows` lack what identification needs, saying what is missing and how to get it."""
-    if not windows:
-        raise WindowError(
-            "no usable stretch of data", "at least one window of 2 s without gaps", "record a longer flight"
-        )
-    longest = max((len(w) - 1) * w.dt for w in windows)
+    longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
     if longest < LEAST_SECONDS:
-        raise WindowError(
-            f"the longest stretch without gaps is {longest:.2g} s", f"at least {LEAST_SECONDS:g} s",
-            "record a longer flight, or log without gaps",
+        raise NotIdentifiableError(
+            f"the longest stretch of usable data is {longest:.3g} s", f"at least {LEAST_SECONDS:g} s without gaps",
+            "use a longer flight, or a wider span of it",
         )  # fmt: skip
     if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
         raise WindowError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
@@ -130,8 +126,8 @@ def fit(
         out_of_reach: parameters that the channels of the log cannot show, and why; they keep the file's value.
 
     Raises:
-        WindowError: unusable data, or no gyro in them.
-        NotIdentifiableError: the data lead to equations that have no finite step; see `polish`.
+        WindowError: no gyro, or several grids.
+        NotIdentifiableError: too little data, or equations that have no finite step; see `polish`.
     """
     options = options or FitOptions()
     report = progress or (lambda stage, share: None)

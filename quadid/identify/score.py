@@ -191,22 +191,19 @@ def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> Noise
 
 
 @INFINITE
-def settle_states(
-    shooting: Shooting, theta: FloatArray, names: Sequence[str] = (), states: InitialStates | None = None
-) -> Linearised:
+def settle_states(shooting: Shooting, theta: FloatArray, names: Sequence[str] = ()) -> Linearised:
     """Fits the initial state of every segment at fixed `theta`; a step that makes a segment worse is not taken.
 
     Args:
         shooting: the data.
         theta: full vector.
         names: parameters in use, also at values without effect: they decide which initial states matter.
-        states: to begin with; as measured by default.
 
     Returns:
         The linearisation at the fitted states.
     """
     none = shooting.free(names)
-    lin = shooting.linearise(theta, none, states)
+    lin = shooting.linearise(theta, none)
     power = _power(shooting, lin)
     for _ in range(STATE_STEPS):
         trial = shooting.linearise(theta, none, lin.stepped())

@@ -36,8 +36,7 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
-        said = f"{error.found}; allowed: {error.allowed}" if error.allowed else error.found
-        return Check("hover", Verdict.ERROR, said, error.fix)
+        return Check("hover", Verdict.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
     inside = within(signal.t, spans)
     if not inside.any():
         return Check("hover", Verdict.UNKNOWN, "no flight in this log, by its rotor speeds")

@@ -145,11 +145,10 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
                 (float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(typical[rotor] / needed[rotor])))
             )
     if not fits:
-        return f"the rotor speeds are far from balance in the layout of '{vehicle.name}'", {"share": float(odd.mean())}
+        return "the rotor speeds are far from balance", {"share": float(odd.mean())}
     _, rotor, ratio = min(fits)
     return (
-        f"rotor {rotor + 1} reads {ratio:.2f} times the speed that the layout of '{vehicle.name}' needs for balance "
-        f"for {odd.mean():.0%} of the flight",
+        f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of the flight",
         {"rotor": rotor + 1.0, "speed_ratio": ratio, "share": float(odd.mean())},
     )
 

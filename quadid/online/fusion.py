@@ -125,18 +125,17 @@ class Fusion:
         drift: honest difference between windows by parameter, log scale, shape (P,).
     """
 
-    def __init__(self, mean: FloatArray, sigma: FloatArray, memory: float, drift: float = DRIFT) -> None:
+    def __init__(self, mean: FloatArray, sigma: FloatArray, memory: float) -> None:
         """Starts from the prior.
 
         Args:
             mean: scaled parameters of the prior, shape (P,).
             sigma: its standard deviations, shape (P,).
             memory: time constant of forgetting [s] of data taken in.
-            drift: honest difference between windows, log scale.
         """
         self._mean, self._precision = mean, np.diag(1.0 / sigma**2)
         self._memory = memory
-        self.drift: FloatArray = np.full(len(mean), drift)
+        self.drift: FloatArray = np.full(len(mean), DRIFT)
         self.windows: deque[WindowEstimate] = deque(maxlen=KEPT_WINDOWS)
         self._sums: deque[_Sum] = deque(maxlen=KEPT_WINDOWS)
         self.counted = -math.inf

@@ -26,19 +26,13 @@ _LEVELS: dict[str, Level] = {
     "partly_explained": "fair",
     "unknown": "poor",
 }
-_SENTENCES = {
-    "nothing_found": "The simulation agrees with the flight: nothing was found that it gets wrong.",
-    "explained": "These causes explain all of the model error.",
-    "partly_explained": "These causes explain most of the model error; some remains.",
-    "unknown": "The simulation gets something wrong that no known cause explains.",
-}
 
 
 def diagnose_verdict(result: JsonDict) -> Verdict:
     """Judges a result of the form ``quadid.diagnose/1``."""
     large, small = _named(result)
     verdict = result["verdict"]
-    headline = _SENTENCES[verdict]
+    headline = result["statement"]
     if (large or small) and verdict != "unknown":
         found = [", ".join(large)] if large else []
         found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []

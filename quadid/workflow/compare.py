@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from quadid.errors import ParameterError, nearest
 from quadid.workflow.logs import Given, settled
 from quadid.workflow.progress import Advance, silent
-from quadid.workflow.searching import check_length
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +66,6 @@ def compare(
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]
-    check_length(windows)
     noise = fit(windows, described, FitOptions(seed=seeds[0]), progress=lambda _, share: advance("noise", share)).noise
     judge = Judge(described, noise, windows, unseen, find_autopilot(windows, described))
     problem = judge.problem(objective)

@@ -11,7 +11,7 @@ from quadid.workflow.identify import origin_remark, out_of_reach, proven
 from quadid.workflow.logs import Given, settled
 from quadid.workflow.outcome import Outcome
 from quadid.workflow.progress import Advance, silent
-from quadid.workflow.searching import OPTIMIZERS, check_length, search
+from quadid.workflow.searching import OPTIMIZERS, search
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -172,7 +172,6 @@ def diagnose(
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
-    check_length(windows)
     unreachable = out_of_reach(train)
     # One flight has one error: what `quadid identify` states for it, and what the findings make of that.
     fit = search(
@@ -184,7 +183,7 @@ def diagnose(
     found, model = _within_reach(found, unreachable), workings.search.model
     result, (before, after) = found.to_dict(), found.validation.deciding
     result["validation"]["deciding"] = {
-        "seconds": workings.decisive.seconds, "mse_nominal": before, "mse_extended": after
+        "seconds": workings.search.shooting.seconds, "mse_nominal": before, "mse_extended": after
     }  # fmt: skip
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed

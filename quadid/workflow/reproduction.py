@@ -235,7 +235,7 @@ def _own(flown: Protocol, seed: int, advance: Advance) -> tuple[Fit, Diagnosis, 
     found = fit(train, flown.vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance(stage, share))
     diagnosis, workings = diagnose(train, flown.vehicle, unseen, seed, advance)
     # One noise for all columns: that which the better model leaves.
-    noise = workings.decisive.noise
+    noise = workings.search.shooting.noise
     return replace(found, noise=noise), diagnosis, workings.search.model.theta, noise
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from quadid.errors import NotIdentifiableError, ParameterError, nearest
+from quadid.errors import ParameterError, nearest
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -27,18 +27,6 @@ def check_optimizer(name: str) -> None:
         raise ParameterError(f"unknown optimizer '{name}'", ", ".join(OPTIMIZERS), nearest(name, OPTIMIZERS))
 
 
-def check_length(windows: Sequence[Window]) -> None:
-    """Raises NotIdentifiableError unless at least one window is long enough to be fitted and scored."""
-    from quadid.identify.fit import LEAST_SECONDS
-
-    longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
-    if longest < LEAST_SECONDS:
-        raise NotIdentifiableError(
-            f"the longest stretch of usable data is {longest:.3g} s", f"at least {LEAST_SECONDS:g} s without gaps",
-            "use a longer flight, or a wider span of it",
-        )  # fmt: skip
-
-
 def search(
     name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
     out_of_reach: Mapping[str, str] | None = None,
@@ -51,7 +39,6 @@ def search(
     """
     from quadid.identify.fit import FitOptions, fit
 
-    check_length(windows)
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
     from quadid.baselines.optimisers import minimise

@@ -89,7 +89,7 @@ def _failed(case: Case, note: str) -> Graded:
 
 def _oracle(case: Case, workings: Workings, validate: Window) -> float:
     """Error on the second flight of the model with the true causes, each fitted from the truth's neighbourhood."""
-    shooting = workings.decisive
+    shooting = workings.search.shooting
     listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
     model: Model = workings.search.nominal
     for effect, values in sorted(case.hidden.items(), key=lambda item: item[0] != "rotor_drag"):

@@ -6,7 +6,6 @@ import os
 import random
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -354,22 +353,6 @@ def test_a_link_that_cannot_be_opened_is_one_line(url: str) -> None:
     with pytest.raises(LinkError) as refused:
         MavlinkLink(url, 4)
     assert "\n" not in str(refused.value)
-
-
-def test_a_log_is_no_link(tmp_path: Path) -> None:
-    """pymavlink would play it as fast as it can."""
-    log = tmp_path / "flight.tlog"
-    log.write_bytes(bytes(100))
-    with pytest.raises(LinkError, match="is a file; allowed: a link, .*; fix: a log goes through `quadid replay LOG`"):
-        MavlinkLink(str(log), 4)
-
-
-def test_where_no_autopilot_is_heard_it_is_said_what_to_do(link: MavlinkLink, port: int) -> None:
-    (problem,) = link.traffic().problems
-    assert problem.startswith(f"no autopilot heard on udpin:127.0.0.1:{port}: send its telemetry there")
-    Sender(port).heartbeat()
-    samples(link, 0.1)
-    assert link.traffic().problems == ()
 
 
 def test_a_signed_link_without_a_key_is_said(port: int) -> None:

@@ -202,7 +202,8 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
         "alternatives": [{"effect": "command_delay", "mse_after": 1.3}],
     }  # fmt: skip
     data = {
-        "schema": "quadid.diagnose/1", "verdict": "partly_explained", "findings": [finding],
+        "schema": "quadid.diagnose/1", "verdict": "partly_explained", "statement": "Some remains.",
+        "findings": [finding],
         "validation": {"mse_nominal": 3.1, "mse_extended": 1.0, "noise_floor": 1.0}, "unexplained": {"p": 0.02},
         "vehicle_file": "/x.yaml",
     }  # fmt: skip

@@ -138,7 +138,10 @@ def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mend
         {"effect": "weak_rotor", "confident": False, "ordinary": False},
     ]
     validation = {"mse_nominal": 9.0, "mse_extended": 1.0}
-    result = {"verdict": "explained", "findings": findings, "validation": validation, "unexplained": {}}
+    result = {
+        "verdict": "explained", "statement": "These causes explain all of the model error.", "findings": findings,
+        "validation": validation, "unexplained": {},
+    }  # fmt: skip
     verdict = diagnose_verdict(result)
     assert verdict.headline.startswith("Found: parasitic drag; no larger than on most vehicles: cg offset. ")
     assert [step.split(":")[0] for step in verdict.next_steps if ":" in step] == ["Parasitic drag"]
