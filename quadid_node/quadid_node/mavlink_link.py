@@ -85,7 +85,6 @@ class MavlinkLink:
         """
         if not 0 <= system <= 255:
             raise LinkError(f"system id {system}", "1 to 255, or 0 for the first one heard")
-        self._url = url
         self._wire, self._key = Wire(url, system or 1, COMPONENT, key, memory), key is not None
         self._source = Source()
         self._decoder = MavlinkDecoder(rotors)
@@ -240,8 +239,6 @@ class MavlinkLink:
             problems.append("the frames are signed, but no key is given to check them: give --key")
         if self._key and wire.refused and not self.vehicle_system and not wire.signed:
             problems.append("a key is given, but the frames are not signed: give the vehicle the key (SETUP_SIGNING)")
-        if not self.vehicle_system and not wire.refused:
-            problems.append(f"no autopilot heard on {self._url}: send its telemetry there, as MAVProxy with --out does")
         said = tuple(p for p in problems if p)
         return Traffic(dict(self._rates), self._requests.denied, wire.refused, wire.dropped, wire.mav.behind, said)
 

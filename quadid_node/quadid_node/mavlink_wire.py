@@ -127,23 +127,15 @@ def read_key(path: Path) -> bytes:
         except (ValueError, UnicodeDecodeError):
             pass
     if len(data) != KEY_BYTES:
-        raise LinkError(
-            f"{path} holds {len(data)} bytes", "a key of 32 bytes, or 64 hexadecimal digits",
-            "give the file with the key that the vehicle was given (SETUP_SIGNING)",
-        )  # fmt: skip
+        raise LinkError(f"{path} holds {len(data)} bytes", "a key of 32 bytes, or 64 hexadecimal digits")
     return data
 
 
 def _check_port(device: str) -> None:
-    """Raises LinkError for a file, a port that none is, or one that is taken.
+    """Raises LinkError for a port that none is, or that is taken.
 
     pymavlink lets two programs listen on one UDP port, and the second one takes the first one's frames away.
     """
-    if Path(device).is_file():
-        raise LinkError(
-            f"{device} is a file", "a link, as udpin:0.0.0.0:14540 or /dev/ttyACM0,921600",
-            "a log goes through `quadid replay LOG`",
-        )  # fmt: skip
     kind, _, place = device.partition(":")
     host, _, port = place.rpartition(":")
     if port.isdigit() and int(port) > LAST_PORT:
