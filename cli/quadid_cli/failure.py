@@ -7,6 +7,9 @@ from typing import NamedTuple
 from quadid.errors import QuadidError
 from quadid.sanitise import one_line
 
+_MISSING = "MissingParameter"
+"""An error of usage for what was not given; its help says what that may be."""
+
 
 class Failure(NamedTuple):
     """One line without line breaks, and the exit code that goes with it."""
@@ -32,5 +35,7 @@ def explain(error: Exception) -> Failure | None:
     if callable(told):
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "quadid"
-        return Failure(one_line(f"{str(told()).rstrip('.')}; see `{path} --help`"), 2)
+        wanted = getattr(getattr(error, "param", None), "help", None) if type(error).__name__ == _MISSING else None
+        allowed = f"; allowed: {wanted[0].lower()}{wanted[1:].rstrip('.')}" if wanted else ""
+        return Failure(one_line(f"{str(told()).rstrip('.')}{allowed}; see `{path} --help`"), 2)
     return None
