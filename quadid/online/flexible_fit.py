@@ -172,7 +172,12 @@ def sampling_error(
     share = (0.5 * spacing) ** ORDER[windows[0].sampling]
     missed = (share * 0.5 * (shifts[0] - shifts[1])) ** 2 + (share**2 * 0.5 * (shifts[0] + shifts[1])) ** 2
     missed[ROLL_PITCH] = np.mean(missed[ROLL_PITCH])
-    return np.diag(missed) * max(LASTING / (estimate.stop - estimate.start), 1.0)
+    return np.diag(missed)
+
+
+def alike(estimate: WindowEstimate) -> float:
+    """How many windows like this one err alike: by so much the variance of what they miss has to count in each."""
+    return max(LASTING / (estimate.stop - estimate.start), 1.0)
 
 
 def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:

@@ -20,7 +20,7 @@ from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.answered import answers
-from quadid.online.flexible_fit import EFFECT_WIDTH, flexible_fit, moving_names, reduced, sampling_error, widened
+from quadid.online.flexible_fit import EFFECT_WIDTH, alike, flexible_fit, moving_names, reduced, sampling_error, widened
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
 from quadid.online.model_vehicle import with_room
@@ -211,8 +211,9 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
     bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
     missed = sampling_error(estimate, shooting, free, prior, result, request.spacing)
+    wide = widened(estimate, alike(estimate) * missed)
     reply = FitReply(
-        request.number, "", bounds, is_excited(bounds), widened(estimate, missed), result.theta, shooting.noise,
+        request.number, "", bounds, is_excited(bounds), wide, result.theta, shooting.noise,
         vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),
     )  # fmt: skip
     return replace(reply, measured=residual_noise(shooting, result)) if request.measure else reply

@@ -11,7 +11,7 @@ import quadid.online.flexible_fit as flexible_fit_room
 from quadid.identify.gauss_newton import polish
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
-from quadid.online.flexible_fit import LASTING, ORDER, flexible_fit, halved, reduced, sampling_error, widened
+from quadid.online.flexible_fit import LASTING, ORDER, alike, flexible_fit, halved, reduced, sampling_error, widened
 from quadid.online.fusion import Fusion, WindowEstimate
 from quadid.online.resampler import Resampler
 from quadid.online.window_fit import prior_of
@@ -81,10 +81,8 @@ class Moved:
 
     shifts: tuple[FloatArray, FloatArray]
 
-    def __call__(
-        self, monkeypatch: pytest.MonkeyPatch, sampling: Sampling, spacing: float, seconds: float
-    ) -> FloatArray:
-        own = WindowEstimate(0.0, seconds, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0)
+    def __call__(self, monkeypatch: pytest.MonkeyPatch, sampling: Sampling, spacing: float) -> FloatArray:
+        own = WindowEstimate(0.0, 10.0, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0)
         moved = iter([replace(own, score=-shift) for shift in self.shifts])
         monkeypatch.setattr(flexible_fit_room, "reduced", lambda *_: next(moved))
         windows = (window(1.0, sampling),)
@@ -104,7 +102,7 @@ def test_what_is_in_step_falls_with_the_distance_and_noise_with_its_square(
     """Trials that move apart tell of torque in step with the motion, trials that move alike of noise of the input."""
     shift = np.array([0.01, 0.0, 0.08, 0.08, 0.0, 0.0])
     for other, power in ((-shift, 1), (shift, 2)):
-        said = [Moved((shift, other))(monkeypatch, sampling, spacing, LASTING) for spacing in (2.0, 1.0, 0.5)]
+        said = [Moved((shift, other))(monkeypatch, sampling, spacing) for spacing in (2.0, 1.0, 0.5)]
         np.testing.assert_allclose(said[0], shift)
         np.testing.assert_allclose(said[1], shift / 2.0 ** (power * order))
         np.testing.assert_allclose(said[2], shift / 4.0 ** (power * order))
@@ -112,16 +110,23 @@ def test_what_is_in_step_falls_with_the_distance_and_noise_with_its_square(
 
 def test_roll_and_pitch_are_two_tries_at_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
     shift = np.array([0.0, 0.0, 0.08, 0.0, 0.0, 0.0])
-    said = Moved((shift, -shift))(monkeypatch, "held", 2.0, LASTING)
+    said = Moved((shift, -shift))(monkeypatch, "held", 2.0)
     np.testing.assert_allclose(said[2:4], 0.08 / np.sqrt(2.0))
 
 
-def test_windows_of_one_minute_say_an_error_that_lasts_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    shift = np.array([0.0, 0.0, 0.08, 0.08, 0.0, 0.0])
-    said = Moved((shift, -shift))(monkeypatch, "held", 2.0, 10.0)
-    np.testing.assert_allclose(
-        said / np.sqrt(LASTING / 10.0), Moved((shift, -shift))(monkeypatch, "held", 2.0, LASTING)
-    )
+def test_windows_of_one_minute_say_an_error_that_lasts_once() -> None:
+    """As many windows as err alike know together what one of them knows."""
+    information = np.diag(np.full(6, 1e12))
+    missed = np.diag(np.full(6, 0.04**2))
+    fusion, length, count = Fusion(np.zeros(6), np.full(6, 1e3), 1e9), LASTING / 5.0, 5
+    for k in range(count):
+        own = WindowEstimate(k * length, (k + 1) * length, np.zeros(6), information, np.zeros(6), 900.0, 900.0)
+        assert alike(own) == pytest.approx(count)
+        fusion.add(widened(own, alike(own) * missed))
+    fused = fusion.estimate()
+    assert fused is not None
+    np.testing.assert_allclose(fused.sigma, 0.04, rtol=1e-3)
+    assert alike(replace(own, stop=own.start + 2.0 * LASTING)) == 1.0
 
 
 def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -> None:
