@@ -17,7 +17,7 @@ class Candidate:
     Attributes:
         effect: name of the effect.
         names: entries it frees.
-        starts: non-neutral starting values of those entries, for causes that cannot be linearised at neutral.
+        start: non-neutral starting values of those entries, for causes that cannot be linearised at neutral.
         requires: effect, or label of a cause, that must be in the model first.
         timed: index of its time entry, when it begins at an unknown moment.
         label: tells candidates of one effect apart.
@@ -27,7 +27,7 @@ class Candidate:
 
     effect: str
     names: tuple[str, ...]
-    starts: tuple[tuple[float, ...], ...] = ()
+    start: tuple[float, ...] = ()
     requires: str | None = None
     timed: int | None = None
     label: str = field(default="")
@@ -74,17 +74,17 @@ def candidates(
                 out.append(Candidate(effect, (f"{effect}.extra_{i + 1}",), requires=label, label=torque, refines=True))
             continue
         timed = layout.entry(f"{effect}.time").index if spec.timed else None
-        cause, optional = Candidate(effect, spec.entries, spec.starts, spec.requires, timed), _refinements(spec)
+        cause, optional = Candidate(effect, spec.entries, spec.start, spec.requires, timed), _refinements(spec)
         out += [cause, *optional]
         for at_cg in (c for c in optional if c.names == (f"{effect}.central",)):
             # Air that acts at the CG turns nothing; at the hubs, where it does, it may explain nothing.
-            names, starts, both = (*cause.names, *at_cg.names), ((*spec.starts[0], 1.0),), (cause, at_cg)
-            out.append(Candidate(effect, names, starts, label=f"{effect} at the CG", split=both))
+            names, start, both = (*cause.names, *at_cg.names), (*spec.start, 1.0), (cause, at_cg)
+            out.append(Candidate(effect, names, start, label=f"{effect} at the CG", split=both))
     if has_velocity:
         # Drag in air that moves faster than the vehicle explains nothing alone.
         drag, wind = (next(c for c in out if c.label == wanted) for wanted in ("rotor_drag", "wind"))
-        names, starts, both = (*drag.names, *wind.names), ((*drag.starts[0], 0.0, 0.0),), (drag, wind)
-        out.append(Candidate(drag.effect, names, starts, label="rotor_drag in wind", split=both))
+        names, start, both = (*drag.names, *wind.names), (*drag.start, 0.0, 0.0), (drag, wind)
+        out.append(Candidate(drag.effect, names, start, label="rotor_drag in wind", split=both))
     return out
 
 

@@ -134,16 +134,12 @@ class Sketch:
 
 
 def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Sketch:
-    """What `model` with `candidate` would gain, by one linearisation at each of its starts; the best one."""
+    """What `model` with `candidate` would gain, by one linearisation at its start."""
     free = shooting.free(free_names((*model.causes, candidate)))
     prior = default_prior(shooting, free)
-    thetas = [model.theta.copy() for _ in candidate.starts] or [model.theta]
-    for theta, start in zip(thetas, candidate.starts, strict=False):
-        theta[shooting.free(list(candidate.names)).index] = start
-    return max((_step(shooting, model, free, prior, theta) for theta in thetas), key=lambda s: s.drop)
-
-
-def _step(shooting: Shooting, model: Model, free: Free, prior: Prior, theta: FloatArray) -> Sketch:
+    theta = model.theta.copy()
+    if candidate.start:
+        theta[shooting.free(candidate.names).index] = candidate.start
     lin = shooting.linearise(theta, free, model.states)
     h, g = normal_equations(lin, free, prior, theta)
     z = bounded_step(free, theta, h, g)

@@ -169,7 +169,7 @@ def _adds_and_drops(
     shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float
 ) -> Iterator[Trial]:
     model = everything.model
-    scores = [s for s in everything.scores(listed) if s.candidate.starts or s.drop > least]
+    scores = [s for s in everything.scores(listed) if s.candidate.start or s.drop > least]
     yield from _refits(shooting, model, scores, least, NEAR)
     for cause in _removable(model):
         if everything.loss(cause) < 4.0 * least:
@@ -227,7 +227,7 @@ def _removable(model: Model) -> list[Candidate]:
 
 def _draft(shooting: Shooting, model: Model, score: Score) -> tuple[Score, FloatArray | Sketch]:
     """What to expect of a refit and where it starts: causes that no slope at neutral shows, where a sketch leads."""
-    if score.candidate.starts:
+    if score.candidate.start:
         drawn = sketch(shooting, model, score.candidate)
         return replace(score, drop=drawn.drop), drawn
     return score, model.theta

@@ -128,15 +128,10 @@ class Effect:
         return tuple(name for name in self.entries if name not in rigid)
 
     @property
-    def starts(self) -> tuple[tuple[float, ...], ...]:
-        """Where a search over `entries` begins; none: at neutral.
-
-        What acts through the air is also begun at neutral: with unmeasured velocities it may have two optima.
-        """
+    def start(self) -> tuple[float, ...]:
+        """Where a search over `entries` begins; none: at neutral."""
         start = tuple(p.start for p in self.parameters if p.name != "time" and not p.optional)
-        if not any(start):
-            return ()
-        return (start, (0.0,) * len(start)) if self.acts == "air" else (start,)
+        return start if any(start) else ()
 
     def told(self, values: Mapping[str, float]) -> str:
         """The sentence with these values, in contract units."""
