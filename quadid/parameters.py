@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -99,6 +99,24 @@ class ParameterSet:
         if self.covariance.shape != (n, n):
             raise ParameterError(f"covariance of shape {self.covariance.shape}", f"shape ({n}, {n})")
         self.covariance.setflags(write=False)
+
+    def first(self, n: int) -> ParameterSet:
+        """The first `n` parameters; what is known only relative to another one than these is not to be used."""
+        names = self.names[:n]
+        kept = [
+            p if p.relative_to in (None, *names) else replace(p, status=Status.UNRELIABLE, relative_to=None)
+            for p in self.parameters[:n]
+        ]
+        return ParameterSet(tuple(kept), np.array(self.covariance[:n, :n]))
+
+    def unreliable(self, names: Sequence[str]) -> ParameterSet:
+        """The same, with those of `names` that data tell not to be used."""
+        told = {Status.IDENTIFIED, Status.RATIO_ONLY}
+        parts = [
+            replace(p, status=Status.UNRELIABLE, relative_to=None) if p.name in names and p.status in told else p
+            for p in self.parameters
+        ]
+        return ParameterSet(tuple(parts), np.array(self.covariance))
 
     @property
     def names(self) -> tuple[str, ...]:

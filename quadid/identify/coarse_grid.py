@@ -35,7 +35,7 @@ def on_coarse_grid(problem: Shooting, found: Polished, free: Free, prior: Prior)
     """
     windows = [coarse(rollout.window) for rollout in problem.rollouts]
     noise = replace(problem.noise, shape=None)
-    cut = Shooting.cut(windows, problem.vehicle, problem.seconds, noise, problem.layout).with_local(problem.local)
+    cut = Shooting.cut(windows, problem.vehicle, problem.seconds, noise, problem.layout).leaving_out(problem.left_out)
     if not cut.count or cut.channels != problem.channels:
         return None
     return polish(cut, found.theta, free, prior, iterations=_ITERATIONS, robust=problem.robust is not None)

@@ -60,11 +60,11 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
         robust: down-weight outliers of the second cut too.
 
     Returns:
-        None where there are too few segments, where moments were set aside, or one of the cuts has no good fit.
+        None where there are too few segments, where random moments rule, or one of the cuts has no good fit.
     """
     second = shooting.between()
     enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
-    if second.count < enough or shooting.local or not np.isfinite(found.cost):
+    if second.count < enough or shooting.noise.moments is not None or not np.isfinite(found.cost):
         return None
     other = polish(second, found.theta, free, prior, iterations=ITERATIONS, robust=robust)
     if not other.cost * found.lin.total_rows < WORSE * found.cost * other.lin.total_rows:

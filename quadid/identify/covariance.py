@@ -63,6 +63,11 @@ class Uncertainty:
         """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
         return self.sigma if self.grown is None else self.sigma / self.grown
 
+    def first(self, n: int) -> Uncertainty:
+        """Of the first `n` parameters."""
+        grown, spread = (None if a is None else a[:n] for a in (self.grown, self.spread))
+        return Uncertainty(self.covariance[:n, :n], self.inflation[:n], self.prior_sigma[:n], grown, spread)
+
     def differing(self, steps: Sequence[FloatArray]) -> Uncertainty:
         """Intervals that hold other estimates too, which lie `steps` away, each of shape (P,); they count as spread."""
         if not steps:

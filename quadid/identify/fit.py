@@ -21,12 +21,13 @@ from quadid.identify.noise_estimation import residual_noise as residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
-from quadid.identify.priors import default_prior
+from quadid.identify.priors import Prior, default_prior
+from quadid.identify.quick_motion import quick_motion, with_moments
 from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet, at_bound
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -35,14 +36,14 @@ SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 SHORT_SEGMENTS = 1000
 """Most short segments of the first polish, whose result only starts the last one."""
-SLOW_MOMENTS = ("cg_offset.x", "cg_offset.y")
-"""Moments about pitch and roll that go with thrust, set aside segment by segment where the model lacks slow moments."""
-MOMENT_MISFIT = 1.5
-MOMENT_GAIN = 0.5
-"""They are set aside when the fit is this bad, or rests on a bound, and the rate residual falls below this share."""
-_SET_ASIDE = (
-    "slow roll and pitch moments that the model lacks were set aside in every segment, so that they do not pass for "
-    "inertia; parameters come from the faster motion alone; quadid diagnose names the cause"
+WHITE_SHARE = 0.5
+"""Quick motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
+noise and the rest is made by random moments."""
+YAW = ("d", "J_zz", "J_r")
+"""What quick motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
+_QUICK = (
+    "moments that the model lacks turn the vehicle, so parameters come from its quick motion alone, "
+    f"which does not show {', '.join(YAW)}; quadid diagnose looks for the cause"
 )
 
 
@@ -91,6 +92,20 @@ class Fit:
     outcome: Convergence
     evaluations: int
     warnings: tuple[str, ...] = ()
+
+    def of(self, names: Sequence[str]) -> Fit:
+        """The same for some of its parameters, which come first; others were fitted along and are neutral again."""
+        if len(names) == len(self.parameters):
+            return self
+        theta, layout = self.theta.copy(), Layout(self.vehicle)
+        for p in self.parameters.parameters[len(names) :]:
+            theta[layout.entry(p.name).index] = p.initial
+        return replace(
+            self,
+            theta=theta,
+            parameters=self.parameters.first(len(names)),
+            uncertainty=self.uncertainty.first(len(names)),
+        )
 
 
 LEAST_SECONDS = 2.0
@@ -144,20 +159,23 @@ def fit(
             short, theta, short.free(free_names), settings, options.particles, options.seed, report
         )
     if not options.polish:
-        return final_answer(_finish(short, theta, free_names, Convergence.BUDGET, evaluations), out_of_reach or {})
+        free = short.free(free_names)
+        searched = Polished(theta, short.linearise(theta, free), np.nan, 0, Convergence.BUDGET)
+        found = _finish(short, searched, free, default_prior(short, free), evaluations)
+        return final_answer(replace(found, warnings=_warnings(found)), out_of_reach or {})
     report("polish", 0.0)
     short = short.at_most(SHORT_SEGMENTS)
     free = short.free(free_names)
     typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
-    moments = _slow_moments(short, theta, first, free)
-    if moments is not None:
-        # Longer segments would only let the missing moments in again.
-        final, result = moments
-        # What the moments leave is no measure of the noise, nor are its weights a start for one.
-        starts = [result.theta, first.theta]
+    judge, prior = first, default_prior(short, free)
+    quick = quick_motion(windows, short, first.theta, free_names) if _restless(short, first) else None
+    if quick is not None:
+        # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
+        starts = [quick.found.theta, first.theta]
         flexible = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS)
-        noise, spent, said = flexible.noise, flexible.simulated, (*said, _SET_ASIDE)
+        noise, spent, said = flexible.noise, flexible.simulated, (*said, _QUICK)
+        final, result, free, prior, judge = quick.shooting, quick.found, quick.free, quick.prior, quick.short
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
@@ -173,61 +191,52 @@ def fit(
     report("polish", 1.0)
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
-    judge = None if set(INERTIAS) & set(out_of_reach or ()) else first
-    found = _finish(final, result.theta, free_names, result.outcome, evaluations, result, options.robust, judge)
-    return final_answer(replace(found, noise=noise, warnings=(*said, *found.warnings)), out_of_reach or {})
+    comparable = not set(INERTIAS) & set(out_of_reach or ())
+    found = _finish(final, result, free, prior, evaluations, options.robust, judge if comparable else None)
+    found = found.of(free_names)
+    if quick is not None:
+        found = replace(found, parameters=found.parameters.unreliable(YAW))
+    found = replace(found, noise=noise, warnings=(*said, *found.warnings, *_warnings(found)))
+    return final_answer(found, out_of_reach or {})
 
 
-def _slow_moments(short: Shooting, start: FloatArray, plain: Polished, free: Free) -> tuple[Shooting, Polished] | None:
-    """Problem and fit with a slow roll and pitch moment of its own in each segment; None unless the data ask for it.
+def _restless(short: Shooting, plain: Polished) -> bool:
+    """Whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
 
-    Aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model that lacks them otherwise takes them
-    for a large inertia.
+    Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise
+    takes them for a large inertia.
     """
-    if plain.lin.total_cost < MOMENT_MISFIT * plain.lin.total_rows and _at_rest(free, plain.theta):
-        return None
-    apart = short.with_local(SLOW_MOMENTS)
-    best = polish(apart, start, free, iterations=10)
-    for _ in range(2):
-        apart = apart.with_noise(residual_noise(apart, best))
-        best = polish(apart, best.theta, free, states=best.states, iterations=8)
-    free_variance, variance = residual_noise(apart, best).variance[:2], short.noise.variance[:2]
-    return (apart, best) if np.any(free_variance < MOMENT_GAIN * variance) else None
-
-
-def _at_rest(free: Free, theta: FloatArray) -> bool:
-    """True when no parameter rests on a bound."""
-    return not any(at_bound(float(theta[e.index]), e.lower, e.upper) for e in free.entries)
+    white = with_moments(short, plain.lin).variance[:2]
+    return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
 
 
 def _finish(
-    shooting: Shooting, theta: FloatArray, names: list[str], outcome: Convergence, evaluations: int,
-    polished: Polished | None = None, robust: bool = False, short: Polished | None = None,
+    shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int, robust: bool = False,
+    short: Polished | None = None,
 ) -> Fit:  # fmt: skip
     """Intervals and statuses; `short` is the fit to short segments, which tells what the numbers are worth."""
-    free = shooting.free(names)
-    prior = default_prior(shooting, free)
-    both = None if polished is None else with_second_cut(shooting, polished, free, prior, robust)
-    lin = polished.lin if polished is not None else shooting.linearise(theta, free)
-    unc = uncertainty(lin, prior, None if both is None else both.information)
+    theta, ended = polished.theta, np.isfinite(polished.cost)
+    both = with_second_cut(shooting, polished, free, prior, robust) if ended else None
+    unc = uncertainty(polished.lin, prior, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     doubts: tuple[str, ...] = ()
-    if polished is not None and short is not None and np.isfinite(polished.cost):
+    if short is not None and ended:
         trust = reliability(shooting, polished, free, prior, short)
         unc, doubts = trust.widened(unc), trust.reasons(free, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(
-        shooting.vehicle, theta, parameters, shooting.noise, unc, outcome, evaluations,
-        (*doubts, *_warnings(free, parameters, unc)),
+        shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations,
+        doubts,
     )  # fmt: skip
 
 
-def _warnings(free: Free, parameters: ParameterSet, unc: Uncertainty) -> tuple[str, ...]:
-    out = on_bounds(parameters)
-    grown = [f"{e.name} x{g:.1f}" for e, g in zip(free.entries, unc.inflation, strict=True) if g > 1.5]
+def _warnings(found: Fit) -> tuple[str, ...]:
+    out = on_bounds(found.parameters)
+    inflation = zip(found.parameters.names, found.uncertainty.inflation, strict=True)
+    grown = [f"{name} x{g:.1f}" for name, g in inflation if g > 1.5]
     if grown:
         out.append(
             "residuals are larger or more correlated than noise, so intervals were widened: " + ", ".join(grown)

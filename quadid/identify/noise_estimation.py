@@ -135,7 +135,7 @@ def flexible_fit(
     first, few = min(tried, key=lambda t: t[0].cost)
     wide = few.free(names)
     brief = residual_noise(few, first)
-    longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS).with_local(())
+    longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
     simulated = sum(t.iterations for t, _ in tried) * (len(names) + 10)
     # In calm flight short segments may lead flexible parameters far astray; then longer ones begin where they did.
     for theta, iterations in [(first.theta, 3), *((start, FROM_START) for start in starts)]:
@@ -183,5 +183,5 @@ def _longest(
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
-    """Segments of `seconds`, at most about `most` of them spread evenly; vehicle and local parameters as in `like`."""
-    return Shooting.cut(windows, like.vehicle, seconds, noise, like.layout).with_local(like.local).at_most(most)
+    """Segments of `seconds`, at most about `most` of them spread evenly; vehicle as in `like`."""
+    return Shooting.cut(windows, like.vehicle, seconds, noise, like.layout).at_most(most)

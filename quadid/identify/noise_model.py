@@ -15,11 +15,13 @@ import numpy as np
 
 from quadid.chi_square import lower_mean
 from quadid.identify.elimination import Whitening
+from quadid.identify.process_noise import AXES, begun_covariance, rate_covariance
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle_parts import Noise
 
-_Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None]
-"""A noise model as a key: white, slow, slow time, and the spectrum's shape and bytes."""
+_Moments = tuple[float, float, float]
+_Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None, _Moments | None]
+"""A noise model as a key: white, slow, slow time, the spectrum's shape and bytes, random moments."""
 
 SLOW_TIME = 0.66
 """Correlation time of the slow attitude error [s] until it is estimated (`quadid.identify.noise_memory`)."""
@@ -43,12 +45,15 @@ class NoiseModel:
         slow_time: correlation time of the slow part [s].
         shape: relative spectrum of the white part on `SHAPE_POINTS` frequencies from 0 to Nyquist, mean 1, shape
             (channels, SHAPE_POINTS); None when all is white.
+        moments: random walk of an angular acceleration about x, y, z [rad/s^2/sqrt(s)] that rates carry beside their
+            noise (`quadid.identify.process_noise`); None for none.
     """
 
     white: FloatArray
     slow: FloatArray
     slow_time: float = SLOW_TIME
     shape: FloatArray | None = None
+    moments: _Moments | None = None
 
     @classmethod
     def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
@@ -62,7 +67,7 @@ class NoiseModel:
 
     @property
     def variance(self) -> FloatArray:
-        """Total variance of each channel, shape (channels,)."""
+        """Total variance of the noise of each channel, random moments left out, shape (channels,)."""
         return np.asarray(self.white**2 + self.slow**2)
 
     def whitener(self, length: int, dt: float) -> FloatArray:
@@ -85,36 +90,45 @@ class NoiseModel:
             dt: time between samples [s].
         """
         whitener = self.whitener(rows.shape[1], dt)
-        out = rows * (weights / np.sqrt(self.variance))[..., None]
+        out = rows * (weights / self.deviation(rows.shape[1], dt))[..., None]
         for c in np.flatnonzero(self.coloured):
             full = np.all(weights[:, :, c] > 0.0, axis=1)
             scaled = rows[full, :, c] * weights[full, :, c, None]
             out[full, :, c] = np.matmul(whitener[c], scaled)
         return out
 
+    def deviation(self, length: int, dt: float) -> FloatArray:
+        """Standard deviation of each channel in a segment, random moments included, shape (channels,)."""
+        variance = self.variance
+        if self.moments is not None:
+            variance[list(AXES)] += np.mean(np.diag(begun_covariance(length, dt)))
+        return np.asarray(np.sqrt(variance))
+
     @property
     def _numbers(self) -> _Numbers:
         shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
-        return tuple(self.white), tuple(self.slow), self.slow_time, shape
+        return tuple(self.white), tuple(self.slow), self.slow_time, shape, self.moments
 
     @property
     def coloured(self) -> BoolArray:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
+        if self.moments is not None:
+            mask[list(AXES)] = True
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
 
 
 def _model_of(numbers: _Numbers) -> NoiseModel:
-    whites, slows, slow_time, shape = numbers
+    whites, slows, slow_time, shape, moments = numbers
     shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
-    return NoiseModel(np.array(whites), np.array(slows), slow_time, shapes)
+    return NoiseModel(np.array(whites), np.array(slows), slow_time, shapes, moments)
 
 
 @lru_cache(maxsize=16)
 def _whitening(numbers: _Numbers, length: int, dt: float) -> Whitening:
     """`NoiseModel.whitening` of these numbers."""
     noise = _model_of(numbers)
-    return Whitening(np.sqrt(noise.variance), noise.coloured, _whitener(numbers, length, dt))
+    return Whitening(noise.deviation(length, dt), noise.coloured, _whitener(numbers, length, dt))
 
 
 @lru_cache(maxsize=16)
@@ -123,13 +137,15 @@ def _whitener(numbers: _Numbers, length: int, dt: float) -> FloatArray:
     noise = _model_of(numbers)
     out = np.zeros((len(noise.white), length, length))
     for c, (white, slow) in enumerate(zip(noise.white, noise.slow, strict=True)):
-        if slow > 0.0:
-            covariance = white**2 * np.eye(length) + slow**2 * correlation(length, dt / noise.slow_time)
-        elif noise.shape is not None and np.ptp(noise.shape[c]) > 0.0:
-            covariance = white**2 * _stationary(noise.shape[c], length)
-        else:
+        if not noise.coloured[c]:
             out[c] = np.eye(length) / white
             continue
+        covariance = white**2 * np.eye(length)
+        if noise.shape is not None and not slow > 0.0:
+            covariance = white**2 * _stationary(noise.shape[c], length)
+        covariance += slow**2 * correlation(length, dt / noise.slow_time)
+        if noise.moments is not None and c in AXES:
+            covariance += noise.moments[c] ** 2 * rate_covariance(length, dt) + begun_covariance(length, dt)
         out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
     out.setflags(write=False)
     return out

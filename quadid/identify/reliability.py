@@ -43,8 +43,6 @@ MOST_SEGMENTS = 150
 """Segments that causes are fitted to: differences of that size need no more."""
 WIDE = 0.7
 """Standard deviation of a prior (scaled parameters) that leaves the data to themselves."""
-LONGER = 2.5
-"""Length of segments that other motion decides in, relative to the short ones of a model with moments set aside."""
 
 
 @dataclass(frozen=True)
@@ -107,14 +105,9 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
     own = uncertainty(found.lin, prior)
     between, mean = _between_blocks(found, prior, own)
     left = found.lin.reduced_chi_square
-    misfit = bool(problem.local) or left > MISFIT
-    if problem.local:
-        # Other models of the same data: nothing that they differ by is chance.
-        longer = _longer(problem, short, free, prior)
-        steps = [free.step(found.theta, theta) for theta in (short.theta, longer.theta)]
-        names = ["without the slow moments set aside", "in longer segments"]
-    else:
-        steps, names = [_beyond_chance(found, free, own, short, prior)], ["in short segments"]
+    # Beside random moments the model misses something, however well these account for it.
+    misfit = problem.noise.moments is not None or left > MISFIT
+    steps, names = [_beyond_chance(found, free, own, short, prior)], ["in short segments"]
     if (rows := on_coarse_grid(problem, found, free, prior)) is not None:
         steps.append(SHARE * _beyond_chance(found, free, own, rows, prior))
         names.append("on a finer grid")
@@ -149,13 +142,6 @@ def _between_blocks(found: Polished, prior: Prior, own: Uncertainty) -> tuple[Fl
     return tau, np.sqrt(np.maximum(mean, 0.0))
 
 
-def _longer(problem: Shooting, short: Polished, free: Free, prior: Prior) -> Polished:
-    """The model with no moments set aside, fitted to longer segments."""
-    windows = [rollout.window for rollout in problem.rollouts]
-    cut = Shooting.cut(windows, problem.vehicle, LONGER * problem.seconds, problem.noise, problem.layout)
-    return polish(cut.at_most(MOST_SEGMENTS), short.theta, free, prior) if cut.count else short
-
-
 def _beyond_chance(found: Polished, free: Free, own: Uncertainty, other: Polished, prior: Prior) -> FloatArray:
     """Scaled step to another estimate of the same data, zero where chance explains it, shape (P,)."""
     if not np.isfinite(other.cost):
@@ -187,8 +173,7 @@ def _with_causes(
 
 def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Free) -> list[tuple[str, list[str]]]:
     """Causes by a linearisation of the whole catalogue: the one that promises most, and those that move most."""
-    known = {*free.names, *few.local}
-    everything = few.free([*free.names, *(n for n in flexible_names(few.layout, few) if n not in known)])
+    everything = few.free(list(dict.fromkeys([*free.names, *flexible_names(few.layout, few)])))
     lin = few.linearise(theta, everything, few.linearise(theta, everything, states).stepped())
     h, g = normal_equations(lin, everything, default_prior(few, everything), theta)
     own = np.arange(len(free.entries))

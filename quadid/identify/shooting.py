@@ -23,7 +23,6 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.parameterization import Free as Free
 from quadid.identify.segment_cost import Linearised as Linearised
 from quadid.identify.segment_jacobian import Columns
-from quadid.model.kernel import LANES
 from quadid.model.layout import Layout, places
 from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout
@@ -40,8 +39,6 @@ RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 """Step size of the initial state beyond which it is held back: rad, rad/s, m/s, m; no pull at convergence."""
 RAN_AWAY = 1e30
 """Products of whitened columns above which, or without a value, a simulation has left every scale of a flight."""
-LOCAL_SIGMA = 10.0
-"""Standard deviation, in typical sizes, of parameters that are free in every segment (`Shooting.local`)."""
 VELOCITY_PRIOR = 4.0
 """Standard deviation [m/s] of a segment's initial velocity around dead reckoning where none is measured."""
 _WARM_UP = places(*(e.name for e in EFFECTS.values() if e.memory))
@@ -63,8 +60,7 @@ class Shooting:
         noise: noise model used for weights.
         robust: weights against outliers, 0 where nothing was measured, (segments of all windows, length, channels);
             or None.
-        local: parameters that each segment has a value of its own for, eliminated with its initial state; what they
-            explain, such as slow moments that the model lacks, no longer pulls at the others.
+        left_out: residual channels that do not count, as if nothing had been measured but where segments begin.
     """
 
     vehicle: Vehicle
@@ -77,7 +73,7 @@ class Shooting:
     dt: float
     noise: NoiseModel
     robust: FloatArray | None = None
-    local: tuple[str, ...] = ()
+    left_out: tuple[int, ...] = ()
 
     @classmethod
     def cut(
@@ -124,9 +120,9 @@ class Shooting:
         """The same problem with other weights against outliers."""
         return replace(self, robust=weights)
 
-    def with_local(self, names: Sequence[str]) -> Shooting:
-        """The same problem with other parameters that each segment has a value of its own for."""
-        return replace(self, local=tuple(names))
+    def leaving_out(self, channels: Sequence[int]) -> Shooting:
+        """The same problem without the residuals of these channels, and only these."""
+        return replace(self, left_out=tuple(channels))
 
     def on(self, windows: Sequence[Window]) -> Shooting:
         """The same problem on other data."""
@@ -183,31 +179,32 @@ class Shooting:
         n_pre, k = self.start_of(theta, free)
         starts = self.starts(n_pre, states)
         states = (states or MEASURED).replaced(n_pre, starts)
-        both = Free((*self.free(self.local).entries, *free.entries))
-        local, weights = len(self.local), self._weights()
-        into = Reduced.room(self.count, k + local, len(free.entries), self.length, self.channels)
+        weights = self._weights()
+        into = Reduced.room(self.count, k, len(free.entries), self.length, self.channels)
         place, counts = 0, [len(s.starts) for s in self.segments]
         for i, (x0, reckoned) in enumerate(zip(*starts, strict=True)):
             which = slice(place, place + counts[i])
             prior = self._state_prior(i, x0[:, 7:10] - reckoned, k)
-            self._reduce(i, theta, both, x0.copy(), prior, n_pre, k, weights[which], into.part(which))
+            self._reduce(i, theta, free, x0.copy(), prior, n_pre, k, weights[which], into.part(which))
             place = which.stop
         times = [r.window.t[s.starts] for r, s in zip(self.rollouts, self.segments, strict=True)]
         return Linearised(
             into.gram, into.grad, into.cost, into.occam, np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
-            into.base, weights, (into.offset[:, :k], into.slope[:, :k]),
+            into.base, weights, (into.offset, into.slope),
             np.repeat(np.arange(len(counts), dtype=np.intp), counts), np.concatenate(times), states, n_pre,
         )  # fmt: skip
 
     def _state_prior(self, i: int, away: FloatArray, k: int) -> StatePrior:
-        ridge = np.concatenate([1.0 / RIDGE[:k] ** 2, np.full(len(self.local), LOCAL_SIGMA**-2.0)])
+        ridge = 1.0 / RIDGE[:k] ** 2
         unknown = k >= 9 and self.rollouts[i].channels <= 9
         return StatePrior(ridge, VELOCITY_PRIOR**-2.0 if unknown else 0.0, np.ascontiguousarray(away))
 
     def measured_weights(self, i: int) -> FloatArray:
-        """1 where a window's segments were measured, 0 elsewhere, shape (segments, length, channels)."""
+        """1 where a window's segments were measured and count, 0 elsewhere, shape (segments, length, channels)."""
         rows = self.segments[i].starts[:, None] + np.arange(self.length)
-        return np.asarray(self.rollouts[i].valid[rows][..., : self.channels], dtype=np.float64)
+        weights = np.array(self.rollouts[i].valid[rows][..., : self.channels], dtype=np.float64)
+        weights[..., list(self.left_out)] = 0.0
+        return weights
 
     def _weights(self) -> FloatArray:
         """1 where measured or the robust weight, 0 elsewhere, shape (segments of all windows, length, channels)."""
@@ -240,26 +237,19 @@ class Shooting:
         self, i: int, theta: FloatArray, free: Free, x0: FloatArray, prior: StatePrior, n_pre: int, k: int,
         weights: FloatArray, into: Reduced,
     ) -> None:  # fmt: skip
-        """Linearises the segments of one window, local parameters first in `free`, and eliminates what each has own."""
-        segments, local = self.segments[i], len(self.local)
+        """Linearises the segments of one window and eliminates the initial state of each."""
+        segments = self.segments[i]
         thetas, dx, steps = self._directions(theta, free, k)
         lane = packing(thetas, self.layout.rotors, self.channels)
         thetas, dx = packed(thetas, lane), packed(dx, lane)
         whitening = self.noise.whitening(self.length, self.dt)
-        moved = np.empty((*weights.shape, local))
 
         def use(which: slice, out: FloatArray) -> None:
             reduce_segments(out, lane, steps, weights[which], whitening, prior.part(which), into.part(which))
-            for j, at in enumerate(lane[1 + k : 1 + k + local]):
-                changed = out[at // LANES, ..., : self.channels, at % LANES]
-                moved[which][..., j] = (changed - into.base[which]) / steps[k + j]
 
         self.rollouts[i].roll_parts(segments, thetas, x0, dx, n_pre, use)
         if not np.max(into.largest, initial=0.0) < RAN_AWAY:
             into.run_away(prior)
-        if local:
-            # What the local parameters explain is no residual.
-            into.base[...] -= np.einsum("silj,sj->sil", moved, into.offset[:, k:])
 
     def columns(
         self, theta: FloatArray, free: Free, states: InitialStates | None = None, parameters: bool = True
@@ -291,7 +281,7 @@ class Shooting:
             yield Columns(
                 self.rollouts[i].window, self.segments[i].starts[:, None] + np.arange(self.length), basis,
                 white[..., -1], np.all(weights > 0.0, axis=1), flat[..., k:-1], base[..., 0], weights,
-                np.sqrt(self.noise.variance), self.noise.coloured, whitener,
+                self.noise.deviation(self.length, self.dt), self.noise.coloured, whitener,
             )  # fmt: skip
 
 

@@ -1,0 +1,113 @@
+"""Moments that no model has: inertias must come out right beside them, and what they hide must not be called known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadid
+from quadid.flight import draw_truth, fly
+from quadid.identify import fit as fitting
+from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.process_noise import likeliest
+from quadid.parameters import Status
+from quadid.types import FloatArray
+from quadid.window import Window
+from tests.identify.flights import PELICAN, guessed
+
+DT = 0.02
+SEED = 2
+GUSTS = {"gusts": {"push": 0.5, "turn": 1.0, "time": 0.5}}
+"""Turbulence that turns the vehicle by 1 rad/s^2, with a memory of half a second."""
+SURE = (Status.IDENTIFIED, Status.RATIO_ONLY)
+
+
+def rates(white: float, walk: float, segments: int = 400, length: int = 25) -> FloatArray:
+    """Rates of segments whose acceleration walks from anywhere, with white noise on them (segments, length)."""
+    rng = np.random.default_rng(1)
+    steps = walk * np.sqrt(DT) * rng.standard_normal((segments, length))
+    acceleration = 5.0 * rng.standard_normal((segments, 1)) + np.cumsum(steps, axis=1)
+    rate = np.cumsum(np.column_stack([np.zeros(segments), acceleration[:, :-1]]), axis=1) * DT
+    return np.asarray(rate + white * rng.standard_normal((segments, length)))
+
+
+@pytest.mark.parametrize(("white", "walk"), [(0.01, 10.0), (0.03, 2.0), (0.02, 0.0)])
+def test_noise_and_walk_are_told_apart(white: float, walk: float) -> None:
+    found = likeliest(rates(white, walk), DT)
+    assert found[0] == pytest.approx(white, rel=0.15)
+    assert found[1] == pytest.approx(walk, rel=0.2, abs=0.3)
+
+
+def test_whitened_rates_are_white() -> None:
+    noise = replace(NoiseModel.guess(9), white=np.full(9, 0.01), moments=(10.0, 10.0, 10.0))
+    whitened = rates(0.01, 10.0) @ noise.whitener(25, DT)[0].T
+    rest = whitened[:, 2:]  # the first two rows find where rate and acceleration begin
+    assert np.cov(rest.T) == pytest.approx(np.eye(rest.shape[1]), abs=0.25)
+    assert np.mean(rest**2) == pytest.approx(1.0, abs=0.05)
+
+
+def in_gusts(change: str = "") -> Window:
+    """A flight through turbulence, by the simulator that shares no equation with the model."""
+    window = fly(PELICAN, draw_truth(PELICAN, SEED), 60.0, SEED, outside=GUSTS).window
+    if change == "lost samples":
+        assert window.gyro is not None
+        gyro = window.gyro.copy()
+        gyro[np.random.default_rng(3).random(len(gyro)) < 0.02] = np.nan
+        return replace(window, gyro=gyro)
+    return window
+
+
+def fitted(window: Window) -> Fit:
+    """The nominal fit from a poor guess."""
+    return fit([window], guessed(draw_truth(PELICAN, SEED), SEED), FitOptions(iterations=0))
+
+
+@pytest.mark.parametrize("change", ["", "lost samples"])
+def test_turbulence_does_not_pass_for_inertia(change: str) -> None:
+    found, truth = fitted(in_gusts(change)), draw_truth(PELICAN, SEED).as_dict()
+    for name in ("b", "J_xx", "J_yy"):
+        p = found.parameters[name]
+        assert p.value == pytest.approx(truth[name], rel=0.04)
+        assert p.ci95[0] < truth[name] < p.ci95[1]
+    assert all(found.parameters[name].status not in SURE for name in ("d", "J_zz", "J_r"))
+    assert any("quick motion" in w for w in found.warnings)
+    assert len(found.parameters) == 6, "what is late was fitted along, and is not told"
+
+
+def test_without_random_moments_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "WHITE_SHARE", 0.0)
+    found, truth = fitted(in_gusts()), draw_truth(PELICAN, SEED).as_dict()
+    off = [found.parameters[n].value / truth[n] - 1.0 for n in ("J_xx", "J_yy")]
+    assert max(off) > 0.2, off
+
+
+def test_a_calm_flight_is_fitted_whole() -> None:
+    window = fly(PELICAN, draw_truth(PELICAN, SEED), 60.0, SEED).window
+    assert not any("quick motion" in w for w in fitted(window).warnings)
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
+def test_a_brushed_crazyflie_has_the_same_inertia_on_every_grid(data_dir: Path, rate: float) -> None:
+    """A thrust stand gives b = 2.02e-8, and others' inertias lie between 1.6e-5 and 2.2e-5."""
+    folder = data_dir / "brushed"
+    vehicle = quadid.Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
+    logs = [quadid.load(str(folder / f"{n}.csv"), vehicle, rate=rate) for n in ("jana00", "jana02")]
+    found = quadid.identify(logs).parameters
+    assert found["b"].value == pytest.approx(2.02e-8, rel=0.03)
+    for name in ("J_xx", "J_yy"):
+        assert 1.5e-5 < found[name].value < 2.3e-5
+        assert found[name].status in SURE
+    assert all(found[name].status not in SURE for name in ("d", "J_zz", "J_r"))
+
+
+def test_commands_whose_lag_passes_for_inertia_tell_none(data_dir: Path) -> None:
+    folder = data_dir / "arpl"
+    vehicle = quadid.Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
+    found = quadid.identify([quadid.load(str(folder / "log15.csv"), vehicle)]).parameters
+    for name in ("J_xx", "J_yy"):
+        inside = found[name].ci95[0] < 1.8e-5 and found[name].ci95[1] > 1.0e-5
+        assert inside or found[name].status not in SURE
