@@ -41,7 +41,8 @@ def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: t
     stated, fitted = found.result["validation"], found.result["sets"][0]["mse"]
     assert stated["on"] == "held-out blocks"
     assert "held-out blocks of the same flight" in found.verdict.details[0]
-    assert 1.0 < stated["mse_nominal"] / fitted["nominal"] < 2.0
+    # The weak rotor turns the vehicle, so the nominal numbers come from quick motion, and minimise neither.
+    assert stated["mse_nominal"] / fitted["nominal"] == pytest.approx(1.0, abs=0.05)
     assert 1.0 < stated["mse_extended"] / fitted["extended"] < 1.1
 
 
@@ -51,7 +52,7 @@ def test_on_motion_capture(data_dir: Path) -> None:
     log = quadid.load(f"{folder / 'figure8_27.csv'}@0:25", vehicle=folder / "vehicle.yaml")
     fit, found = quadid.identify(log), quadid.diagnose(log)
     assert_alike(fit, found)
-    assert any("slow roll and pitch moments" in warning for warning in fit.warnings)
+    assert any("quick motion" in warning for warning in fit.warnings)
     # What the model lacks is no noise: a Crazyflie's gyro is quieter than 0.15 rad/s.
     assert np.all(np.sqrt(fit.fit.noise.variance[:3]) < 0.15)
 
