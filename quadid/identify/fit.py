@@ -10,7 +10,7 @@ import numpy as np
 from quadid.errors import NotIdentifiableError, WindowError
 from quadid.identify.answer import final_answer, on_bounds
 from quadid.identify.composite_likelihood import with_second_cut
-from quadid.identify.covariance import Uncertainty, parameter_set, uncertainty
+from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
@@ -168,7 +168,7 @@ def fit(
     free = short.free(free_names)
     typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
-    judge, prior = first, default_prior(short, free)
+    judge, prior, others = first, default_prior(short, free), []
     quick = quick_motion(windows, short, first.theta, free_names) if _restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
@@ -176,6 +176,9 @@ def fit(
         flexible = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS)
         noise, spent, said = flexible.noise, flexible.simulated, (*said, _QUICK)
         final, result, free, prior, judge = quick.shooting, quick.found, quick.free, quick.prior, quick.short
+        others = [quick.prompt]
+        if late := [n for n, step in zip(free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
+            said = (*said, f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
@@ -192,7 +195,7 @@ def fit(
     evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
-    found = _finish(final, result, free, prior, evaluations, options.robust, judge if comparable else None)
+    found = _finish(final, result, free, prior, evaluations, options.robust, judge if comparable else None, others)
     found = found.of(free_names)
     if quick is not None:
         found = replace(found, parameters=found.parameters.unreliable(YAW))
@@ -212,9 +215,12 @@ def _restless(short: Shooting, plain: Polished) -> bool:
 
 def _finish(
     shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int, robust: bool = False,
-    short: Polished | None = None,
+    short: Polished | None = None, others: Sequence[FloatArray] = (),
 ) -> Fit:  # fmt: skip
-    """Intervals and statuses; `short` is the fit to short segments, which tells what the numbers are worth."""
+    """Intervals and statuses.
+
+    The fit to `short` segments tells what the numbers are worth, and so do `others`, scaled steps to other estimates.
+    """
     theta, ended = polished.theta, np.isfinite(polished.cost)
     both = with_second_cut(shooting, polished, free, prior, robust) if ended else None
     unc = uncertainty(polished.lin, prior, None if both is None else both.information)
@@ -224,7 +230,7 @@ def _finish(
     doubts: tuple[str, ...] = ()
     if short is not None and ended:
         trust = reliability(shooting, polished, free, prior, short)
-        unc, doubts = trust.widened(unc), trust.reasons(free, unc)
+        unc, doubts = trust.widened(unc).differing(others), trust.reasons(free, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(

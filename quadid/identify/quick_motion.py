@@ -44,6 +44,7 @@ class QuickMotion:
         shooting: the problem, with its random moments; found: the optimum; free: nominal parameters and what is late.
         prior: on these.
         short: the same in segments as short as those of the first fit, whose motion is quicker still.
+        prompt: scaled step of the parameters to where they are with nothing late, shape (P,).
     """
 
     shooting: Shooting
@@ -51,6 +52,7 @@ class QuickMotion:
     free: Free
     prior: Prior
     short: Polished
+    prompt: FloatArray
 
 
 def quick_motion(
@@ -90,7 +92,16 @@ def quick_motion(
     if not np.isfinite(found.cost):
         return None
     brief = short.with_noise(shooting.noise).leaving_out(rest)
-    return QuickMotion(shooting, found, free, prior, polish(brief, theta, free, prior, iterations=8))
+    quicker = polish(brief, theta, free, prior, iterations=8)
+    return QuickMotion(shooting, found, free, prior, quicker, _prompt(shooting, found, free, len(names)))
+
+
+def _prompt(shooting: Shooting, found: Polished, free: Free, told: int) -> FloatArray:
+    """Step of the first `told` parameters to their values with all others at neutral."""
+    theta = found.theta.copy()
+    theta[free.index[told:]] = 0.0
+    other = polish(shooting, theta, shooting.free(free.names[:told]), states=found.states, iterations=8)
+    return np.where(np.arange(len(free.entries)) < told, free.step(found.theta, other.theta), 0.0)
 
 
 def _late(window: Window) -> list[str]:

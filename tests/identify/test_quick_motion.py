@@ -111,3 +111,14 @@ def test_commands_whose_lag_passes_for_inertia_tell_none(data_dir: Path) -> None
     for name in ("J_xx", "J_yy"):
         inside = found[name].ci95[0] < 1.8e-5 and found[name].ci95[1] > 1.0e-5
         assert inside or found[name].status not in SURE
+
+
+def test_a_filter_that_passes_for_inertia_makes_it_unreliable(data_dir: Path) -> None:
+    """ArduCopter's gyro is filtered at 20 Hz; at 50 Hz what is late cannot be told from inertia (truth 0.018, 0.024)."""
+    folder = data_dir / "ardupilot_sitl"
+    vehicle = quadid.Vehicle.from_yaml((folder / "quad_sq.yaml").read_text(encoding="utf-8"))
+    fit = quadid.identify(quadid.load(f"{folder / 'quad_sq.bin'}@60:120", vehicle))
+    for name, truth in (("J_xx", 0.018), ("J_yy", 0.024)):
+        found = fit.parameters[name]
+        assert found.ci95[0] < truth < found.ci95[1] or found.status not in SURE
+    assert any("where nothing is late" in w for w in fit.result["warnings"])
