@@ -114,7 +114,7 @@ def test_commands_whose_lag_passes_for_inertia_tell_none(data_dir: Path) -> None
 
 
 def test_a_filter_that_passes_for_inertia_makes_it_unreliable(data_dir: Path) -> None:
-    """ArduCopter's gyro is filtered at 20 Hz; at 50 Hz what is late cannot be told from inertia (truth 0.018, 0.024)."""
+    """ArduCopter filters its gyro at 20 Hz; at 50 Hz what is late is not told from inertia (truth 0.018, 0.024)."""
     folder = data_dir / "ardupilot_sitl"
     vehicle = quadid.Vehicle.from_yaml((folder / "quad_sq.yaml").read_text(encoding="utf-8"))
     fit = quadid.identify(quadid.load(f"{folder / 'quad_sq.bin'}@60:120", vehicle))
