@@ -25,7 +25,7 @@ from quadid.window import Window
 THRUST_AXIS = 8
 """Residual channel of the specific force along z."""
 LATE_START = 0.005
-"""Where they begin [s]."""
+"""Where lags and delays begin in the fit [s]."""
 MOST_SEGMENTS = 1000
 """Most segments; the parameters need no more."""
 ROUNDS = 15
