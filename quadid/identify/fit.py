@@ -233,10 +233,7 @@ def _finish(
         unc, doubts = trust.widened(unc).differing(others), trust.reasons(free, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
-    return Fit(
-        shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations,
-        doubts,
-    )  # fmt: skip
+    return Fit(shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations, doubts)
 
 
 def _warnings(found: Fit) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ import numpy as np
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_estimation import LINE_SECONDS, STAYS, residual_noise, thinned
 from quadid.identify.noise_model import ATTITUDE, TREND, NoiseModel, correlation
+from quadid.identify.process_noise import modes_beside_trend
 from quadid.identify.shooting import Shooting
 from quadid.types import FloatArray
 from quadid.window import Window
@@ -118,8 +119,4 @@ def _log_likelihood(residuals: FloatArray, step: float) -> float:
 @lru_cache(maxsize=64)
 def _modes(length: int, step: float) -> tuple[FloatArray, FloatArray]:
     """Independent modes of slow noise beside its trend, as columns (length, modes), and their variances."""
-    t = np.linspace(-1.0, 1.0, length)
-    order = TREND[1]
-    rest = np.linalg.qr(np.column_stack([np.vander(t, order), np.eye(length)]))[0][:, order:]
-    slow, turn = np.linalg.eigh(rest.T @ correlation(length, step) @ rest)
-    return rest @ turn, slow
+    return modes_beside_trend(correlation(length, step), TREND[1])

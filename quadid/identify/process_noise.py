@@ -71,7 +71,19 @@ def likeliest(residuals: FloatArray, dt: float) -> tuple[float, float]:
 @lru_cache(maxsize=32)
 def _modes(length: int, dt: float) -> tuple[FloatArray, FloatArray]:
     """Independent modes, as columns, of the random rate beside a fitted straight line, and their variances."""
-    line = np.vander(np.linspace(-1.0, 1.0, length), 2)
-    rest = np.linalg.qr(np.column_stack([line, np.eye(length)]))[0][:, 2:length]
-    levels, turn = np.linalg.eigh(rest.T @ rate_covariance(length, dt) @ rest)
-    return rest @ turn, np.maximum(levels, 0.0)
+    modes, levels = modes_beside_trend(rate_covariance(length, dt), 2)
+    return modes, np.maximum(levels, 0.0)
+
+
+def modes_beside_trend(covariance: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Independent modes of noise less its fitted trend, as columns (length, modes), and their variances.
+
+    Args:
+        covariance: of the noise, shape (length, length).
+        order: coefficients of the trend, a polynomial in time.
+    """
+    length = len(covariance)
+    trend = np.vander(np.linspace(-1.0, 1.0, length), order)
+    rest = np.linalg.qr(np.column_stack([trend, np.eye(length)]))[0][:, order:]
+    levels, turn = np.linalg.eigh(rest.T @ covariance @ rest)
+    return rest @ turn, levels
