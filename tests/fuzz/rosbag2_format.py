@@ -36,12 +36,18 @@ def split(data: bytes) -> list[bytes]:
     return records
 
 
+def _parts(record: bytes) -> list[Any]:
+    """Table and values of a row; nothing where mutations left no list."""
+    try:
+        parts = msgpack.unpackb(record[4:])
+    except (ValueError, TypeError, msgpack.UnpackException):
+        return []
+    return parts if isinstance(parts, list) else []
+
+
 def define(rng: Random, record: bytes) -> bytes:
     """A value of a row replaced by one of another kind, or its text changed."""
-    try:
-        table, *values = msgpack.unpackb(record[4:])
-    except (ValueError, msgpack.UnpackException):
-        return record
+    table, *values = _parts(record) or [None]
     if not values:
         return record
     at = rng.randrange(len(values))
@@ -64,12 +70,13 @@ def finish(data: bytes) -> bytes:
     with sqlite3.connect(":memory:") as connection:
         connection.deserialize(_empty())
         for record in split(data):
+            table, *values = _parts(record) or [None]
+            if not isinstance(table, str) or table not in TABLES:
+                continue
             try:
-                table, *values = msgpack.unpackb(record[4:])
-                if table in TABLES:
-                    marks = ",".join("?" * len(values))
-                    connection.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", values)
-            except (ValueError, TypeError, OverflowError, msgpack.UnpackException, sqlite3.Error):
+                marks = ",".join("?" * len(values))
+                connection.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", values)
+            except (ValueError, TypeError, OverflowError, sqlite3.Error):
                 continue
         connection.commit()
         out = connection.serialize()

@@ -7,13 +7,14 @@ import time
 from pathlib import Path
 from random import Random
 
+import msgpack
 import pytest
 import quadid_replay
 
 from quadid.errors import LogError
 from quadid.window import Recording
 from tests.faults.evidence import Happened
-from tests.fuzz import book, campaign
+from tests.fuzz import book, campaign, rosbag2_format
 from tests.fuzz.formats import FLOODED, FORMATS
 from tests.fuzz.seeds import seeds
 
@@ -76,6 +77,15 @@ def _slow(path: Path) -> Recording:
 def _growing(path: Path) -> Recording:
     keep = bytearray(b"x") * (campaign.GROWTH + (16 << 20))
     raise LogError(f"{len(keep)} bytes taken")
+
+
+@pytest.mark.parametrize("value", [7, "text", {"a": 1}, [[]], [{}, 1], []])
+def test_a_row_that_mutations_made_something_else_is_passed_over(value: object) -> None:
+    packed = msgpack.packb(value)
+    record = len(packed).to_bytes(4, "little") + packed
+    assert rosbag2_format.define(Random(1), record)[:4]
+    good = rosbag2_format.row("topics", 1, "name", "type", "cdr", "")
+    assert rosbag2_format.finish(record + good) == rosbag2_format.finish(good)
 
 
 @pytest.mark.parametrize(
