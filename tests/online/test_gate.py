@@ -158,6 +158,14 @@ def test_a_guess_of_the_vehicle_file_and_a_wide_deviation_are_no_reference() -> 
     assert decide(good(stated={"b": (1.25 * TRUE["b"], 0.2 * TRUE["b"])}), GateSettings()).state is SetState.ACCEPTED
 
 
+def test_an_estimate_buys_no_room_by_a_wide_deviation_of_its_own() -> None:
+    wide = parameter_set(scaled(b=1.05), sigma=0.012)
+    narrow, vague = (online_set(TRUE, sigma=sigma) for sigma in (0.001, 0.012))
+    decision = decide(good(parameters=wide, baseline=narrow, in_force=narrow), GateSettings())
+    assert (decision.state, decision.check) == (SetState.PENDING, "reference")
+    assert decide(good(parameters=wide, baseline=vague, in_force=vague), GateSettings()).state is SetState.ACCEPTED
+
+
 def test_mass_leaves_torque_over_inertia_as_it_is() -> None:
     lighter = online_set(scaled(**dict.fromkeys(NOMINAL_NAMES, 1.2)))
     assert decide(good(baseline=lighter, in_force=lighter), GateSettings()).state is SetState.ACCEPTED
