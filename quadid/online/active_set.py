@@ -127,15 +127,16 @@ class ActiveSet:
         return Answer(True, f"set {number} approved, in force as set {self.in_force.sequence}", tuple(actions))
 
     def roll_back(self, t: float, by: str, why: str = "") -> Answer:
-        """Returns to the set before the one in force, under a new number."""
+        """Returns to the set before the one in force, under a new number; what made that out of date made both."""
         if not self._earlier:
             return Answer(False, "there is no earlier set to return to")
         assert self.in_force is not None
         bad, good = self.in_force, self._earlier.pop()
         reason = f"set {good.sequence} again, in place of set {bad.sequence}: {why or 'asked for by ' + by}"
         self.in_force = replace(
-            good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by
-        )
+            good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by,
+            outdated=good.outdated or bad.outdated,
+        )  # fmt: skip
         self._held.clear()
         self._watch_from = math.inf
         if by != "auto":

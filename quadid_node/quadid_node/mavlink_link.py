@@ -137,22 +137,19 @@ class MavlinkLink:
 
     def _on_heartbeat(self, message: Any) -> None:
         """The first autopilot heard is our vehicle; we speak under its system id, to who is heard again and again."""
-        ours = message.autopilot != dialect.MAV_AUTOPILOT_INVALID and self._only in (0, message.get_srcSystem())
-        self._wire.peers.hello(self._wire.source, time.monotonic(), ours and not self._other(message))
-        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID or self.vehicle_system:
+        found = not self.vehicle_system and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
+        found &= self._only in (0, message.get_srcSystem())
+        if found:
+            self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
+        self._wire.peers.hello(self._wire.source, time.monotonic(), self._is_vehicle(message))
+        if not found:
             return
-        if self._only and message.get_srcSystem() != self._only:
-            return
-        self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
         self._wire.mav.srcSystem = self.vehicle_system
         self._decoder.autopilot = message.autopilot
         for n in range(1, 13):
             name = f"SERVO{n}_FUNCTION".encode()
             if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
                 self._wire.send(dialect.MAVLink_param_request_read_message(self.vehicle_system, self._target, name, -1))
-
-    def _other(self, message: Any) -> bool:
-        return self.vehicle_system not in (0, message.get_srcSystem())
 
     def _on_ack(self, message: Any) -> None:
         """Notes a refused request for a message."""

@@ -35,7 +35,8 @@ class SigningMemory:
         What came after the last save is not in the file: it is refused too, being at most `SAVED_EVERY` newer.
         """
         self._path, self._signing, self._clock = path, signing, clock
-        self._saved_at, self._saved = -1e9, -1
+        self._saved_at = -1e9
+        self._saved: dict[Any, int] = {}
         self.problem = ""
         try:
             kept = json.loads(path.read_text(encoding="ascii"))
@@ -53,12 +54,11 @@ class SigningMemory:
     def keep(self, at_once: bool = False) -> None:
         """Saves what has changed, once a second."""
         now, streams = self._clock(), self._signing.stream_timestamps
-        newest = max(streams.values(), default=0)
-        if newest == self._saved or not (at_once or now - self._saved_at >= SAVED_EVERY):
+        if not (at_once or now - self._saved_at >= SAVED_EVERY) or streams == self._saved:
             return
         self._saved_at = now
         last = sorted(streams.items(), key=lambda entry: -entry[1])[:_MOST_STREAMS]
-        kept = {"newest": newest, "streams": {".".join(map(str, stream)): stamp for stream, stamp in last}}
+        kept = {"newest": last[0][1], "streams": {".".join(map(str, stream)): stamp for stream, stamp in last}}
         aside = self._path.with_suffix(".new")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,4 +70,4 @@ class SigningMemory:
         except OSError as error:
             self.problem = f"time stamps of signatures cannot be kept in {self._path} ({error.strerror})"
             return
-        self._saved, self.problem = newest, ""
+        self._saved, self.problem = dict(streams), ""

@@ -14,7 +14,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO
@@ -124,6 +124,9 @@ class Store:
     def _restored(self, db: sqlite3.Connection, gate: GateSettings) -> Restored:
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
         last = self._set(db, gate, "state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
+        if last is not None:
+            told = self._set(db, gate, "state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC")
+            last = replace(last, outdated=told.outdated if told is not None else last.outdated)
         approved = self._set(db, gate, "approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
         first = self._set(db, gate, "state = 'accepted' ORDER BY rowid")
         self._last = self._row(last) if last is not None else None

@@ -296,6 +296,22 @@ def test_speeds_of_rotors_that_are_not_there_are_left_out(rotors: int, happened:
     happened(15, f"ESC_STATUS from rotor 0 to 255 of a vehicle with {rotors}: nothing but its own rotors")
 
 
+def test_another_component_of_the_vehicle_elsewhere_is_answered_no_sooner_than_others(
+    link: MavlinkLink, port: int, happened: Happened
+) -> None:
+    vehicle = Sender(port)
+    vehicle.heartbeat()
+    samples(link, 0.1)
+    strangers = [Sender(port, system=1, component=2 + k) for k in range(5)]
+    for sender in strangers:
+        sender.heartbeat(autopilot=12)
+    samples(link, 0.1)
+    link.publish(accepted())
+    assert vehicle.heard(0.3)
+    assert not any(sender.heard(0.2) for sender in strangers)
+    happened(27, f"{len(strangers)} addresses, one heartbeat each as another component of the vehicle: none answered")
+
+
 def test_requests_for_all_parameters_are_answered_once_a_second(
     link: MavlinkLink, port: int, happened: Happened
 ) -> None:

@@ -136,6 +136,28 @@ def test_replays_are_refused_after_a_restart_and_with_the_clock_set_back(
     happened(14, f"{len(stolen)} recorded frames after a restart, and with our clock set back by an hour: all refused")
 
 
+def test_replays_of_a_stream_behind_another_one_are_refused_after_a_restart(port: int, tmp_path: Path) -> None:
+    memory = memory_path(tmp_path, KEY)
+    vehicle, station, thief = Sender(port, key=KEY), Sender(port, 255, 190, key=KEY), Sender(port)
+    station.mav.signing.timestamp += 30 * 100_000
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY, memory=memory)
+    vehicle.heartbeat()
+    station.heartbeat(autopilot=8)
+    samples(link, 0.1)
+    vehicle.mav.signing.timestamp += 5 * 100_000  # time goes on; the station, 30 s ahead, says nothing more
+    stolen = [vehicle.heartbeat(), *(vehicle.imu(6.0 + 0.01 * k) for k in range(5))]
+    assert samples(link, 0.2)
+    link.close()
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, key=KEY, memory=memory)
+    try:
+        for frame in stolen:
+            thief.socket.send(frame)
+        assert samples(link, 0.2) == []
+        assert link.vehicle_system == 0
+    finally:
+        link.close()
+
+
 @pytest.mark.parametrize("data", [b"", b"short", b"z" * 64])
 def test_a_key_that_is_none_opens_no_link(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "key"

@@ -16,7 +16,8 @@ from quadid_node.codec import set_from_dict, set_to_dict
 from quadid_node.store import Store
 from quadid_node.store_file import StoreError, connect, read_history
 
-from quadid.online.records import Diagnosed, Event, OnlineFinding, SetState
+from quadid.online.active_set import ActiveSet
+from quadid.online.records import Diagnosed, Event, OnlineFinding, Publish, SetState
 from tests.faults.evidence import Happened
 from tests.online.test_gate import TRUE, online_set
 
@@ -63,6 +64,29 @@ def test_everything_is_there_after_a_restart(tmp_path: Path) -> None:
     assert [s["sequence"] for s in found["sets"]] == [1, 2]
     assert [c["check"] for c in found["candidates"]] == ["approval", "approval"]
     assert [e["kind"] for e in found["events"]] == ["change", "diagnosis"]
+
+
+def test_a_set_known_to_be_out_of_date_is_still_so_after_two_restarts(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    filled(path).close()
+    for run in range(3):
+        store = Store(path, "pelican")
+        found = store.restore()
+        sets = ActiveSet("auto", found.item, found.next_sequence)
+        assert sets.in_force is not None
+        assert bool(sets.in_force.outdated) == (run > 0)
+        store.numbered(sets.in_force)
+        for action in sets.withdraw("mass +15 %"):
+            assert isinstance(action, Publish)
+            store.numbered(action.item)
+        store.close()
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=found.next_sequence + 10, approved_by="auto"))
+    store.flush(5.0)
+    item = store.restore().item
+    store.close()
+    assert item is not None
+    assert not item.outdated
 
 
 def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -37,6 +38,17 @@ def test_rollback_returns_the_earlier_values_under_a_new_number() -> None:
     assert (ledger.in_force.state, ledger.in_force.sequence) == (SetState.ROLLED_BACK, 3)
     assert ledger.approval == "manual"
     assert not ledger.roll_back(62.0, "bob").done
+
+
+@pytest.mark.parametrize("by", ["ann", "auto"])
+def test_a_rollback_after_a_change_brings_no_set_from_before_it_back_as_good(by: str) -> None:
+    sets = ActiveSet("auto")
+    sets.accept(online_set(TRUE), "auto", 1.0, 1.0)
+    sets.accept(online_set({**TRUE, "b": 2.34e-5}), "auto", 2.0, 2.0)
+    sets.withdraw("mass +15 %")
+    action = sets.roll_back(3.0, by).actions[0]
+    assert isinstance(action, Publish)
+    assert (action.item.parameters["b"].value, action.item.outdated) == (TRUE["b"], "mass +15 %")
 
 
 def test_a_restored_set_is_stale_and_numbers_go_on() -> None:
