@@ -38,6 +38,7 @@ class Frames(NamedTuple):
         head: bytes from the mark to the payload: 6 or 10.
         stop: offset behind the whole frame.
         received: receive times [s, UNIX].
+        number: of each frame, counted by its sender from 0 to 255 again and again.
         message, system, component: message id and who sent it.
         skipped: bytes that belong to no frame.
         cut: whether the file ends inside a frame.
@@ -49,6 +50,7 @@ class Frames(NamedTuple):
     head: IntArray
     stop: IntArray
     received: FloatArray
+    number: IntArray
     message: IntArray
     system: Bytes
     component: Bytes
@@ -76,13 +78,14 @@ def read_frames(path: Path) -> Frames:
     kept, skipped, cut = _walk(places, stop, marks, len(data))
     start, head, end = places[kept] + _STAMP, head[kept], end[kept]
     short = np.where(head == 6, 0, 2)  # MAVLink 2 has two flags more before these
-    number = start + 5 + short
-    message = data[number].astype(np.int64)
+    kind = start + 5 + short
+    message = data[kind].astype(np.int64)
     long = head == 10
-    message[long] |= data[number[long] + 1].astype(np.int64) << 8 | data[number[long] + 2].astype(np.int64) << 16
+    message[long] |= data[kind[long] + 1].astype(np.int64) << 8 | data[kind[long] + 2].astype(np.int64) << 16
     return Frames(
-        data, start, end, head, stop[kept], received[kept].astype(np.float64) * 1e-6, message, data[start + 3 + short],
-        data[start + 4 + short], skipped, cut,
+        data, start, end, head, stop[kept], received[kept].astype(np.float64) * 1e-6,
+        data[start + 2 + short].astype(np.int64), message, data[start + 3 + short], data[start + 4 + short],
+        skipped, cut,
     )  # fmt: skip
 
 

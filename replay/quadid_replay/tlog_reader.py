@@ -26,6 +26,10 @@ _MOST_BACKWARDS = 10
 """Boot time that falls more often: no vehicle boots that often."""
 
 
+_FAR = 8
+"""Frame numbers that jump by no more come from a frame that is lost, late or there twice."""
+
+
 def read_tlog(path: Path) -> Recording:
     """Reads a telemetry log, whole or damaged; of several vehicles the one that tells most.
 
@@ -51,11 +55,27 @@ def read_tlog(path: Path) -> Recording:
             "times: two vehicles under one system id", "one vehicle an id",
             "give each vehicle its own SYSID_THISMAV (MAV_SYS_ID) and record again, or record each link by itself",
         )  # fmt: skip
+    if _two_rows(frames.number[(frames.system == who[0]) & (frames.component == who[1])]):
+        notes.append(
+            f"frame numbers of system {who[0]} component {who[1]} come in two rows: two links of one vehicle, or two "
+            "vehicles under one id, and then nothing of it can be trusted"
+        )
     others = [key for key, v in vehicles.items() if key != who and v.signals]
     if others:
         notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")
     raw = _channels(vehicles[who], notes)
     return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
+
+
+def _two_rows(number: IntArray) -> bool:
+    """Whether frame numbers jump to and fro between two rows: each jump lands where the last one had left off.
+
+    Numbers of one sender jump over what was lost, and never go on where they were before.
+    """
+    step = np.diff(number) % 256
+    jumps = np.flatnonzero((step > _FAR) & (step < 256 - _FAR))
+    back = int(np.count_nonzero(number[jumps[1:] + 1] == (number[jumps[:-1]] + 1) % 256))
+    return back > max(_MOST_BACKWARDS, len(jumps) // 2)
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:

@@ -152,6 +152,35 @@ def test_two_vehicles_under_one_system_id_are_refused(tmp_path: Path, happened: 
     happened(31, "two autopilots with one id, frame by frame: refused as two vehicles")
 
 
+@pytest.mark.parametrize("turn", [1, 10, 100])
+def test_two_vehicles_under_one_id_that_were_started_at_once_are_said(
+    tmp_path: Path, turn: int, happened: Happened
+) -> None:
+    """Their boot times are the same: only the numbers of their frames tell them apart."""
+    senders = Tlog(), Tlog()
+    senders[1].mav.seq = 90
+    mixed = bytearray()
+    for k in range(1600):
+        log = senders[k // turn % 2]
+        log.data.clear()
+        log.add(0.02 * k, attitude(100.0 + 0.02 * k))
+        mixed += log.data
+    assert "frame numbers of system 1 component 1 come in two rows" in opened(tmp_path, bytes(mixed))
+    happened(31, f"two autopilots with one id and one clock, {turn} frames each in turn: said, by their frame numbers")
+
+
+def test_one_sender_whose_frames_are_lost_late_or_doubled_is_one(tmp_path: Path) -> None:
+    rng, log, frames = np.random.default_rng(1), Tlog(), []
+    for k in range(3000):
+        log.data.clear()
+        log.add(0.02 * k, attitude(100.0 + 0.02 * k))
+        frames.append(bytes(log.data))
+    late = [f for pair in zip(frames[1::2], frames[::2], strict=True) for f in pair]
+    lossy = [f for f in frames if rng.random() < 0.05]
+    for kept in (frames, lossy, late, [f for f in frames for _ in range(2)], frames[:900] + frames[1000:]):
+        assert "two rows" not in opened(tmp_path, b"".join(kept))
+
+
 def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path, happened: Happened) -> None:
     log = Dataflash()
     columns = ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
