@@ -127,7 +127,6 @@ def _statistics() -> None:
     rotor_table(Rollout(window, vehicle).drive, nothing, np.repeat(theta, LANES, axis=0), table)
 
 
-
 def _closed_loop() -> None:
     from quadid.flight import default_gains
     from quadid.model.closed_loop import ClosedLoop
