@@ -13,12 +13,12 @@ A controller is software: it is the same in the flown vehicle and in a simulatio
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
+import numba
 import numpy as np
 
 from quadid.errors import ParameterError, nearest
-from quadid.machine_code import kept
 from quadid.rotation import write_rotation
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -27,8 +27,12 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def _kernel(function: F) -> F:
-    """Compiles with IEEE arithmetic."""
-    return kept(function, nogil=True, error_model="numpy")
+    """Compiles with IEEE arithmetic, cached on disk where something can be written there."""
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    try:
+        return cast(F, numba.njit(cache=True, **options)(function))
+    except RuntimeError:
+        return cast(F, numba.njit(**options)(function))
 
 
 GAIN_UNITS: dict[str, str] = {

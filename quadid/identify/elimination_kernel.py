@@ -8,6 +8,7 @@ vector registers; the elimination is a Cholesky factor of the initial state's ow
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -17,7 +18,8 @@ from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 
 # isort: off
 from quadid.model.simd import (
-    LANES, TILE_COLUMNS, TILE_ROWS, cache_aligned, jit, lane_kernel, on_disk, scaled_lanes, tile_product,
+    LANES, SOURCES, TILE_COLUMNS, TILE_ROWS, allocating, cache_aligned, cached, jit, lane_kernel, scaled_lanes,
+    tile_product,
 )  # fmt: skip
 
 # isort: on
@@ -43,7 +45,7 @@ def reduce_segments(
     w = whitening
     # A copy, because read-only arrays are another type, for which all would be compiled again.
     own_lane = np.array(lane)
-    _reduce(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, own_lane, prior, into)
+    _reduce_on_disk(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, own_lane, prior, into)
 
 
 @nb.njit(**{**jit, "fastmath": False})
@@ -171,7 +173,7 @@ def _largest(g: FloatArray) -> float:
     return out
 
 
-@on_disk
+@nb.njit(**allocating)
 def _reduce(
     out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: BoolArray,
     matrix: FloatArray, reach: IntArray, lane: IndexArray, prior: StatePrior, into: Reduced,
@@ -214,3 +216,15 @@ def _reduce(
                 _tile(x, i, lanes, 1, x, j, lanes, channels * length, flat_g, i * lanes + j, lanes)
         into.largest[s] = _largest(g)
         _eliminate(g, lane, s, prior, into, l, y, row)
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def reduce(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _reduce(*arguments)
+
+    return reduce
+
+
+_reduce_on_disk = _on_disk(SOURCES)

@@ -12,8 +12,7 @@ from typing import Any
 
 import numba as nb
 
-from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate, step_core, step_core_shared
-from quadid.model.needs_kernel import Needs
+from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
 from quadid.types import FloatArray
 
 # isort: off
@@ -27,7 +26,7 @@ from quadid.model.rows import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, inlined, jit, lane_kernel, piece_on_disk
+from quadid.model.simd import LANES, inlined, jit, lane_kernel
 
 
 @nb.njit(**inlined)
@@ -254,34 +253,3 @@ step_rare = _step_of(True, True, False, True)
 """One step of velocity with all that moving air does."""
 step_full = _step_of(True, True, True, True)
 """One step with every effect."""
-
-
-@piece_on_disk
-def step_body(dt: float, need: Needs, table: FloatArray, k: int, s: FloatArray) -> None:
-    """One step with the effects that any lane needs.
-
-    Args:
-        dt: step [s].
-        need: which parts of the model.
-        table: moments that all lanes share, read if `need.shared` and nothing but the nominal step is needed.
-        k: step, the row of `table`.
-        s: rows; advanced in place as in `quadid.model.kernel.step_core`.
-    """
-    if need.rare and need.solid:
-        step_full(dt, s)
-    elif need.rare:
-        step_rare(dt, s)
-    elif need.hub and need.solid:
-        step_hub_solid(dt, s)
-    elif need.hub:
-        step_hub(dt, s)
-    elif need.air and need.solid:
-        step_air_solid(dt, s)
-    elif need.air:
-        step_air(dt, s)
-    elif need.solid:
-        step_solid(dt, s)
-    elif need.shared:
-        step_core_shared(dt, table, k, s)
-    else:
-        step_core(dt, s)

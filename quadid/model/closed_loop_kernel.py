@@ -7,6 +7,8 @@ The flight is kept whole because it is the order of events within a step.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
@@ -27,7 +29,7 @@ from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_
 
 # isort: on
 from quadid.attitude_controller import rotation_of, steer
-from quadid.model.simd import LANES, allocating, cache_aligned, jit, on_disk
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
 from quadid.rotation import write_rotation
 
 OUTPUTS = 10
@@ -140,8 +142,8 @@ def _fly(
         out[k, 3:7] = kept[:4]
 
 
-@on_disk
-def fly_closed_loop(
+@nb.njit(**allocating)
+def _fly_closed_loop(
     references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
     terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
@@ -183,3 +185,15 @@ def fly_closed_loop(
         references, gains, mixer, substeps, lanes, geometry, flight, theta, need, out, s, rot, terms, coefficients,
         signals,
     )  # fmt: skip
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def fly_closed_loop(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _fly_closed_loop(*arguments)
+
+    return fly_closed_loop
+
+
+fly_closed_loop = _on_disk(SOURCES)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
-from quadid.model.simd import jit, on_disk
+from quadid.model.simd import SOURCES, cached, jit
 from quadid.types import FloatArray
 
 
@@ -77,8 +77,8 @@ def _any_of(theta: FloatArray, entries: tuple[int, ...]) -> bool:
     return found
 
 
-@on_disk
-def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
+@nb.njit(**jit)
+def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
     """Returns what a block of parameter vectors (LANES, size) needs of the model."""
     rare, factors, payload = (
         _any_of(theta, RARE_ENTRIES), _any_of(theta, FACTOR_ENTRIES), _any_of(theta, PAYLOAD_ENTRIES)
@@ -103,3 +103,15 @@ def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
         _any_of(theta, (EXPONENT,)), growth, hub or growth, factors, payload, _any_of(theta, (ix.IMU_PERIOD,)),
         _any_of(theta, (ix.ATT_DELAY,)), _any_of(theta, IMU_ENTRIES), _any_of(theta, (ix.AHRS_K,)), learned,
     )  # fmt: skip
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def needs_of(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        return _needs_of(*arguments)
+
+    return needs_of
+
+
+needs_of = _on_disk(SOURCES)

@@ -7,12 +7,21 @@ The march is kept whole because it is the order of events within a step.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 
-from quadid.model.body_kernel import step_body
+from quadid.model.body_kernel import (
+    step_air,
+    step_air_solid,
+    step_full,
+    step_hub,
+    step_hub_solid,
+    step_rare,
+    step_solid,
+)
 from quadid.model.compare_kernel import collect, compare, compare_motion, settle
-from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload
+from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core, step_core_shared
 from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
@@ -30,7 +39,7 @@ from quadid.model.sensor_kernel import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, cache_aligned, jit, lane_kernel, on_disk
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit, lane_kernel
 
 
 @nb.njit(**jit)
@@ -118,7 +127,24 @@ def _march(
                 residual_signals(s, signals)
                 residual_forces(terms, coefficients, signals, i == 0, s)
             # The step from t_k gives the second half of the accelerometer's mean at t_k; the step before, the first.
-            step_body(dt, need, table, k, s)
+            if need.rare and need.solid:
+                step_full(dt, s)
+            elif need.rare:
+                step_rare(dt, s)
+            elif need.hub and need.solid:
+                step_hub_solid(dt, s)
+            elif need.hub:
+                step_hub(dt, s)
+            elif need.air and need.solid:
+                step_air_solid(dt, s)
+            elif need.air:
+                step_air(dt, s)
+            elif need.solid:
+                step_solid(dt, s)
+            elif need.shared:
+                step_core_shared(dt, table, k, s)
+            else:
+                step_core(dt, s)
             if i == 0:
                 _settle_force(s)
             if need.imu_lag:
@@ -147,8 +173,8 @@ def _march(
                     ends[seg, c, lane] = s[X_QW + c * LANES + lane]
 
 
-@on_disk
-def roll_segments(
+@nb.njit(**allocating)
+def _roll_segments(
     drive: Drive, terms: IntArray, flight: Flight, table: FloatArray,
     measured: FloatArray, scale: FloatArray, memory: int, starts: IntArray, n_pre: int, x0: FloatArray,
     theta: FloatArray, dx: FloatArray, need: Needs, channels: int, n_seg: int, sums: bool, basis: FloatArray,
@@ -206,3 +232,15 @@ def roll_segments(
         drive, flight, theta, table, measured, scale, memory, starts, n_pre, x0, dx, need, channels, n_seg,
         sums, basis, out, ends, cost, s, rot, ahead, past, total, inside, terms, coefficients, signals,
     )  # fmt: skip
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def roll_segments(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _roll_segments(*arguments)
+
+    return roll_segments
+
+
+roll_segments = _on_disk(SOURCES)

@@ -6,7 +6,7 @@ Speeds and their means are those of `quadid.model.lag_kernel`; here is what is r
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 
@@ -36,7 +36,7 @@ from quadid.model.rows import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, cache_aligned, exact, jit, lane_kernel, on_disk, piece_on_disk
+from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, jit, lane_kernel
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""
@@ -199,7 +199,7 @@ def _add_growth(r, spin, rot, s):  # type: ignore[no-untyped-def]
         s[A_Z2 + HALF + lane] += gain * (n3 * rotors * s[C_HOVER + lane] - n2)
 
 
-@piece_on_disk
+@nb.njit(**jit)
 def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArray) -> None:
     """Advances all rotors over step k, from t_k to t_k+1, and sums their moments for both half steps.
 
@@ -218,8 +218,8 @@ def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArra
         turn_rotor(plain, drive.u[k, r], r, drive.held, sloped, drive.geometry, drive.dt, need, rot, s)
 
 
-@on_disk
-def rotor_table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
+@nb.njit(**allocating)
+def _table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
     """Moments of every step of a window for lanes that share all that acts on rotors.
 
     Args:
@@ -264,3 +264,15 @@ def spread_moments(table: FloatArray, k: int, s: FloatArray) -> None:
         s[A_O1 + lane], s[A_O1 + HALF + lane] = table[k, 4], table[k, ALL_MOMENTS + 4]
         s[A_S1 + lane], s[A_S1 + HALF + lane] = table[k, 5], table[k, ALL_MOMENTS + 5]
         s[A_DO + lane], s[A_DO + HALF + lane] = table[k, 6], table[k, ALL_MOMENTS + 6]
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def rotor_table(*arguments):  # type: ignore[no-untyped-def]
+        _ = sources
+        _table(*arguments)
+
+    return rotor_table
+
+
+rotor_table = _on_disk(SOURCES)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
 from importlib import resources
-from typing import Any, TypeVar
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -15,10 +14,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
-from quadid.machine_code import kept
 from quadid.types import FloatArray
-
-F = TypeVar("F", bound=Callable[..., object])
 
 LANES = 16
 """Parameter vectors rolled out together; two AVX-512 or four AVX2 registers of float64."""
@@ -32,8 +28,11 @@ _VECTOR = ir.VectorType(ir.DoubleType(), CACHE_LINE)
 FREE = {"contract", "nnan", "ninf", "nsz"}
 """Freedom of the compiler: fused multiply-add, and no regard for infinities.  No regrouping of sums: each compilation
 would round differently, and flights replayed after a restart would not be the same bit for bit."""
-_arithmetic: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"}
-allocating: dict[str, Any] = {**_arithmetic, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+cached: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FREE, "error_model": "numpy"}
+"""Options of the kernels that Python calls."""
+allocating: dict[str, Any] = {
+    "nogil": True, "fastmath": FREE, "error_model": "numpy", "no_cfunc_wrapper": True
+}  # fmt: skip
 """Options of kernels that make arrays."""
 jit: dict[str, Any] = {**allocating, "_nrt": False}
 """Options of all others: without reference counts, whose atomic updates cost more than a short lane loop."""
@@ -56,17 +55,9 @@ def _sources() -> int:
     return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside, order]))
 
 
-_SOURCES = _sources()
-
-
-def on_disk(function: F) -> F:
-    """Compiles a kernel that Python calls and keeps it on disk."""
-    return kept(function, _SOURCES, **_arithmetic)
-
-
-def piece_on_disk(function: F) -> F:
-    """As `jit`, for a large piece: kept on disk, so that another process can compile it for its callers."""
-    return kept(function, _SOURCES, **{**jit, "no_cpython_wrapper": False})
+SOURCES = _sources()
+"""Captured by the kernels on disk, so that it becomes part of their key: numba alone looks at the file of the function
+that is called, and would run an old version of what that function calls."""
 
 
 def _lane_kernel(context: Any) -> Any:

@@ -1,7 +1,6 @@
 """The compiled kernels: which there are, whether this machine has them already, and short runs that compile them.
 
-The parts are made so that two processes side by side take about the same time: the second begins with pieces that the
-first needs late, and finds on disk by then.
+The parts are made so that two processes side by side take about the same time.
 """
 
 from __future__ import annotations
@@ -101,19 +100,18 @@ def _simulation() -> None:
 def _statistics() -> None:
     import numpy as np
 
+    from quadid.flight.stabiliser import default_gains
     from quadid.identify.elimination import Reduced, StatePrior, Whitening
     from quadid.identify.elimination_kernel import reduce_segments
-    from quadid.model.body_kernel import step_body
+    from quadid.model.closed_loop import ClosedLoop
     from quadid.model.layout import Layout
     from quadid.model.needs_kernel import Needs
     from quadid.model.rollout import Rollout
     from quadid.model.rotor_kernel import rotor_table
-    from quadid.model.rows import ALL_MOMENTS, N_ROWS
+    from quadid.model.rows import ALL_MOMENTS
     from quadid.model.simd import LANES, aligned
 
     vehicle, window = _hover()
-    nothing, table = Needs(*[False] * len(Needs._fields)), np.empty((len(window), 2 * ALL_MOMENTS))
-    step_body(window.dt, nothing, table, 0, aligned((N_ROWS * LANES,)))
     own, rows, channels = 9, 8, 9
     out = aligned((1, 1, rows, channels, LANES))
     out[:] = np.random.default_rng(1).standard_normal(out.shape)
@@ -124,16 +122,11 @@ def _statistics() -> None:
         StatePrior(np.ones(own), 0.0, np.zeros((1, 3))), Reduced.room(1, own, 1, rows, channels),
     )  # fmt: skip
     theta = Layout(vehicle).initial(vehicle)[None]
-    rotor_table(Rollout(window, vehicle).drive, nothing, np.repeat(theta, LANES, axis=0), table)
-
-
-def _closed_loop() -> None:
-    from quadid.flight import default_gains
-    from quadid.model.closed_loop import ClosedLoop
-    from quadid.model.layout import Layout
-
-    vehicle, window = _hover()
-    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
+    rotor_table(
+        Rollout(window, vehicle).drive, Needs(*[False] * len(Needs._fields)), np.repeat(theta, LANES, axis=0),
+        np.empty((len(window), 2 * ALL_MOMENTS)),
+    )  # fmt: skip
+    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(theta)
 
 
 def _flight() -> None:
@@ -150,16 +143,11 @@ def _simulation_kernels() -> list[Any]:
 
 
 def _statistics_kernels() -> list[Any]:
-    from quadid.identify.elimination_kernel import _reduce
+    from quadid.identify.elimination_kernel import _reduce_on_disk
+    from quadid.model.closed_loop_kernel import fly_closed_loop
     from quadid.model.rotor_kernel import rotor_table
 
-    return [rotor_table, _reduce]
-
-
-def _closed_loop_kernels() -> list[Any]:
-    from quadid.model.closed_loop_kernel import fly_closed_loop
-
-    return [fly_closed_loop]
+    return [rotor_table, _reduce_on_disk, fly_closed_loop]
 
 
 def _flight_kernels() -> list[Any]:
@@ -171,7 +159,6 @@ def _flight_kernels() -> list[Any]:
 PARTS = {
     "simulation": Part(_simulation, _simulation_kernels, 120),
     "statistics": Part(_statistics, _statistics_kernels, 100),
-    "closed loop": Part(_closed_loop, _closed_loop_kernels, 60),
     "flight": Part(_flight, _flight_kernels, 30),
 }
 """What an identification or a diagnosis needs, in two parts, and the flown vehicle of `quadid simulate`."""

@@ -36,6 +36,6 @@ def test_what_is_missing_is_known_without_compiling(tmp_path: Path) -> None:
 
 def test_a_fit_calls_what_was_compiled_and_nothing_else(flights: Flights, inside: Cli) -> None:
     counts = json.loads(python(SIGNATURES, str(flights.train)).splitlines()[-1])
-    assert counts == dict.fromkeys(("needs_of", "roll_segments", "rotor_table", "_reduce"), 1)
+    assert counts == dict.fromkeys(("needs_of", "roll_segments", "rotor_table", "reduce", "fly_closed_loop"), 1)
     assert inside("warmup").out.startswith("Kernels: compiled")
     assert inside("warmup").out == "Kernels: compiled already.\n"
