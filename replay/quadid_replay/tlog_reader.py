@@ -24,8 +24,6 @@ _WANTED = {n: m for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS
 _ROTORCRAFT = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
 _MOST_BACKWARDS = 10
 """Boot time that falls more often: no vehicle boots that often."""
-
-
 _FAR = 8
 """Frame numbers that jump by no more come from a frame that is lost, late or there twice."""
 
