@@ -122,23 +122,26 @@ def make_tables(path: Path) -> None:
 
 
 def check_tables(db: sqlite3.Connection) -> None:
-    """Raises DatabaseError where a file holds more than our tables: what a view or trigger computes may never end."""
-    for kind, name, page in db.execute("SELECT type, name, rootpage FROM sqlite_master"):
+    """Raises DatabaseError where a file holds what computes: triggers, views, and tables of ours made in another way.
+
+    What a view, an index or the condition of a column computes may never end, and may take all memory.
+    """
+    made = _made()
+    for kind, name, table, page, sql in db.execute(
+        "SELECT type, name, lower(tbl_name), rootpage, sql FROM sqlite_master"
+    ):
         if kind not in ("table", "index") or not page:
             raise sqlite3.DatabaseError(f"malformed: {plain(str(name), 40)} is no table that a history has")
-    for table, columns in _columns().items():
-        found = [(row[1], row[-1]) for row in db.execute(f"PRAGMA table_xinfo({table})")]
-        if found and found != columns:
-            raise sqlite3.DatabaseError(f"malformed: the table {table} has other columns")
+        if (table, "table") in made and sql != made.get((name, kind)):
+            raise sqlite3.DatabaseError(f"malformed: {plain(str(name), 40)} is not as a history has it")
 
 
 @lru_cache(maxsize=1)
-def _columns() -> dict[str, list[tuple[str, int]]]:
-    """Names of the columns by table, each with 0: none is computed."""
+def _made() -> dict[tuple[str, str], str]:
+    """How each table and index is made, by its name and kind."""
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         db.executescript(SCHEMA)
-        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        return {t: [(row[1], 0) for row in db.execute(f"PRAGMA table_xinfo({t})")] for t in tables}
+        return {(name, kind): sql for name, kind, sql in db.execute("SELECT name, type, sql FROM sqlite_master")}
 
 
 def begin_anew(path: Path, error: sqlite3.Error) -> str:

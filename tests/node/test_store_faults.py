@@ -229,6 +229,11 @@ HOSTILE_FILES = {
     f"(vehicle, level, kind, text, wall) {ENDLESS} SELECT 'v', '', '', x, 1 FROM c; END",
     "a view without end": "DROP TABLE sets; CREATE VIEW sets AS " + ENDLESS + " SELECT 'v' AS vehicle, x AS sequence, "
     "'accepted' AS state, '' AS reason, '' AS approved_by, 1 AS stop, 1 AS wall, '{}' AS data FROM c",
+    "an index that computes": "CREATE INDEX i ON sets (hex(zeroblob(100000000)))",
+    "an index that refuses": "CREATE UNIQUE INDEX i ON sets (length(vehicle) > 0)",
+    "a condition that computes": "DROP TABLE sets; CREATE TABLE Sets (vehicle TEXT NOT NULL, "
+    "sequence INTEGER NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL, approved_by TEXT NOT NULL, stop REAL, "
+    "wall REAL NOT NULL, data TEXT NOT NULL CHECK (length(hex(zeroblob(400000000))) > 0))",
     "a computed column": "ALTER TABLE sets DROP COLUMN data; ALTER TABLE sets ADD COLUMN data TEXT GENERATED ALWAYS AS "
     "(hex(zeroblob(400000000)))",
 }
