@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import validate
+from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
 from quadid.diagnose.cross_validation import FEWEST_BLOCKS
 from quadid.diagnose.findings import describe, extended_vehicle
 from quadid.diagnose.hypotheses import Candidate, candidates
@@ -92,6 +93,9 @@ def diagnose(
     vehicle = with_reference_voltage(vehicle, windows)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     begun, search = _select(windows, begun, report)
+    schedule, held = begun.schedule, held_by_quick_motion(windows, begun.short, begun.nominal, search.model)
+    if held is not None:
+        schedule, search = refitted(held, schedule, search)
     decisive = search.shooting
     left = remainder(decisive, search.model, seed)
     report("validation", 0.0)
@@ -105,7 +109,7 @@ def diagnose(
     if search.model.causes and (outcome.contradicted or saturated or len(doubts) == len(search.model.causes)):
         verdict = Verdict.UNKNOWN
     alike = {c.family for c in search.model.causes if c.label in doubts}
-    parameters, reasons = _nominal_parameters(decisive, begun.short, search.model, verdict, doubts)
+    parameters, reasons = _nominal_parameters(decisive, schedule[-1], search.model, verdict, doubts, held)
     parameters, moved = possible_moments(parameters)
     weak = late_unknown(search.model, parameters) | slight_changes(search.model)
     believed = [] if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
@@ -143,13 +147,14 @@ def _prediction(
 
 
 def _nominal_parameters(
-    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubts: Collection[str] = ()
-) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
+    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubts: Collection[str] = (),
+    held: Held | None = None,
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
     Estimates must agree as those of an identification, and with those without each cause in `doubts` (labels): it
     stands for something else, which may do to them what it does.  Where the cause of the error is unknown, so is what
-    it does to them: none is identified; nor an inertia beside a doubtful moment.
+    it does to them: none is identified; nor an inertia beside a doubtful moment.  What is `held` is not concerned.
     """
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     trust = reliability(decisive, model, model.free, model.prior, brief)
@@ -164,6 +169,8 @@ def _nominal_parameters(
             reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
     everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    if held is not None:
+        nominal, reasons = held.among(nominal), (held.sentence, *reasons)
     reasons = (*on_bounds(nominal), *reasons)
     for cause in model.causes:
         nominal = tied(nominal, EFFECTS[cause.effect].ties)
@@ -171,7 +178,8 @@ def _nominal_parameters(
     if turning := [c.label for c in model.causes if c.label in doubts and EFFECTS[c.effect].turns]:
         told |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
     for names, why in told.items():
-        if doubted := [p.name for p in nominal if p.status is Status.IDENTIFIED and p.name in names]:
+        open_to_it = set(names) - set(held.parameters if held else ())
+        if doubted := [p.name for p in nominal if p.status is Status.IDENTIFIED and p.name in open_to_it]:
             nominal = tuple(replace(p, status=Status.UNRELIABLE) if p.name in doubted else p for p in nominal)
             reasons = (*reasons, f"{', '.join(doubted)}: not to be used while {why}")
     return nominal, reasons

@@ -22,7 +22,7 @@ from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.priors import Prior, default_prior
-from quadid.identify.quick_motion import quick_motion, with_moments
+from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion, with_moments
 from quadid.identify.reliability import reliability
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
@@ -34,8 +34,6 @@ from quadid.window import Window
 
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
-SHORT_SEGMENTS = 1000
-"""Most short segments of the first polish, whose result only starts the last one."""
 WHITE_SHARE = 0.5
 """Quick motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
 noise and the rest is made by random moments."""
@@ -164,53 +162,73 @@ def fit(
         found = _finish(short, searched, free, default_prior(short, free), evaluations)
         return final_answer(replace(found, warnings=_warnings(found)), out_of_reach or {})
     report("polish", 0.0)
-    short = short.at_most(SHORT_SEGMENTS)
+    short = short.at_most(MOST_SEGMENTS)
     free = short.free(free_names)
     typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
-    judge, prior, others = first, default_prior(short, free), []
-    quick = quick_motion(windows, short, first.theta, free_names) if _restless(short, first) else None
+    evaluations += first.iterations * (len(free.entries) + 10)
+    # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
+    comparable = not set(INERTIAS) & set(out_of_reach or ())
+    quick = quick_motion(windows, short, first.theta, free_names) if restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
         starts = [quick.found.theta, first.theta]
         flexible = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS)
-        noise, spent, said = flexible.noise, flexible.simulated, (*said, _QUICK)
-        final, result, free, prior, judge = quick.shooting, quick.found, quick.free, quick.prior, quick.short
-        others = [quick.prompt]
-        if late := [n for n, step in zip(free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
-            said = (*said, f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
+        found = quick_fit(quick, free_names, options.robust, comparable)
+        noise, evaluations = flexible.noise, evaluations + flexible.simulated
     else:
         noise, spent = noise_floor(windows, short, first.theta, free)
         report("polish", 0.4)
         final = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
         result = polish(final, first.theta, free, robust=options.robust)
         noise, more = with_memory(windows, final, result.theta, free_names)
-        final, spent = final.with_noise(noise), spent + more
+        final = final.with_noise(noise)
         theta, states = result.theta, result.states
         del result  # of a long log its residuals are a large part of all memory
         result = polish(final, theta, free, states=states, robust=options.robust)
-    if not np.isfinite(result.cost):
-        final, result = short, first
+        if not np.isfinite(result.cost):
+            final, result = short, first
+        evaluations += spent + more + result.iterations * (len(free.entries) + 10)
+        judge = first if comparable else None
+        found = _finish(final, result, free, default_prior(short, free), 0, options.robust, judge)
+        found = replace(found, warnings=(*found.warnings, *_warnings(found)))
     report("polish", 1.0)
-    evaluations += spent + (first.iterations + result.iterations) * (len(free.entries) + 10)
-    # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
-    comparable = not set(INERTIAS) & set(out_of_reach or ())
-    found = _finish(final, result, free, prior, evaluations, options.robust, judge if comparable else None, others)
-    found = found.of(free_names)
-    if quick is not None:
-        found = replace(found, parameters=found.parameters.unreliable(YAW))
-    found = replace(found, noise=noise, warnings=(*said, *found.warnings, *_warnings(found)))
+    found = replace(found, noise=noise, evaluations=evaluations + found.evaluations, warnings=(*said, *found.warnings))
     return final_answer(found, out_of_reach or {})
 
 
-def _restless(short: Shooting, plain: Polished) -> bool:
+def restless(short: Shooting, plain: Polished) -> bool:
     """Whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
 
     Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise
     takes them for a large inertia.
+
+    Args:
+        short: short segments, with the noise that the model leaves there.
+        plain: the model fitted to them.
     """
     white = with_moments(short, plain.lin).variance[:2]
     return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
+
+
+def quick_fit(quick: QuickMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
+    """What quick motion says of `names`, with intervals and statuses.
+
+    Args:
+        quick: the fit.
+        names: of the vehicle's own parameters.
+        robust: down-weight outliers of the second cut.
+        comparable: whether short segments and other models tell what the numbers are worth.
+    """
+    said = [_QUICK]
+    if late := [n for n, step in zip(quick.free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
+        said.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
+    judge = quick.short if comparable else None
+    found = _finish(
+        quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, robust, judge, [quick.prompt]
+    ).of(names)
+    found = replace(found, parameters=found.parameters.unreliable(YAW))
+    return replace(found, warnings=(*said, *found.warnings, *_warnings(found)))
 
 
 def _finish(

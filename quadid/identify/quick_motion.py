@@ -27,7 +27,7 @@ THRUST_AXIS = 8
 LATE_START = 0.005
 """Where lags and delays begin in the fit [s]."""
 MOST_SEGMENTS = 1000
-"""Most segments; the parameters need no more."""
+"""Most segments of this fit and of a first one; the parameters need no more."""
 ROUNDS = 15
 """Most estimates of the random moments, each followed by a fit."""
 USUAL = 1.0
@@ -45,6 +45,7 @@ class QuickMotion:
         prior: on these.
         short: the same in segments as short as those of the first fit, whose motion is quicker still.
         prompt: scaled step of the parameters to where they are with nothing late, shape (P,).
+        simulated: parameter vectors simulated for all of it.
     """
 
     shooting: Shooting
@@ -53,6 +54,7 @@ class QuickMotion:
     prior: Prior
     short: Polished
     prompt: FloatArray
+    simulated: int
 
 
 def quick_motion(
@@ -81,27 +83,25 @@ def quick_motion(
     prior = Prior(prior.mean, np.where(np.isin(free.names, late), USUAL, prior.sigma))
     theta = theta.copy()
     theta[shooting.free(late).index] = LATE_START
-    lin = shooting.linearise(theta, free)
+    lin, spent = shooting.linearise(theta, free), 1
     for _ in range(ROUNDS):
         shooting = shooting.with_noise(with_moments(shooting, lin))
         found = polish(shooting, theta, free, prior, states=lin.states, iterations=8)
         moved = free.step(theta, found.theta)
-        theta, lin = found.theta, found.lin
+        theta, lin, spent = found.theta, found.lin, spent + found.iterations
         if found.outcome is Convergence.CONVERGED and np.max(np.abs(moved)) < SETTLED:
             break
     if not np.isfinite(found.cost):
         return None
     brief = short.with_noise(shooting.noise).leaving_out(rest)
     quicker = polish(brief, theta, free, prior, iterations=8)
-    return QuickMotion(shooting, found, free, prior, quicker, _prompt(shooting, found, free, len(names)))
-
-
-def _prompt(shooting: Shooting, found: Polished, free: Free, told: int) -> FloatArray:
-    """Step of the first `told` parameters to their values with all others at neutral."""
-    theta = found.theta.copy()
-    theta[free.index[told:]] = 0.0
-    other = polish(shooting, theta, shooting.free(free.names[:told]), states=found.states, iterations=8)
-    return np.where(np.arange(len(free.entries)) < told, free.step(found.theta, other.theta), 0.0)
+    told = shooting.free(names)
+    neutral = theta.copy()
+    neutral[shooting.free(late).index] = 0.0
+    prompt = polish(shooting, neutral, told, states=found.states, iterations=8)
+    step = np.where(np.isin(free.names, names), free.step(theta, prompt.theta), 0.0)
+    simulated = (spent + quicker.iterations) * (len(free.entries) + 10) + prompt.iterations * (len(told.entries) + 10)
+    return QuickMotion(shooting, found, free, prior, quicker, step, simulated)
 
 
 def _late(window: Window) -> list[str]:

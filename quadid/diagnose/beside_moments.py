@@ -1,0 +1,115 @@
+"""Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that quick motion shows.
+
+The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
+motion by itself (`quadid.identify.quick_motion`) is free of that.  Where it is better explained without any cause than
+by the selected model, and puts b, J_xx or J_yy elsewhere, these are held at what it shows, and the causes are refitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.diagnose.model import Model, fit_model, without
+from quadid.diagnose.plausibility import impossible_causes
+from quadid.diagnose.segment_schedule import Stage
+from quadid.diagnose.selection import Search, pruned
+from quadid.identify.fit import YAW, quick_fit, restless
+from quadid.identify.gauss_newton import polish
+from quadid.identify.noise_estimation import residual_noise
+from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion
+from quadid.identify.shooting import Shooting
+from quadid.model.layout import Layout
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, Parameter, ParameterSet
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
+from quadid.window import Window
+
+SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
+"""What quick motion shows."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """Parameters held at what quick motion shows.
+
+    Attributes:
+        parameters: by name, as an identification gives them.
+        vehicle: with these values.
+    """
+
+    parameters: Mapping[str, Parameter]
+    vehicle: Vehicle
+
+    def on(self, shooting: Shooting) -> Shooting:
+        """The same problem with what is held."""
+        return replace(shooting, vehicle=self.vehicle, layout=Layout(self.vehicle))
+
+    def among(self, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+        """Parameters with those held in their place, and no trust in what quick motion does not show."""
+        told = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
+        return tuple(self.parameters.get(p.name, p) for p in told)
+
+    @property
+    def sentence(self) -> str:
+        """Why they are."""
+        return (
+            f"moments that the model lacks turn the vehicle, so {', '.join(self.parameters)} come from its quick "
+            f"motion alone, which does not show {', '.join(YAW)}"
+        )
+
+
+def held_by_quick_motion(windows: Sequence[Window], short: Shooting, nominal: FloatArray, model: Model) -> Held | None:
+    """What the selected model has wrong because moments that no model has turn the vehicle; None where it has not.
+
+    Args:
+        windows: the data.
+        short: short segments.
+        nominal: optimum of the model without causes, full vector.
+        model: the selected one.
+    """
+    short = short.at_most(MOST_SEGMENTS)
+    brief = polish(short, model.theta, model.free, model.prior, iterations=8)
+    if not restless(short.with_noise(residual_noise(short, brief)), brief):
+        return None
+    quick = quick_motion(windows, short, nominal, NOMINAL_NAMES)
+    if quick is None or not _better(quick, model):
+        return None
+    shown = {p.name: p for p in quick_fit(quick, NOMINAL_NAMES).parameters if p.name in SHOWN}
+    values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
+    wrong = {n: p for n, p in shown.items() if not p.ci95[0] <= values[n] <= p.ci95[1]}
+    return Held(wrong, _holding(short.vehicle, wrong)) if wrong else None
+
+
+def _better(quick: QuickMotion, model: Model) -> bool:
+    """Whether quick motion is better explained by its own parameters and no cause than by the selected model."""
+    selected = polish(quick.shooting, model.theta, quick.shooting.free([]), iterations=6)
+    return not selected.lin.total_cost <= quick.found.lin.total_cost
+
+
+def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:
+    """The vehicle with parameters that stay where they are, and J_zz no larger than a rigid body's can be then."""
+    priors = dict(vehicle.parameters)
+    for name, p in held.items():
+        priors[name] = ParameterPrior(initial=p.value, bounds=(p.value, p.value), sigma=p.sigma)
+    *flat, upright = INERTIAS
+    low, high = vehicle.limits(upright)
+    if set(flat) <= set(held) and low < (most := sum(held[n].value for n in flat)) < high:
+        old = priors[upright]
+        priors[upright] = ParameterPrior(initial=min(old.initial, most), bounds=(low, most), sigma=old.sigma)
+    return vehicle.model_copy(update={"parameters": priors})
+
+
+def refitted(held: Held, schedule: Sequence[Shooting], search: Search) -> tuple[list[Shooting], Search]:
+    """Schedule and selection with what is held, causes refitted, less those that are of no use there or impossible."""
+    before, beside = search.model, [held.on(s) for s in schedule]
+    moved = beside[-1].free(before.free.names).move(before.theta, np.zeros(len(before.free.names)))
+    stage = Stage.begin(beside, moved, replace(before, theta=moved))
+    shooting, model = stage.shooting, pruned(stage.shooting, stage.model)
+    while wrong := [c for c in model.causes if c.label in impossible_causes(model)]:
+        model = pruned(shooting, without(shooting, model, wrong[0]))
+    nominal = fit_model(schedule[stage.rung], search.nominal.theta, ())
+    return beside, replace(search, shooting=shooting, model=model, nominal=nominal)

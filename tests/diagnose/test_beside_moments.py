@@ -1,0 +1,82 @@
+"""Moments that no model has: a diagnosis must not write the inertias into its file that they pass for."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from quadid.diagnose import Diagnosis, diagnose
+from quadid.diagnose.beside_moments import held_by_quick_motion
+from quadid.diagnose.model import Model, fit_model
+from quadid.flight import draw_truth, fly
+from quadid.identify import fit as fitting
+from quadid.identify.shooting import Shooting
+from quadid.parameters import UNKNOWN
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+from tests.diagnose.problems import cause, clean, fitted, window_with
+from tests.identify.flights import PELICAN, guessed
+
+SEED = 2
+GUSTS = {"gusts": {"push": 0.5, "turn": 1.0, "time": 0.5}}
+"""Turbulence that turns the vehicle by 1 rad/s^2, with a memory of half a second."""
+SHOWN = ("b", "J_xx", "J_yy")
+
+
+@lru_cache(maxsize=1)
+def in_gusts() -> Window:
+    """A flight through turbulence, by the simulator that shares no equation with the model."""
+    return fly(PELICAN, draw_truth(PELICAN, SEED), 60.0, SEED, outside=GUSTS).window
+
+
+def diagnosed() -> Diagnosis:
+    """What the diagnosis of it says, from a poor guess."""
+    return diagnose([in_gusts()], guessed(draw_truth(PELICAN, SEED), SEED))[0]
+
+
+def errors(found: Diagnosis) -> dict[str, float]:
+    """Relative errors of what quick motion shows."""
+    truth = draw_truth(PELICAN, SEED).as_dict()
+    return {p.name: p.value / truth[p.name] - 1.0 for p in found.parameters if p.name in SHOWN}
+
+
+def test_turbulence_does_not_pass_for_inertia() -> None:
+    found, truth = diagnosed(), draw_truth(PELICAN, SEED).as_dict()
+    assert max(map(abs, errors(found).values())) < 0.04, errors(found)
+    parameters = {p.name: p for p in found.parameters}
+    for name in ("J_xx", "J_yy"):
+        assert parameters[name].ci95[0] < truth[name] < parameters[name].ci95[1]
+        assert parameters[name].status not in UNKNOWN
+    assert all(parameters[name].status in UNKNOWN for name in ("d", "J_zz", "J_r"))
+    assert any("quick motion" in w for w in found.warnings)
+    written = Vehicle.from_yaml(found.vehicle_yaml).parameters
+    assert all(written[n].initial == pytest.approx(parameters[n].value, rel=1e-6) for n in SHOWN)
+
+
+def test_without_quick_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "WHITE_SHARE", 0.0)
+    found = errors(diagnosed())
+    assert max(found.values()) > 0.2, found
+
+
+def held(window: Window, shooting: Shooting, nominal: Model, model: Model) -> object:
+    """What is held of a model."""
+    short = Shooting.cut([window], shooting.vehicle, fitting.SWARM_SECONDS, shooting.noise, shooting.layout)
+    return held_by_quick_motion([window], short, nominal.theta, model)
+
+
+def test_a_model_that_leaves_noise_keeps_its_numbers() -> None:
+    problem = clean()
+    assert held(problem.window, problem.shooting, problem.nominal, problem.nominal) is None
+
+
+def test_a_cause_that_is_known_is_no_random_moment() -> None:
+    """An offset of the centre of gravity turns the vehicle with thrust: unknown it rules the rates."""
+    problem = fitted(window_with({"cg_offset": {"x": 0.01, "y": -0.01}}))
+    known = (cause(problem, "cg_offset"),)
+    model = fit_model(problem.shooting, problem.nominal.theta, known, iterations=10)
+    off = problem.nominal.theta[2:4] / model.theta[2:4] - 1.0
+    assert np.max(np.abs(off)) > 0.3, off
+    assert held(problem.window, problem.shooting, problem.nominal, model) is None
