@@ -1,8 +1,8 @@
 """Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that quick motion shows.
 
 The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
-motion by itself (`quadid.identify.quick_motion`) is free of that.  Where it is better explained without any cause than
-by the selected model, and puts b, J_xx or J_yy elsewhere, these are held at what it shows, and the causes are refitted.
+motion by itself (`quadid.identify.quick_motion`) is free of that.  Where the fit to it, without any cause, explains it
+better than the selected model does, and puts b, J_xx or J_yy elsewhere, these are held there and the causes refitted.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from quadid.diagnose.selection import Search, pruned
 from quadid.identify.fit import YAW, quick_fit, restless
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_estimation import residual_noise
+from quadid.identify.process_noise import AXES
 from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
@@ -85,9 +86,11 @@ def held_by_quick_motion(windows: Sequence[Window], short: Shooting, nominal: Fl
 
 
 def _better(quick: QuickMotion, model: Model) -> bool:
-    """Whether quick motion is better explained by its own parameters and no cause than by the selected model."""
-    selected = polish(quick.shooting, model.theta, quick.shooting.free([]), iterations=6)
-    return not selected.lin.total_cost <= quick.found.lin.total_cost
+    """Whether quick roll and pitch are better explained by the fit to quick motion, without causes, than by `model`."""
+    others = [c for c in range(quick.shooting.channels) if c not in AXES[:2]]
+    rates = quick.shooting.leaving_out(others)
+    own, selected = (polish(rates, theta, rates.free([]), iterations=6) for theta in (quick.found.theta, model.theta))
+    return not selected.lin.total_cost <= own.lin.total_cost
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:
