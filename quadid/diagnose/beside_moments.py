@@ -2,7 +2,8 @@
 
 The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
 motion by itself (`quadid.identify.quick_motion`) is free of that.  Where the fit to it, without any cause, explains it
-better than the selected model does, and puts b, J_xx or J_yy elsewhere, these are held there and the causes refitted.
+better than the selected model does, and puts one of b, J_xx and J_yy elsewhere, all three are held there and the causes
+refitted.
 """
 
 from __future__ import annotations
@@ -81,8 +82,10 @@ def held_by_quick_motion(windows: Sequence[Window], short: Shooting, nominal: Fl
         return None
     shown = {p.name: p for p in quick_fit(quick, NOMINAL_NAMES).parameters if p.name in SHOWN}
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
-    wrong = {n: p for n, p in shown.items() if not p.ci95[0] <= values[n] <= p.ci95[1]}
-    return Held(wrong, _holding(short.vehicle, wrong)) if wrong else None
+    if all(p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
+        return None
+    # Together: torque is b times a square over an inertia, and one may be known only relative to another.
+    return Held(shown, _holding(short.vehicle, shown))
 
 
 def _better(quick: QuickMotion, model: Model) -> bool:
@@ -100,7 +103,7 @@ def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:
         priors[name] = ParameterPrior(initial=p.value, bounds=(p.value, p.value), sigma=p.sigma)
     *flat, upright = INERTIAS
     low, high = vehicle.limits(upright)
-    if set(flat) <= set(held) and low < (most := sum(held[n].value for n in flat)) < high:
+    if low < (most := sum(held[n].value for n in flat)) < high:
         old = priors[upright]
         priors[upright] = ParameterPrior(initial=min(old.initial, most), bounds=(low, most), sigma=old.sigma)
     return vehicle.model_copy(update={"parameters": priors})
