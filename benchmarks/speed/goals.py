@@ -42,6 +42,9 @@ GOALS: tuple[tuple[str, str, str, Callable[[Result], str], Callable[[Result], st
     ("commands", "... whole command, from its start", "3 s",
      lambda r: _both(r["times"]["quadid diagnose, 120 s MCAP"]),
      lambda all: bounds.started(all, all["commands"].get("megabytes", {}).get("quadid diagnose, 120 s MCAP", 0.0))),
+    ("commands", "quadid identify of 60 s, after installation", "2 s",
+     lambda r: _both(r["times"]["quadid identify, 60 s MCAP"]),
+     lambda all: bounds.started(all, all["commands"].get("megabytes", {}).get("quadid identify, 60 s MCAP", 0.0))),
     ("refits", "warm refit of a 10 s window", "250 ms",
      lambda r: "{wall:.0f} ms ({processor:.0f} ms)".format(
          **{c: 1e3 * r["times"]["warm, one second later"][c] for c in ("wall", "processor")}),

@@ -105,6 +105,7 @@ def commands(rounds: int, folder: Path) -> dict[str, Any]:
     out = str(folder)
     model = ("--vehicle", "pelican", "--out", out)
     cases = {
+        "quadid identify, 60 s MCAP": ("identify", str(logged(folder, 60.0, ".mcap")), *model),
         "quadid identify, 500 s MCAP": ("identify", str(flown), *model),
         "... with --report": ("identify", str(flown), *model, "--report", str(folder / "report.html")),
         "quadid diagnose, 120 s MCAP": ("diagnose", str(short), *model),

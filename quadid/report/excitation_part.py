@@ -28,8 +28,9 @@ def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
         })  # fmt: skip
     sharp = all(b <= SHARP for b in found.bound.tolist())
     intro = (
-        f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method (Cramér–Rao bound): "
-        "with all parameters unknown, and with all others known. Far apart, the flight only moves them together."
+        f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method, were the model right "
+        "(Cramér–Rao bound): with all parameters unknown, and with all others known. Far apart, the flight only moves "
+        "them together."
     )
     return {"intro": intro, "rows": rows, "done": "Nothing more needs to be flown for these." if sharp else ""}
 

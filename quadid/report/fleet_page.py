@@ -65,7 +65,8 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
     details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
     details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
     if rough:
-        details.append(f"{rough} miss much of their flight (error above {ROUGH:g} noise variances): not to be used.")
+        what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
+        details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")
     details += [
         f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
         f"in {d['days']:.3g} days."

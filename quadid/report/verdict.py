@@ -177,8 +177,8 @@ def at_bounds(result: JsonDict) -> list[str]:
 
 def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
     out = []
-    if not ratio <= ROUGH:
-        # First things first: with the wrong model a parameter seems hidden, or runs into a bound.
+    rough = not ratio <= ROUGH
+    if rough:
         out.append(_DIAGNOSE)
     if _lacking(result["sets"]):
         out.append(f"To prove it, give another flight of {LEAST_SECONDS:g} s or more with --validate.")
@@ -187,10 +187,12 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
             f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(stuck)} "
             f"rest{'s' * (len(stuck) == 1)} on a bound."
         )
-    for p in open_ones:
-        if p["status"] == "prior_dominated" and p["name"] not in stuck:
+    # With the wrong model a parameter seems hidden that the flight shows well: more flying is no cure.
+    hidden = [] if rough else [p for p in open_ones if p["name"] not in stuck]
+    for p in hidden:
+        if p["status"] == "prior_dominated":
             out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} does not show in these data.")
-    if any(p["name"] not in stuck for p in open_ones):
+    if hidden:
         out.append("`quadid excite` proposes a manoeuvre and says what it would gain.")
     if ratio > NOISE_LEVEL:
         out.append(_DIAGNOSE)
@@ -210,7 +212,9 @@ def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
         return f"{percent(_number(parameter['prior_share']))} of what is known comes from the vehicle file's sigma."
     if status == "prior_dominated":
         needs = MOTION.get(name)
-        return "Not observable in these data; the value is the guess." + (f" It needs {needs}." if needs else "")
+        return "With this model the data do not show it; the value is the guess." + (
+            f" It needs {needs}." if needs else ""
+        )
     if status == "unreliable":
         return "Not to be used: the model misses this flight, or parts of it give different values."
     if status == "ratio_only":

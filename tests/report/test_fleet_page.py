@@ -118,7 +118,7 @@ def test_a_fleet_of_bad_fits_is_not_green() -> None:
         log["mse_fitted"] = 50.0
     verdict = fleet_verdict(summarise(logs, parameters, []))
     assert verdict.level == "poor"
-    assert "3 miss much of their flight" in verdict.details[0]
+    assert "3 answers miss much of their flights" in verdict.details[0]
 
 
 def test_flights_are_counted_where_dates_are_those_of_copies() -> None:

@@ -46,6 +46,14 @@ def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
     assert any("yaw turns" in step for step in verdict.next_steps)
 
 
+def test_with_the_wrong_model_more_flying_is_no_cure() -> None:
+    result = _result(fitted=320.0)
+    result["parameters"][5]["status"] = "prior_dominated"
+    steps = identify_verdict(result).next_steps
+    assert "quadid diagnose" in steps[0]
+    assert not [s for s in steps if "Fly" in s or "excite" in s]
+
+
 def test_no_validation_asks_for_one() -> None:
     verdict = identify_verdict(_result(role="train"))
     assert "--validate" in verdict.next_steps[0]
