@@ -47,8 +47,8 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
     described = vehicle.command.kind != "rotor_speed"
     if channel is None:
         raise LogError(
-            "; ".join((f"{recording.name}: no rotor speeds and no motor commands", *notes)), "either of them",
-            _HOW_TO_GET_MOTORS,
+            "; ".join((f"{recording.name}: no rotor speeds and no motor commands", *notes, *recording.warnings)),
+            "either of them", _HOW_TO_GET_MOTORS,
         )  # fmt: skip
     source = channel.source or channel.name
     if channel.name == "rotor_speed":

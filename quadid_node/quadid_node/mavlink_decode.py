@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from quadid_replay.boot_clock import BootClock
-from quadid_replay.motors import ardupilot_motor_outputs
+from quadid_replay.motors import MOTOR_FUNCTION, ardupilot_motor_outputs, unheld
 from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
 
 from quadid.window import Sample
@@ -19,8 +18,6 @@ from quadid_node.chooser import Chooser
 ARDUPILOT = 3
 REBOOT = 1.0
 """The vehicle's clock this far back [s] is one that began anew."""
-_NEEDED = re.compile(r"SERVO(?:[1-9]|[12]\d|3[0-2])_FUNCTION")
-"""Parameters that are kept; any other name would only take memory."""
 MOTOR_PREFERENCE = {
     "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
     "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
@@ -41,6 +38,7 @@ class MavlinkDecoder:
         counts: messages by name.
         parameters: those parameters of the autopilot that tell which output is which motor.
         autopilot: its MAV_AUTOPILOT.
+        problem: why its outputs are not used; empty where they are.
     """
 
     def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
@@ -48,6 +46,7 @@ class MavlinkDecoder:
         self.counts: Counter[str] = Counter()
         self.parameters: dict[str, float] = {}
         self.autopilot = 0
+        self.problem = ""
         self._rotors = rotors
         self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
@@ -65,7 +64,7 @@ class MavlinkDecoder:
         name = message.get_type()
         self.counts[name] += 1
         if name == "PARAM_VALUE":
-            if _NEEDED.fullmatch(str(message.param_id)):
+            if MOTOR_FUNCTION.fullmatch(str(message.param_id)):  # any other name would only take memory
                 self.parameters[str(message.param_id)] = float(message.param_value)
             return
         if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
@@ -97,15 +96,18 @@ class MavlinkDecoder:
         if channel in ("servo", "actuator"):
             channel, values = "motor_command", self._motors(channel, values)
         rank = RANKS.get((channel, source))
-        if rank is not None and all(math.isfinite(v) for v in values):
+        if rank is not None and values and all(math.isfinite(v) for v in values):
             yield from self._chooser.take(Sample(t, channel, values), rank)
 
     def _motors(self, signal: str, values: tuple[float, ...]) -> tuple[float, ...]:
-        """The outputs that are motors: as the autopilot's parameters say, else the first ones."""
-        order = ardupilot_motor_outputs(self.parameters) if signal == "servo" else []
-        if len(order) >= self._rotors:
-            return tuple(values[i] for i in order[: self._rotors])
-        return values[: self._rotors]
+        """The outputs that are motors: as the autopilot's parameters say, else the first ones; none where they lack."""
+        if signal != "servo":
+            return values[: self._rotors]
+        order = ardupilot_motor_outputs(self.parameters)[: self._rotors]
+        if len(order) < self._rotors:
+            order = list(range(self._rotors))
+        self.problem = unheld(order, len(values), "SERVO_OUTPUT_RAW")
+        return () if self.problem else tuple(values[i] for i in order)
 
     def _escs(self, t: float, reading: Reading, source: str) -> Iterator[Sample]:
         """Joins the messages of one round to a row at the time of the first."""

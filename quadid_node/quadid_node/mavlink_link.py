@@ -231,7 +231,7 @@ class MavlinkLink:
     def traffic(self) -> Traffic:
         """What comes over the link."""
         wire = self._wire
-        problems = [self._source.problem, wire.memory_problem]
+        problems = [self._source.problem, self._decoder.problem, wire.memory_problem]
         if not self._key and wire.signed:
             problems.append("the frames are signed, but no key is given to check them: give --key")
         if self._key and wire.refused and not self.vehicle_system and not wire.signed:

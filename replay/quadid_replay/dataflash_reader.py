@@ -19,7 +19,14 @@ from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
 from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
 from quadid_replay.frames import from_euler
-from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
+from quadid_replay.motors import (
+    RPM,
+    active_outputs,
+    ardupilot_motor_outputs,
+    changed_functions,
+    merge_instances,
+    unheld,
+)  # fmt: skip
 
 _ATTITUDE = ("Roll", "Pitch", "Yaw")
 _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
@@ -54,7 +61,9 @@ def read_dataflash(path: Path) -> Recording:
     index = index_dataflash(path)
     clock = LogClock()
     times = _recording_times(index, clock)
-    parameters = _parameters(index)
+    names, values = _parameters(index)
+    parameters = dict(zip(names, values, strict=True))
+    notes = _damage(index)
     raw = [
         *fastest_first([*_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR")), *_rates(index, times)]),
         *fastest_first(_vectors(index, times, "accel", _ACCEL, ("IMU", "ACC"))),
@@ -62,10 +71,12 @@ def read_dataflash(path: Path) -> Recording:
         *_reference(index, times),
         *_states(index, times, parameters),
         *_battery(index, times),
-        *_outputs(index, times, parameters),
+        *_outputs(index, times, parameters, notes),
         *_esc(index, times, parameters),
     ]
-    recording = assemble(_name(path), "dataflash", raw, clock, _damage(index), parameters)
+    changed = changed_functions(names, values)
+    notes += [changed] if changed else []
+    recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters)
     return replace(recording, modes=_modes(index, times))
 
 
@@ -112,10 +123,11 @@ def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatA
     return dict(zip(stamps, np.split(unsorted, ends[:-1]), strict=True))
 
 
-def _parameters(index: DataflashIndex) -> dict[str, float]:
+def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
+    """Names and values in file order; a parameter that is changed comes again."""
     if not index.has("PARM", "Name", "Value"):
-        return {}
-    return dict(zip(index.text("PARM", "Name"), index.column("PARM", "Value"), strict=True))
+        return [], []
+    return index.text("PARM", "Name"), index.column("PARM", "Value").tolist()
 
 
 def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
@@ -224,7 +236,9 @@ def _battery(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawCha
     return out
 
 
-def _outputs(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+def _outputs(
+    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+) -> list[RawChannel]:
     description = index.formats.get("RCOU")
     if description is None:
         return []
@@ -233,9 +247,10 @@ def _outputs(index: DataflashIndex, times: dict[str, FloatArray], parameters: di
     if source is None or not columns:
         return []
     pulses = _stack(index, source, columns)
-    motors = [i for i in ardupilot_motor_outputs(parameters, _frame(index)) if i < len(columns)]
-    motors = motors or active_outputs(pulses)
-    if not motors:
+    motors = ardupilot_motor_outputs(parameters, _frame(index)) or active_outputs(pulses)
+    missing = unheld(motors, len(columns), "RCOU")
+    notes += [missing] if missing else []
+    if not motors or missing:
         return []
     label = "RCOU " + " ".join(columns[i] for i in motors)
     return [RawChannel("motor_command", source.t, pulses[:, motors], label, source.refused)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,7 +13,11 @@ RPM = 2.0 * np.pi / 60.0
 """One revolution per minute [rad/s]."""
 _LOWEST_PULSE, _HIGHEST_PULSE = 700.0, 2300.0
 _FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8, "OCTAQUAD": 8, "OCTA_QUAD": 8, "DODECAHEXA": 12}
-_MOST_ROTORS, _LARGEST_WHOLE = 12, 1e9
+MOST_ROTORS = 12
+"""ArduPilot and PX4 mix no more."""
+_LARGEST_WHOLE = 1e9
+MOTOR_FUNCTION = re.compile(r"SERVO(?:[1-9]|[12]\d|3[0-2])_FUNCTION")
+"""Parameters of ArduPilot that say what an output drives."""
 _PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
 
 
@@ -27,14 +32,57 @@ def ardupilot_motor_outputs(parameters: Mapping[str, float], frame: str = "") ->
     """
     motors: dict[int, int] = {}
     for output in range(1, 33):
-        function = _whole(parameters, f"SERVO{output}_FUNCTION")
-        if 33 <= function <= 40:
-            motors[function - 33] = output - 1
-        elif 82 <= function <= 85:
-            motors[function - 82 + 8] = output - 1
+        motor = _motor_of(_whole(parameters, f"SERVO{output}_FUNCTION"))
+        if motor is not None:
+            motors[motor] = output - 1
     if motors and sorted(motors) == list(range(len(motors))):
         return [motors[i] for i in range(len(motors))]
     return list(range(_FRAMES.get(frame.split("/")[0].strip().upper(), 0)))
+
+
+def unheld(motors: Sequence[int], width: int, message: str) -> str:
+    """Says which motors stand on outputs that a message does not hold; empty where it holds all.
+
+    Args:
+        motors: their outputs, 0 is the first.
+        width: how many outputs the message holds.
+        message: its name.
+    """
+    far = [f"motor {k + 1} on output {output + 1}" for k, output in enumerate(motors) if output >= width]
+    if not far:
+        return ""
+    return (
+        f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
+        f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
+    )
+
+
+def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
+    """Says which SERVOn_FUNCTION of a motor changes within a log; empty where none does.
+
+    Args:
+        names: of all parameters in the order in which the log gives them.
+        values: theirs.
+    """
+    given: dict[str, list[int]] = {}
+    for name, value in zip(names, values, strict=True):
+        if MOTOR_FUNCTION.fullmatch(name):
+            function = _whole({name: value}, name)
+            seen = given.setdefault(name, [])
+            if function not in seen[-1:]:
+                seen.append(function)
+    changed = [
+        f"{name} ({', then '.join(map(str, seen[:4]))}{' …' if len(seen) > 4 else ''})"
+        for name, seen in given.items()
+        if len(seen) > 1 and any(_motor_of(function) is not None for function in seen)
+    ]
+    if not changed:
+        return ""
+    more = f" and {len(changed) - 4} more" if len(changed) > 4 else ""
+    return (
+        f"the motor order changes within the log: {', '.join(changed[:4])}{more}; outputs are taken as the last values "
+        "say, so those from before the change are of other motors"
+    )
 
 
 def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
@@ -57,7 +105,14 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
     count = _whole(parameters, "CA_ROTOR_COUNT")
-    return count if 0 < count <= _MOST_ROTORS else _PX4_TYPES.get(_whole(parameters, "MAV_TYPE"), 0)
+    return count if 0 < count <= MOST_ROTORS else _PX4_TYPES.get(_whole(parameters, "MAV_TYPE"), 0)
+
+
+def _motor_of(function: int) -> int | None:
+    """The motor, 0 for the first, that a SERVOn_FUNCTION stands for."""
+    if 33 <= function <= 40:
+        return function - 33
+    return function - 82 + 8 if 82 <= function <= 85 else None
 
 
 def _whole(parameters: Mapping[str, float], name: str) -> int:

@@ -15,7 +15,7 @@ from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.mavlink_decode import decode, intact
 from quadid_replay.mavlink_frames import Frames, read_frames
-from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count
+from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count, unheld
 from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES
 from quadid_replay.tlog_vehicle import Told, VehicleLog, vehicle_log
 
@@ -121,6 +121,7 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
         notes.append(f"the vehicle calls itself MAV_TYPE {vehicle.kind}, no multirotor: its outputs are not used")
         return []
     rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or _ROTORCRAFT.get(vehicle.kind, 0)
+    notes += [vehicle.changed] if vehicle.changed else []
     raw: list[RawChannel] = []
     for (signal, source), (t, values, refused) in vehicle.signals.items():
         if signal == "esc":
@@ -130,7 +131,9 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
         elif signal == "servo":
             motors = ardupilot_motor_outputs(vehicle.parameters) or list(range(rotors)) or active_outputs(values)
             label = f"{source} {' '.join(str(i + 1) for i in motors)}"
-            if motors:
+            missing = unheld(motors, values.shape[1], source)
+            notes += [missing] if missing else []
+            if motors and not missing:
                 raw.append(RawChannel("motor_command", t, values[:, motors], label, refused))
         elif signal == "actuator" and rotors:
             raw.append(RawChannel("motor_command", t, values[:, :rotors], f"{source} (normalized)", refused))

@@ -11,6 +11,7 @@ import numpy as np
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid_replay.clocks import LogClock
 from quadid_replay.mavlink_decode import Messages
+from quadid_replay.motors import MOST_ROTORS, changed_functions
 from quadid_replay.tlog_messages import READERS, Reading, boot_seconds, unix_seconds
 from quadid_replay.tlog_times import Stamps, place
 
@@ -45,8 +46,9 @@ class VehicleLog:
         clock: of the log.
         signals: by channel and message.
         parameters: of the autopilot, by name.
+        changed: which of them that name a motor change within the log; empty for none.
         kind: its MAV_TYPE; 0 for unknown.
-        rotors: as ESC_INFO says; 0 for unknown.
+        rotors: as ESC_INFO says; 0 for unknown, and for more than a vehicle has.
         heard: whether a measurement has its time before the log ends.
         backwards: how often the boot time fell.
     """
@@ -54,6 +56,7 @@ class VehicleLog:
     clock: LogClock
     signals: Mapping[tuple[str, str], Signal]
     parameters: Mapping[str, float]
+    changed: str
     kind: int
     rotors: int
     heard: bool
@@ -89,17 +92,19 @@ def vehicle_log(told: Mapping[str, Told], received: FloatArray) -> VehicleLog:
     clock = LogClock()
     batches = [b for b in (_batch(name, told, received) for name in READERS if name in told) if len(b.which)]
     signals, heard, backwards = _signals(batches, clock) if batches else ({}, False, 0)
+    names, values = _parameters(told)
+    rotors = 0 if escs is None else int(escs.messages.count.max())
     return VehicleLog(
-        clock, signals, _parameters(told), 0 if beats is None else int(beats.messages.type[-1]),
-        0 if escs is None else int(escs.messages.count.max()), heard, backwards,
+        clock, signals, dict(zip(names, values, strict=True)), changed_functions(names, values),
+        0 if beats is None else int(beats.messages.type[-1]), rotors if rotors <= MOST_ROTORS else 0, heard, backwards,
     )  # fmt: skip
 
 
-def _parameters(told: Mapping[str, Told]) -> dict[str, float]:
+def _parameters(told: Mapping[str, Told]) -> tuple[list[str], list[float]]:
     if "PARAM_VALUE" not in told:
-        return {}
+        return [], []
     m = told["PARAM_VALUE"].messages
-    return dict(zip(m.param_id, m.param_value.tolist(), strict=True))
+    return list(m.param_id), m.param_value.tolist()
 
 
 def _batch(name: str, told: Mapping[str, Told], received: FloatArray) -> _Batch:

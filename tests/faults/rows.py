@@ -106,7 +106,8 @@ FAULTS: dict[int, Fault] = {
     ),
     30: Fault("fit process that hangs while it warms up", "given up after the promised time, and begun anew"),
     31: Fault(
-        "two vehicles on one system id, an FMT defined anew, a shuffled MCAP, `1_0` and a wild first stamp in a CSV",
+        "two vehicles on one system id, an FMT defined anew, a motor on an output that is not logged, a motor order "
+        "that changes, a shuffled MCAP, `1_0` and a wild first stamp in a CSV",
         "refused, or read as it is meant; said",
     ),
     32: Fault(

@@ -8,7 +8,9 @@ import time
 import tracemalloc
 import warnings
 import zlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -20,13 +22,15 @@ from quadid_replay.motors import ardupilot_motor_outputs, px4_motor_outputs, px4
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
+from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, IndexArray
+from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.fuzz import campaign, rosbag2_format
 from tests.fuzz.seeds import mcap_of
-from tests.replay.test_dataflash import Dataflash
+from tests.replay.test_dataflash import Dataflash, add_flight, flight
 from tests.replay.test_mcap import header
-from tests.replay.test_tlog import MAV, Tlog, heartbeat
+from tests.replay.test_tlog import MAV, Tlog, heartbeat, raw_imu, servo
 from tests.replay.test_ulog import Ulog
 from tests.replay.test_usd import Usd, controller_log
 
@@ -218,3 +222,68 @@ def test_a_database_whose_rows_claim_more_than_memory_is_damaged(tmp_path: Path,
     with pytest.raises(LogError, match="damaged SQLite database") as told:
         open_log(opened(tmp_path, campaign.input_of("rosbag2", 229_688)))
     happened(1, f"rosbag2 whose pages claim sizes that cannot be: '{str(told.value)[:80]}'")
+
+
+def test_a_motor_beyond_the_outputs_of_a_telemetry_log_is_named(tmp_path: Path, happened: Happened) -> None:
+    log = Tlog()
+    log.add(0.0, heartbeat())
+    for motor, output in enumerate((1, 2, 3, 17)):
+        log.add(0.0, function(output, 33 + motor))
+    for k in range(50):
+        log.add(0.02 * k, raw_imu(10.0 + 0.02 * k))
+        log.add(0.02 * k, servo(10.0 + 0.02 * k))
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    assert set(recording.channels) == {"gyro", "accel"}
+    (said,) = (w for w in recording.warnings if "motor 4 on output 17" in w)
+    assert "SERVO_OUTPUT_RAW holds outputs 1 to 16" in said
+    happened(31, f"telemetry log with a motor on output 17: '{said[:90]}'")
+
+
+def test_a_motor_beyond_the_outputs_of_a_dataflash_log_is_named(tmp_path: Path) -> None:
+    """Before, the other three were taken for all motors."""
+    recording = open_log(opened(tmp_path, bytes(flight(motors=(0, 1, 2, 16)).data)))
+    assert "motor_command" not in recording.channels
+    assert any("motor 4 on output 17" in w and "RCOU holds outputs 1 to 6" in w for w in recording.warnings)
+    without = replace(recording, channels={n: c for n, c in recording.channels.items() if n != "rotor_speed"})
+    with pytest.raises(LogError, match="no motor commands.*motor 4 on output 17"):
+        rotor_signal(without, Vehicle.shipped("pelican"))
+
+
+def test_more_escs_than_a_vehicle_has_do_not_say_how_many_motors_there_are(tmp_path: Path) -> None:
+    log = Tlog()
+    log.add(0.0, heartbeat())
+    log.add(0.0, MAV.MAVLink_esc_info_message(0, 0, 0, 255, 0, 0, [0] * 4, [0] * 4, [0] * 4))
+    for k in range(50):
+        log.add(0.02 * k, servo(10.0 + 0.02 * k))
+    assert open_log(opened(tmp_path, bytes(log.data))).channels["motor_command"].values.shape == (50, 4)
+
+
+@pytest.mark.parametrize("kind", ["tlog", "dataflash"])
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_motor_order_that_changes_within_a_log_is_said(
+    tmp_path: Path, kind: str, changed: bool, happened: Happened
+) -> None:
+    again = (34, 33) if changed else (33, 34)
+    if kind == "dataflash":
+        log = flight(motors=(0, 1, 2, 3))
+        for output, value in enumerate(again, 1):
+            log.add("PARM", 0, f"SERVO{output}_FUNCTION".encode(), float(value))
+        add_flight(log, 1.0, 14.0)
+        data = bytes(log.data)
+    else:
+        heard = Tlog()
+        heard.add(0.0, heartbeat())
+        for k, value in enumerate((33, 34, *again)):
+            heard.add(0.02 * k, servo(10.0 + 0.02 * k))
+            heard.add(0.02 * k, function(1 + k % 2, value))
+        data = bytes(heard.data)
+    said = [w for w in open_log(opened(tmp_path, data)).warnings if "motor order" in w]
+    assert len(said) == changed
+    if said:
+        assert "SERVO1_FUNCTION (33, then 34), SERVO2_FUNCTION (34, then 33)" in said[0]
+        happened(31, f"{kind} in which two motors change their outputs: '{said[0][:100]}'")
+
+
+def function(output: int, value: int) -> Any:
+    """What an ArduPilot says that an output drives."""
+    return MAV.MAVLink_param_value_message(f"SERVO{output}_FUNCTION".encode(), float(value), 9, 900, output)

@@ -400,6 +400,26 @@ def test_servo_outputs_follow_the_autopilots_motor_functions_and_unwrap() -> Non
     assert motors[0].t == pytest.approx(boot + 0.005)
 
 
+def test_a_motor_beyond_the_outputs_that_come_is_said_and_ends_nothing(
+    link: MavlinkLink, port: int, happened: Happened
+) -> None:
+    """One parameter with the value of a motor on output 17 was an IndexError in the service."""
+    vehicle = Sender(port)
+    vehicle.heartbeat()
+    samples(link, 0.1)
+    for motor, output in enumerate((1, 2, 3, 17)):
+        name = f"SERVO{output}_FUNCTION".encode()
+        vehicle.send(dialect.MAVLink_param_value_message(name, 33.0 + motor, 9, 900, output))
+    for k in range(20):
+        vehicle.imu(10.0 + 0.01 * k)
+        vehicle.send(dialect.MAVLink_servo_output_raw_message(10_000_000 + 10_000 * k, 0, *[1500] * 16))
+    got = samples(link, 0.3)
+    assert {s.channel for s in got} == {"gyro", "accel"}
+    (said,) = link.traffic().problems
+    assert "motor 4 on output 17" in said
+    happened(15, f"the vehicle says that a motor is on output 17 of 16: '{said[:60]}', all else is heard")
+
+
 def decoded(message: Any) -> Any:
     mav = dialect.MAVLink(None, 1, 1)
     return mav.decode(bytearray(message.pack(mav)))
