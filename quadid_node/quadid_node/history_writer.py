@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from quadid_node.store_file import begin_anew, connect, is_damage
 
 MOST_WAITING = 5000
-"""Rows kept while the disk cannot take them; beyond, the oldest are lost, and that is said."""
+"""Rows kept while the disk cannot take them; beyond, the oldest that pass are lost, and that is said."""
 PRUNE_EVERY = 1000
 AGAIN = 1.0
 """Time after which rows that could not be written are tried again [s]."""
@@ -25,11 +25,17 @@ _UNFIT = (OverflowError, UnicodeError, sqlite3.ProgrammingError, sqlite3.Interfa
 
 
 class Row(NamedTuple):
-    """A statement with its values; `number` is that of the set which may be published once the row is on the disk."""
+    """A statement with its values.
+
+    Attributes:
+        number: of the set which may be published once the row is on the disk; 0 for none.
+        passes: the row may be lost where there are too many; others tell what is in force and what people decided.
+    """
 
     statement: str
     values: tuple[Any, ...]
     number: int = 0
+    passes: bool = False
 
 
 class HistoryWriter:
@@ -40,20 +46,21 @@ class HistoryWriter:
     """
 
     def __init__(
-        self, path: Path, kept: Mapping[str, int], last: Callable[[], Row | None], notes: list[str],
+        self, path: Path, kept: Mapping[str, int], standing: Callable[[], list[Row]], notes: list[str],
     ) -> None:  # fmt: skip
         """Begins to write.
 
         Args:
             path: database with its tables made.
             kept: rows that stay, by table.
-            last: the row of the set in force, with which a new file begins.
+            standing: the rows with which a new file begins.
             notes: gets what people should know of what is past: a damaged file set aside, a row that was no row.
         """
-        self._path, self._kept, self._last_row, self._notes = path, kept, last, notes
+        self._path, self._kept, self._standing, self._notes = path, kept, standing, notes
         self.problem = ""
         self._rows: list[Row] = []
         self._written: set[int] = set()
+        self._lost: set[int] = set()
         self._changed = threading.Condition()
         self._closing = False
         self._since_pruned = 0
@@ -65,13 +72,18 @@ class HistoryWriter:
         with self._changed:
             self._rows.append(row)
             if len(self._rows) > MOST_WAITING:
-                del self._rows[0]
+                at = next((k for k, waiting in enumerate(self._rows) if waiting.passes), 0)
+                self._lost.add(self._rows.pop(at).number)
                 self.problem = f"{self._path}: the disk takes nothing, entries are lost"
             self._changed.notify_all()
 
     def is_written(self, number: int) -> bool:
         """Whether the row of that set is on the disk."""
         return number in self._written
+
+    def is_lost(self, number: int) -> bool:
+        """Whether the row of that set will never be on the disk."""
+        return number in self._lost
 
     def flush(self, seconds: float) -> bool:
         """Waits until everything is on the disk; False when it is not after so long [s]."""
@@ -114,6 +126,7 @@ class HistoryWriter:
             self._rows = [row for row in self._rows if id(row) not in done]
             refused = {id(row) for row, _ in unfit}
             self._written |= {row.number for row in batch if row.number and id(row) not in refused}
+            self._lost |= {row.number for row, _ in unfit}
             self._notes += [f"an entry that no history can hold was left out ({why})" for _, why in unfit]
             self.problem = ""
             self._changed.notify_all()
@@ -135,14 +148,13 @@ class HistoryWriter:
         return unfit
 
     def _replace(self, error: sqlite3.Error) -> None:
-        """After damage while running: a new file that begins with the set in force."""
+        """After damage while running: a new file that begins with what stands."""
         try:
             note = begin_anew(self._path, error)
         except (sqlite3.Error, OSError) as failure:
             self.problem = f"{self._path} cannot be written ({failure}): kept in memory until it can"
             return
         self._notes += [note] if note else []
-        last = self._last_row()
+        standing = self._standing()
         with self._changed:
-            if last is not None and last not in self._rows:
-                self._rows.insert(0, last)
+            self._rows[:0] = [row for row in standing if row not in self._rows]

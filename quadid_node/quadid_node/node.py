@@ -278,11 +278,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
         speaker.publish("diagnostics", report)
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:
-        if self._service is not None:
-            for change in changes:
-                problem = check_change(change.name, change.value)
-                if problem:
-                    return SetParametersResult(successful=False, reason=problem)
-                if change.name == "approval":
-                    self._service.decide_approval(change.value)
-        return SetParametersResult(successful=True)
+        if self._service is None:
+            return SetParametersResult(successful=True)
+        problem = next(filter(None, (check_change(change.name, change.value) for change in changes)), "")
+        decided = [change.value for change in changes if change.name == "approval" and not problem]
+        said = "; ".join(self._service.decide_approval(value).text for value in decided)
+        return SetParametersResult(successful=not problem, reason=problem or said)

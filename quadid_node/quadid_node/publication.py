@@ -20,6 +20,9 @@ class Disk(Protocol):
     def written(self, number: int) -> bool:
         """Whether the set of that number is on the disk."""
 
+    def lost(self, number: int) -> bool:
+        """Whether it will never be there."""
+
 
 class Publication:
     """Hands outputs out, in order, once they may be published.
@@ -64,11 +67,13 @@ class Publication:
             self._waiting.remove(next(o for o in self._waiting if not any(o is newest for newest in ours[-1:])))
 
     def _released(self) -> list[Output]:
-        """What waits up to the first set that is not on the disk."""
-        out: list[Output] = []
-        while self._waiting and (self._disk is None or self._on_disk(self._waiting[0])):
-            out.append(self._waiting.pop(0))
+        """What waits up to the first set that is not on the disk yet; one that never will be holds up no other."""
+        disk, out = self._disk, list[Output]()
+        while disk is not None and self._waiting:
+            output = self._waiting[0]
+            if not isinstance(output, Publish) or disk.written(output.item.sequence):
+                out.append(output)
+            elif not disk.lost(output.item.sequence):
+                break
+            del self._waiting[0]
         return out
-
-    def _on_disk(self, output: Output) -> bool:
-        return not isinstance(output, Publish) or (self._disk is not None and self._disk.written(output.item.sequence))

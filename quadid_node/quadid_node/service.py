@@ -196,14 +196,14 @@ class Service:
         return [*outputs, *self._history_trouble()]
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:
-        """Gives everything to the history; returns what may be published now."""
-        for output in outputs:
-            self._journal(output)
+        """Gives everything to the history, decisions before what follows from them; returns what may be published."""
         approval = self.session.active_set.approval
         if approval != self._approval:
             self._approval = approval
             if self._store is not None:
                 self._store.decision(self._configured, approval)
+        for output in outputs:
+            self._journal(output)
         decided, self._decided = self._decided, []
         return [*decided, *self._publication.take(outputs)]
 

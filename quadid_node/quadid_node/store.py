@@ -13,6 +13,7 @@ import json
 import os
 import sqlite3
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,7 +96,8 @@ class Store:
         self._problem = ""
         self._lock: IO[str] | None = None
         self._writer: HistoryWriter | None = None
-        self._last: Row | None = None
+        self._standing: dict[str, Row] = {}
+        self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = _take_lock(path, vehicle)
@@ -103,7 +105,8 @@ class Store:
             self._problem = f"{path} cannot be written ({error.strerror}): nothing of this run is kept or published"
         if self._lock is not None:
             self._prepare()
-            self._writer = HistoryWriter(path, kept, lambda: self._last, self.notes)
+            self._writer = HistoryWriter(path, kept, self._begins_with, self.notes)
+            self._writer.problem, self._problem = self._problem, ""
 
     @property
     def problem(self) -> str:
@@ -129,11 +132,15 @@ class Store:
             last = replace(last, outdated=told.outdated if told is not None else last.outdated)
         approved = self._set(db, gate, "approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
         first = self._set(db, gate, "state = 'accepted' ORDER BY rowid")
-        self._last = self._row(last) if last is not None else None
+        for item in (first, approved, last):
+            if item is not None:
+                self._stands(item)
         row = db.execute(
             "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1", (self.vehicle,)
         ).fetchone()
         decided = row[1] if row is not None and row[0] == gate.approval and row[1] in ("auto", "manual") else ""
+        if decided:
+            self._standing["decision"] = self._decision_row(gate.approval, decided)
         return Restored(last, first_number(int(highest or 0)), approved or first, decided, self._healthy(db))
 
     def _healthy(self, db: sqlite3.Connection) -> tuple[FlightTrim, ...]:
@@ -145,6 +152,7 @@ class Store:
         for (data,) in reversed(rows):
             try:
                 out.append(flight_from_dict(json.loads(data)))
+                self._flights.append(self._flight_row(out[-1]))
             except UNREADABLE as error:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
         return tuple(out)
@@ -167,14 +175,33 @@ class Store:
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""
-        row = self._row(item)
-        if item.state.value in ("accepted", "rolled_back"):
-            self._last = row
-        self._put(row)
+        self._put(self._stands(item))
+
+    def _stands(self, item: OnlineSet) -> Row:
+        """The row of a set, kept where a new file would have to begin with it; what `_restored` looks for."""
+        row, state = self._row(item), item.state.value
+        if state == "accepted":
+            self._standing.setdefault("first", row)
+        if state != "stale" and item.approved_by not in ("auto", ""):
+            self._standing["approved"] = row
+        if state in ("accepted", "rolled_back"):
+            self._standing["last"] = row
+        if state in ("accepted", "rolled_back", "stale"):
+            self._standing["told"] = row
+        return row
+
+    def _begins_with(self) -> list[Row]:
+        """Sets in force and what they are measured from, in the order of their numbers; decisions; healthy flights."""
+        rows = {id(row): row for row in (*self._standing.values(), *self._flights)}
+        return sorted(rows.values(), key=lambda row: row.number)
 
     def written(self, number: int) -> bool:
         """Whether the set of that number is on the disk."""
         return self._writer is not None and self._writer.is_written(number)
+
+    def lost(self, number: int) -> bool:
+        """Whether it will never be there: no history can hold it."""
+        return self._writer is not None and self._writer.is_lost(number)
 
     def _row(self, item: OnlineSet) -> Row:
         values = (self.vehicle, item.sequence, item.state.value, item.reason, item.approved_by, item.stop, time.time())
@@ -186,7 +213,7 @@ class Store:
         row = (self.vehicle, item.state.value, item.check, item.reason, item.stop, time.time())
         data = json.dumps(set_to_dict(item, covariance=False))
         names = "vehicle, state, gate, reason, stop, wall, data"
-        self._put(Row(f"INSERT INTO candidates ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, data)))
+        self._put(Row(f"INSERT INTO candidates ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, data), passes=True))
 
     def event(self, item: Event) -> None:
         """Journals an event."""
@@ -201,14 +228,21 @@ class Store:
 
     def healthy_flight(self, flight: FlightTrim) -> None:
         """Journals a flight that later ones are compared with."""
+        self._flights.append(self._flight_row(flight))
+        self._put(self._flights[-1])
+
+    def _flight_row(self, flight: FlightTrim) -> Row:
         values = (self.vehicle, time.time(), json.dumps(flight_to_dict(flight)))
-        self._put(Row("INSERT INTO healthy_flights (vehicle, wall, data) VALUES (?, ?, ?)", values))
+        return Row("INSERT INTO healthy_flights (vehicle, wall, data) VALUES (?, ?, ?)", values)
 
     def decision(self, configured: str, approval: str) -> None:
         """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""
-        names = "vehicle, configured, approval, wall"
+        self._standing["decision"] = self._decision_row(configured, approval)
+        self._put(self._standing["decision"])
+
+    def _decision_row(self, configured: str, approval: str) -> Row:
         values = (self.vehicle, configured, approval, time.time())
-        self._put(Row(f"INSERT INTO decisions ({names}) VALUES (?, ?, ?, ?)", values))
+        return Row("INSERT INTO decisions (vehicle, configured, approval, wall) VALUES (?, ?, ?, ?)", values)
 
     def flush(self, seconds: float) -> bool:
         """Waits until everything is on the disk; False when it is not after so long [s]."""
@@ -227,7 +261,7 @@ class Store:
     def _event(self, level: str, kind: str, text: str, t: float, data: str | None) -> None:
         names = "vehicle, level, kind, text, t, wall, data"
         row = (self.vehicle, level, kind, text, t, time.time(), data)
-        self._put(Row(f"INSERT INTO events ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", row))
+        self._put(Row(f"INSERT INTO events ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", row, passes=True))
 
     def _put(self, row: Row) -> None:
         if self._writer is not None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from quadid_node.history_writer import Row
 from quadid_node.publication import MOST_WAITING, Output, Publication
 from quadid_node.service import Service
 from quadid_node.store import LARGEST_NUMBER, Restored, Store
@@ -233,6 +234,78 @@ def test_a_decision_of_a_person_outlives_the_service(tmp_path: Path, happened: H
     happened(24, "rollback, approval and mode each on the disk before the answer, and there after a restart")
 
 
+def test_a_rollback_is_never_on_the_disk_without_the_mode_that_it_sets(tmp_path: Path, happened: Happened) -> None:
+    """Two commits could part them: the set taken back was published, and a restart then learned it again by itself."""
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    service = service_with(store)
+    accept(service)
+    accept(service, b=2.4e-5)
+    put, rows = store._put, list[Row]()
+
+    def noted(row: Row) -> None:
+        rows.append(row)
+        put(row)
+
+    store._put = noted  # type: ignore[method-assign]
+    assert service.roll_back("bob").done
+    service.close()
+    kinds = [row.statement.split()[2] for row in rows]
+    assert {"decisions", "sets"} <= set(kinds)
+    seen = set[tuple[bool, str]]()
+    for cut in range(len(rows)):  # the kill leaves the first rows
+        with connect(path) as db:
+            for table in ("sets", "decisions"):
+                db.execute(f"DELETE FROM {table}")
+            for row in rows[: cut + 1]:
+                db.execute(row.statement, row.values)
+        again = Store(path, "pelican")
+        restored = again.restore()
+        again.close()
+        seen.add((restored.item is not None and restored.item.state is SetState.ROLLED_BACK, restored.approval))
+    assert (True, "manual") in seen
+    assert (True, "") not in seen
+    happened(24, f"killed between any two of the {len(rows)} rows of a rollback: never the set without the mode")
+
+
+def test_a_row_that_never_reaches_the_disk_holds_up_no_later_set(tmp_path: Path, happened: Happened) -> None:
+    service = service_with(Store(tmp_path / "h.sqlite", "pelican"))
+    odd = replace(online_set(TRUE), reason="odd \udcff bytes")
+    service.session._outbox.act(*service.session.active_set.accept(odd, "auto", 1.0, 1.0))
+    after = accept(service)
+    outputs = list(said(service, 1.5))
+    assert [o.item.sequence for o in outputs if isinstance(o, Publish)] == [after.sequence]
+    assert any(isinstance(o, Event) and "no history can hold" in o.text for o in outputs)
+    service.close()
+    happened(23, "a set whose reason no history can hold: not published, said; the next one is")
+
+
+def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_decisions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    import quadid_node.history_writer as writing
+
+    def full(path: Path, read_only: bool = False) -> sqlite3.Connection:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    store = Store(tmp_path / "h.sqlite", "pelican")
+    service = service_with(store)
+    monkeypatch.setattr(writing, "connect", full)
+    first = accept(service)
+    service.step()
+    assert "NOT on the disk" in service.decide_approval("manual").text
+    many = writing.MOST_WAITING + 10
+    for _ in range(many):
+        store.candidate(replace(online_set(TRUE, SetState.REJECTED), sequence=0))
+    monkeypatch.setattr(writing, "connect", connect)
+    assert published(service, first.sequence), "it was forgotten, and everything after it waited for good"
+    service.close()
+    again = Store(tmp_path / "h.sqlite", "pelican")
+    assert again.restore().approval == "manual"
+    again.close()
+    happened(23, f"{many} candidates while the disk is full: the set and the decision before them are kept")
+
+
 def os_kill_like_end(service: Service) -> None:
     """Ends a service without what an orderly end writes: only the lock is let go, as the kernel does."""
     store = service._store
@@ -321,6 +394,9 @@ def test_a_history_held_at_the_start_is_refused(
 def test_outputs_that_need_no_row_wait_for_nothing() -> None:
     class Never:
         def written(self, number: int) -> bool:
+            return False
+
+        def lost(self, number: int) -> bool:
             return False
 
     publication = Publication(Never())

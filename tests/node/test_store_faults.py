@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from quadid_node.codec import set_to_dict
 from quadid_node.publication import Output
@@ -21,9 +22,11 @@ from quadid_node.store import Store
 from quadid_node.store_file import StoreError, read_history
 from quadid_node.worker import InlineWorker
 
+from quadid.health.trims import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.records import Event, OnlineSet
 from quadid.vehicle import Vehicle
+from quadid_node import store as store_module
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 from tests.online.test_gate import TRUE, online_set
@@ -171,6 +174,65 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
     assert (restored.item.sequence, restored.item.state) == (40, SetState.ACCEPTED)
     what = "new file" if damage == "removed" else "set aside whole, said"
     happened(12, f"history damaged in service ({damage}): {what}; the new one begins with the set in force")
+
+
+TRIM = FlightTrim("log1", np.full(4, 0.1), np.full((2, 4), 0.1), np.full(4, 0.25), np.full(4, 0.01), 30.0, "made up")
+
+
+def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Path, happened: Happened) -> None:
+    """A new file began with the set in force alone: approval was automatic again, creeping counted from that set."""
+    path = tmp_path / "h.sqlite"
+    store = Store(path, "pelican")
+    service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
+    store.numbered(replace(online_set(TRUE), sequence=1000, approved_by="ann"))
+    store.healthy_flight(TRIM)
+    assert service.decide_approval("manual").done
+    service.close()
+
+    store = Store(path, "pelican")
+    service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
+    stale = service.session.active_set.in_force
+    assert stale is not None
+    confirmed = replace(stale, state=SetState.ACCEPTED, approved_by="auto", sequence=stale.sequence + 1)
+    withdrawn = replace(confirmed, sequence=stale.sequence + 2, outdated="thrust stepped")
+    store.numbered(confirmed)
+    store.numbered(withdrawn)
+    assert store.flush(10.0)
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    path.write_bytes(b"no history" * 1000)
+    store.event(Event(1.0, "info", "test", "after"))
+    assert store.flush(60.0)
+    service.close()
+    assert any("set aside" in note for note in store.notes)
+
+    store = Store(path, "pelican")
+    restored = store.restore()
+    store.close()
+    assert restored.approval == "manual"
+    assert restored.baseline is not None
+    assert (restored.baseline.sequence, restored.baseline.approved_by) == (1000, "ann")
+    assert restored.item is not None
+    assert (restored.item.sequence, restored.item.outdated) == (withdrawn.sequence, "thrust stepped")
+    assert [flight.name for flight in restored.healthy] == [TRIM.name]
+    happened(24, "history damaged in service: mode, approved set, withdrawal and healthy flights are in the new one")
+
+
+def test_a_history_that_could_not_be_made_at_first_is_told_to_be_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store_module, "make_tables", full)
+        store = Store(tmp_path / "h.sqlite", "pelican")
+    service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
+    assert any(isinstance(o, Event) and "full" in o.text for o in service.step())
+    store.numbered(in_force(7))
+    assert store.flush(10.0)
+    assert any(isinstance(o, Event) and "written again" in o.text for o in service.step())
+    service.close()
 
 
 def _events(path: Path) -> list[object]:
