@@ -18,7 +18,9 @@ from quadid_replay.mcap_messages import MessageType
 
 Places = tuple[str, list[tuple[int, int]]]
 """A signal, and where each of its numbers stands: run and place in it."""
-UNDECODABLE = (McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError)
+UNDECODABLE = (
+    McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
+)  # fmt: skip
 """What the library and the types' functions raise on damaged data."""
 
 

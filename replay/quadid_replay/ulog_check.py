@@ -12,6 +12,7 @@ import struct
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
@@ -25,10 +26,21 @@ _NEAR = 65536
 _CHAIN = 3
 """So many plausible records in a row are believed to be records."""
 MOST_FIELDS = 5000
-"""Most numbers one message may hold once its nested types are expanded."""
+"""Most numbers that the messages of all topics read may hold once their nested types are expanded: pyulog takes
+microseconds for each. PX4's hold some hundreds."""
+_LONGEST = 6
+"""More digits than any length of a list has."""
 _BASIC = frozenset(f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)) | {
     "float", "double", "bool", "char",
 }  # fmt: skip
+
+
+class Field(NamedTuple):
+    """A field of a message: its type, how many of it, its name."""
+
+    kind: str
+    many: int
+    name: str
 
 
 @dataclass
@@ -39,12 +51,16 @@ class UlogRecords:
         clean: header and whole records of definitions, parameters, and data of the wanted topics.
         skipped: bytes that belong to no record.
         cut: whether the file ends inside a record.
+        described_anew: a message that the file describes twice, differently; what follows is not read. Empty for none.
     """
 
     clean: BytesIO
     skipped: int = 0
     cut: bool = False
-    formats: dict[str, list[tuple[str, int]]] = field(default_factory=dict)
+    described_anew: str = ""
+    formats: dict[str, list[Field]] = field(default_factory=dict)
+    topics: dict[tuple[str, int], str] = field(default_factory=dict)
+    """Message by topic without its version and instance."""
     wanted: set[int] = field(default_factory=set)
     lengths: dict[int, int] = field(default_factory=dict)
     boundaries: list[int] = field(default_factory=list)
@@ -56,7 +72,7 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
     """Walks through all records and keeps those that matter for `topics`.
 
     Raises:
-        LogError: a format that expands beyond `MOST_FIELDS`, an encrypted or future log, or a file without any record.
+        LogError: messages that expand beyond `MOST_FIELDS`, an encrypted or future log, or a file without any record.
     """
     if path.stat().st_size <= _HEADER:
         raise LogError(f"{path.name}: holds a header and nothing else", "a complete ULog", "copy it again")
@@ -80,7 +96,7 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
             break
         else:
             _take(found, path.name, kind, data[offset + 3 : end], topics)
-            offset = end
+            offset = size if found.described_anew else end
     found.cut |= not found.cut and offset < size
     _check_sizes(found, path.name)
     found.clean.seek(0)
@@ -92,10 +108,17 @@ def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozens
         _note_flags(found, name, body)
         return
     if kind == ord("F"):
-        _note_format(body, found.formats)
-    elif kind == ord("A"):
-        if unversioned(body[3:].decode("utf-8", "replace")) not in topics or len(body) < 4:
+        name, fields = _format(body)
+        if found.formats.setdefault(name, fields) != fields:
+            found.described_anew = plain(name, 40)
             return
+    elif kind == ord("A"):
+        message = body[3:].decode("utf-8", "replace")
+        if unversioned(message) not in topics or len(body) < 4:
+            return
+        if (unversioned(message), body[0]) in found.topics:  # the first one of a topic's instance is read
+            return
+        found.topics[unversioned(message), body[0]] = message
         found.wanted.add(body[1] | body[2] << 8)
     elif kind == ord("D") and len(body) > 2:
         number = body[0] | body[1] << 8
@@ -146,34 +169,40 @@ def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
         found.boundaries = [b for b in struct.unpack("<3Q", body[16:40]) if b]
 
 
-def _note_format(body: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
+def _format(body: bytes) -> tuple[str, list[Field]]:
+    """Name of a message and its fields."""
     name, _, fields = body.decode("utf-8", "replace").partition(":")
     parsed = []
     for entry in fields.split(";"):
-        kind, bracket, count = entry.partition(" ")[0].partition("[")
+        kind, _, given = entry.partition(" ")
+        kind, bracket, count = kind.partition("[")
         if kind:
             digits = count.rstrip("]")
-            parsed.append((kind, int(digits) if bracket and digits.isdecimal() else 1))
-    formats[name] = parsed
+            many = int(digits[:_LONGEST]) if bracket and digits.isdecimal() else 1
+            parsed.append(Field(kind, many, given))
+    return name, parsed
 
 
 def _check_sizes(found: UlogRecords, path: str) -> None:
-    for name in found.formats:
-        if _expanded(name, found.formats, {}, 0) > MOST_FIELDS:
+    known: dict[str, int] = {}
+    numbers = 0
+    for message in found.topics.values():
+        numbers += _expanded(message, found.formats, known, 0)
+        if numbers > MOST_FIELDS:
             raise LogError(
-                f"{path}: message '{plain(name, 40)}' expands to more than {MOST_FIELDS} numbers",
+                f"{path}: message '{plain(message, 40)}' expands to more than {MOST_FIELDS} numbers, with those before",
                 "messages as PX4 writes them", "this file is damaged or was made to harm: do not trust it",
             )  # fmt: skip
 
 
-def _expanded(name: str, formats: dict[str, list[tuple[str, int]]], known: dict[str, int], depth: int) -> int:
+def _expanded(name: str, formats: dict[str, list[Field]], known: dict[str, int], depth: int) -> int:
     """Counts the numbers of a message; a type that holds itself counts as endless."""
     if depth > 32:
         return MOST_FIELDS + 1
     if name not in known:
         known[name] = MOST_FIELDS + 1  # while being counted: met again means it holds itself
         total = 0
-        for kind, count in formats.get(name, []):
+        for kind, count, _ in formats.get(name, []):
             total += count if kind in _BASIC else count * _expanded(kind, formats, known, depth + 1)
         known[name] = total
     return known[name]

@@ -32,6 +32,7 @@ from tests.replay.test_dataflash import Dataflash, add_flight, flight
 from tests.replay.test_mcap import header
 from tests.replay.test_tlog import MAV, Tlog, heartbeat, raw_imu, servo
 from tests.replay.test_ulog import Ulog
+from tests.replay.test_ulog import flight as ulog_flight
 from tests.replay.test_usd import Usd, controller_log
 
 
@@ -282,6 +283,75 @@ def test_a_motor_order_that_changes_within_a_log_is_said(
     if said:
         assert "SERVO1_FUNCTION (33, then 34), SERVO2_FUNCTION (34, then 33)" in said[0]
         happened(31, f"{kind} in which two motors change their outputs: '{said[0][:100]}'")
+
+
+def test_a_ulog_message_described_anew_with_millions_of_numbers_ends_what_is_read(
+    tmp_path: Path, happened: Happened
+) -> None:
+    """Fuzzing: the last description was counted, and the library took the first, of two million numbers."""
+    log = ulog_flight()
+    log.format("esc_report", "uint64_t timestamp;int32_t esc_rpm;")
+    for _ in range(10):
+        log.add("sensor_combined", "Q3fIi3fI", 9_000_000, *[0.0] * 3, 5000, 0, *[0.0] * 3, 5000)
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    assert any("esc_report described anew" in w for w in recording.warnings)
+    assert len(recording.channels["gyro"].t) == 400
+    began = time.process_time()
+    with pytest.raises(LogError, match="expands to more than"):
+        open_log(opened(tmp_path, campaign.input_of("ulog", 946_475)))
+    seconds = time.process_time() - began
+    assert seconds < 0.25
+    happened(31, f"a ULog message described anew: read up to there, said; one of two million numbers: {seconds:.2f} s")
+
+
+def test_topics_without_end_take_no_more_than_their_numbers(tmp_path: Path, happened: Happened) -> None:
+    """66 kB took 37 s: the library expands a message for every topic that the log subscribes to."""
+    for instances in (1, 256):
+        log = Ulog()
+        log.format("vehicle_attitude", "uint64_t timestamp;float[4900] q;")
+        for k in range(3000):
+            log.record("A", struct.pack("<BH", k % instances, k) + b"vehicle_attitude")
+        path = opened(tmp_path, bytes(log.data))
+        began = time.process_time()
+        with pytest.raises(LogError, match="expands to more than|no usable flight data"):
+            open_log(path)
+        assert time.process_time() - began < campaign.allowed_seconds(path.stat().st_size)
+    happened(5, "ULog of 66 kB with 3000 topics of 4901 numbers: refused at once, it took 37 s")
+
+
+def test_a_length_of_thousands_of_digits_is_no_traceback(tmp_path: Path) -> None:
+    log = Ulog()
+    log.format("vehicle_attitude", f"uint64_t timestamp;float[{'9' * 5000}] q;")
+    log.subscribe("vehicle_attitude")
+    with pytest.raises(LogError, match="expands to more than"):
+        open_log(opened(tmp_path, bytes(log.data)))
+
+
+def test_stamps_beyond_what_a_header_holds_are_no_sample(tmp_path: Path) -> None:
+    """Fuzzing: a description whose seconds have 64 bits."""
+    recording = open_log(opened(tmp_path, campaign.input_of("mcap", 968_079)))
+    assert any("could not be decoded" in w for w in recording.warnings)
+
+
+def test_messages_without_content_are_counted_as_what_they_take(tmp_path: Path, happened: Happened) -> None:
+    """4 MB of them took 18 s and 638 MiB in the caller's process."""
+    kind = "quadid_msgs/msg/MotorCommand"
+    log = mcap_of(
+        [("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5]})], False
+    )
+    record = struct.pack("<BQ", 5, 23) + struct.pack("<HIQQ", 1, 7, 10**18, 0) + b"x"
+    content = record * ((4 << 20) // len(record))
+    packed = zstandard.compress(content)
+    chunk = struct.pack("<QQQII", 0, 2**62, len(content), zlib.crc32(content), 4) + b"zstd"
+    chunk += struct.pack("<Q", len(packed)) + packed
+    data = log + 46 * (struct.pack("<BQ", 6, len(chunk)) + chunk)
+    path = opened(tmp_path, data + struct.pack("<BQ", 0x80, 4_100_000 - len(data)) + bytes(4_100_000 - len(data)))
+    began = time.process_time()
+    with pytest.raises(LogError, match="inflate to more than 50 times"):
+        open_log(path)
+    seconds = time.process_time() - began
+    assert seconds < 10.0
+    happened(5, f"MCAP of 4 MB with six million messages of one byte: refused after {seconds:.1f} s, it took 18 s")
 
 
 def function(output: int, value: int) -> Any:
