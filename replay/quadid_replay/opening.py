@@ -48,7 +48,7 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
             )  # fmt: skip
         from quadid_replay.reading import read_in_child
 
-        return read_in_child(file, preset, columns)
+        return read_in_child(file, size, preset, columns)
     return read_here(file, preset, columns)
 
 

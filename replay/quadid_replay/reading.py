@@ -65,13 +65,14 @@ def _given(name: str, otherwise: float) -> float:
     return value
 
 
-def read_in_child(path: Path, preset: str, columns: Mapping[str, str] | None = None) -> Recording:
-    """Reads a log as `quadid_replay.open_log` does, in a child process within `limits`.
+def read_in_child(path: Path, size: int, preset: str, columns: Mapping[str, str] | None = None) -> Recording:
+    """Reads a log of `size` bytes, of a folder those of its files, as `quadid_replay.open_log` does, in a child process
+    within `limits`.
 
     Raises:
         LogError: what the reader says; or the log needs more memory or time than the limits, which the error names.
     """
-    allowed = limits(path.stat().st_size)
+    allowed = limits(size)
     request = json.dumps([str(path.absolute()), preset, dict(columns or {}), *allowed])
     command = [sys.executable, "-P", "-m", __name__, request]  # no module of the folder we stand in
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as child:

@@ -35,7 +35,7 @@ def test_columns_are_read_under_the_names_of_the_vehicle_file(tmp_path: Path) ->
     with pytest.raises(LogError):
         open_log(path)
     vehicle = Vehicle.from_yaml(with_keys(columns=NAMES).to_yaml())
-    for found in (open_log(path, columns=vehicle.columns), read_in_child(path, "auto", vehicle.columns)):
+    for found in (open_log(path, columns=vehicle.columns), read_in_child(path, 1 << 20, "auto", vehicle.columns)):
         for name, channel in expected.channels.items():
             np.testing.assert_array_equal(found.channels[name].values, channel.values)
     with pytest.raises(LogError, match=r"no column gyro_X, which `columns` names for p.*did you mean 'gyro_"):

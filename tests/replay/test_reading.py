@@ -10,7 +10,7 @@ import pytest
 import quadid_replay.opening
 import quadid_replay.reading
 from quadid_replay import open_log, write_csv, write_mcap, write_tlog
-from quadid_replay.reading import limits, read_in_child
+from quadid_replay.reading import Limits, limits, read_in_child
 
 from quadid.errors import LogError
 from tests.faults.evidence import Happened
@@ -27,7 +27,7 @@ def all_large(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_child_reads_what_is_read_here(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, full_recording(1.0, 50.0))
-    here, there = open_log(path), read_in_child(path, "auto")
+    here, there = open_log(path), read_in_child(path, path.stat().st_size, "auto")
     assert (here.name, here.sha256, here.warnings, here.breaks) == (
         there.name,
         there.sha256,
@@ -40,6 +40,25 @@ def test_a_child_reads_what_is_read_here(tmp_path: Path) -> None:
         assert not there.channels[name].values.flags.writeable
 
 
+def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limits were those of the folder's own entry, 4 kB: a recording of 500 MB had 10 s and 768 MiB."""
+    folder, allowed = tmp_path / "bag", list[int]()
+    folder.mkdir()
+    for part in range(2):
+        write_mcap(folder / f"bag_{part}.mcap", full_recording(4.0, 500.0))
+    files = ", ".join(f"bag_{part}.mcap" for part in range(2))
+    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths: [{files}]\n")
+
+    def noted(size: int) -> Limits:
+        allowed.append(size)
+        return limits(size)
+
+    monkeypatch.setattr(quadid_replay.opening, "LARGE", 0)
+    monkeypatch.setattr(quadid_replay.reading, "limits", noted)
+    assert open_log(folder).channels
+    assert allowed == [sum(file.stat().st_size for file in folder.glob("*.mcap"))]
+
+
 def test_no_code_of_the_folder_we_stand_in_is_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
@@ -47,7 +66,7 @@ def test_no_code_of_the_folder_we_stand_in_is_run(
     write_mcap(tmp_path / "a.mcap", full_recording(1.0, 50.0))
     (tmp_path / "numpy.py").write_text("open('ran', 'w').close()\nraise SystemExit\n")
     monkeypatch.chdir(tmp_path)
-    assert read_in_child(tmp_path / "a.mcap", "auto").channels
+    assert read_in_child(tmp_path / "a.mcap", 1 << 20, "auto").channels
     assert not (tmp_path / "ran").exists()
     happened(25, "a log beside a numpy.py in the folder we stand in: read, and that file is not run")
 
