@@ -24,6 +24,10 @@ _WANTED = {n: m for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS
 _ROTORCRAFT = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
 _MOST_BACKWARDS = 10
 """Boot time that falls more often: no vehicle boots that often."""
+_MOST_SENDERS = 32
+"""Of more, those with the fewest frames are not looked into: damage makes senders, and none of them is the vehicle."""
+_NAMED = 8
+"""Other vehicles that are named; more are counted."""
 _FAR = 8
 """Frame numbers that jump by no more come from a frame that is lost, late or there twice."""
 
@@ -60,7 +64,9 @@ def read_tlog(path: Path) -> Recording:
         )
     others = [key for key, v in vehicles.items() if key != who and v.signals]
     if others:
-        notes.append(f"vehicle {who[0]} used; also in the log: {', '.join(f'{s}/{c}' for s, c in others)}")
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        named = ", ".join(f"{s}/{c}" for s, c in others[:_NAMED])
+        notes.append(f"vehicle {who[0]} used; also in the log: {named}{more}")
     raw = _channels(vehicles[who], notes)
     return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
 
@@ -77,11 +83,14 @@ def _two_rows(number: IntArray) -> bool:
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
-    """What each system and component tells in the frames `which`, in the order in which they are first heard."""
+    """What each system and component tells in the frames `which`, in the order in which they are first heard; of many
+    senders those with the most frames.
+    """
     sender = frames.system[which].astype(np.int64) << 8 | frames.component[which]
-    found, first = np.unique(sender, return_index=True)
+    found, first, count = np.unique(sender, return_index=True, return_counts=True)
+    most = np.argsort(-count, kind="stable")[:_MOST_SENDERS]
     out = {}
-    for one in found[np.argsort(first)]:
+    for one in found[most][np.argsort(first[most])]:
         its = which[sender == one]
         message = frames.message[its]
         told = {}

@@ -30,7 +30,7 @@ from tests.fuzz import campaign, rosbag2_format
 from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash, add_flight, flight
 from tests.replay.test_mcap import header
-from tests.replay.test_tlog import MAV, Tlog, heartbeat, raw_imu, servo
+from tests.replay.test_tlog import MAV, Tlog, attitude, heartbeat, raw_imu, servo
 from tests.replay.test_ulog import Ulog
 from tests.replay.test_ulog import flight as ulog_flight
 from tests.replay.test_usd import Usd, controller_log
@@ -352,6 +352,29 @@ def test_messages_without_content_are_counted_as_what_they_take(tmp_path: Path, 
     seconds = time.process_time() - began
     assert seconds < 10.0
     happened(5, f"MCAP of 4 MB with six million messages of one byte: refused after {seconds:.1f} s, it took 18 s")
+
+
+def test_senders_without_end_take_no_more_than_their_bytes(tmp_path: Path, happened: Happened) -> None:
+    """2.6 MB took 20 s, and the error named 60,000 vehicles in one line."""
+    data = bytearray()
+    for k in range(20_000):
+        log = Tlog(1 + k % 255)
+        log.mav.srcComponent = k // 255
+        log.add(0.001 * k, attitude(0.001 * k))
+        data += log.data
+    path = opened(tmp_path, bytes(data))
+    began = time.process_time()
+    with pytest.raises(LogError, match="also in the log.* and 23 more") as told:
+        open_log(path)
+    seconds = time.process_time() - began
+    assert seconds < campaign.allowed_seconds(len(data))
+    assert len(str(told.value)) < 2000
+    real = Tlog(7)
+    real.add(0.0, heartbeat())
+    for k in range(50):
+        real.add(0.02 * k, attitude(10.0 + 0.02 * k))
+    assert len(open_log(opened(tmp_path, bytes(data + real.data))).channels["attitude"].t) >= 50
+    happened(5, f"telemetry log of 20,000 senders in {len(data) >> 10} kB: refused after {seconds:.1f} s, was 7 s")
 
 
 def function(output: int, value: int) -> Any:
