@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-FOUND_WITHIN = 1.0
-"""Others are found by then [s]."""
+FOUND_WITHIN = 4.0
+"""Others are found by then [s]: Fast DDS announces a participant every 3 s, and half of the starts measured found a
+service that ran already only by its next announcement (up to 2.9 s)."""
 YOUNG = 10.0
 """Two that claimed at once, within this time [s], both let go, and try again after pauses of different length."""
 PAUSES = (0.5, 4.0)

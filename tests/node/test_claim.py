@@ -5,7 +5,10 @@ from __future__ import annotations
 import random
 
 import pytest
-from quadid_node.claim import BESIDE, OBSERVES, STRANGER, YOUNG, Claim
+from quadid_node.claim import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, Claim
+
+SETTLED = FOUND_WITHIN + 2.0
+"""By then [s] a service that sees no other one speaks."""
 
 
 class Topic:
@@ -56,7 +59,7 @@ def speaking(*services: Claim) -> int:
 def test_the_second_observes_and_takes_over_when_the_first_is_gone() -> None:
     topic = Topic()
     first, second = topic.service(), topic.service()
-    topic.run(3.0, first)
+    topic.run(SETTLED, first)
     topic.run(30.0, first, second)
     assert (first.publisher is not None, second.publisher) == (True, None)
     assert (first.problem, second.problem) == ("", OBSERVES)
@@ -66,10 +69,23 @@ def test_the_second_observes_and_takes_over_when_the_first_is_gone() -> None:
     assert second.problem == ""
 
 
+def test_one_that_is_found_by_its_next_announcement_is_not_talked_over() -> None:
+    topic = Topic()
+    first = topic.service()
+    topic.run(SETTLED, first)
+    second = topic.service()
+    topic.apart = True
+    topic.run(3.0, second)  # Fast DDS announces a participant every 3 s
+    assert second.publisher is None
+    topic.apart = False
+    topic.run(30.0, first, second)
+    assert (first.publisher is not None, second.publisher) == (True, None)
+
+
 def test_one_that_is_not_active_yet_tells_and_claims_nothing() -> None:
     topic = Topic()
     first, second = topic.service(), topic.service()
-    topic.run(3.0, first)
+    topic.run(SETTLED, first)
     assert not second.step(wanted=False)
     assert second.problem == OBSERVES
     first.let_go()
@@ -84,7 +100,7 @@ def test_two_that_claimed_at_once_or_apart_end_with_one(seed: int) -> None:
     topic = Topic()
     services = topic.service(), topic.service(), topic.service()
     topic.apart = True
-    topic.run(3.0 if seed % 2 else 3.0 + 2.0 * YOUNG, *services)
+    topic.run(SETTLED if seed % 2 else SETTLED + 2.0 * YOUNG, *services)
     assert speaking(*services) == 3, "they do not see each other"
     topic.apart = False
     topic.run(60.0, *services)
@@ -95,7 +111,7 @@ def test_two_that_claimed_at_once_or_apart_end_with_one(seed: int) -> None:
 def test_to_a_stranger_a_settled_service_does_not_give_way_and_says_so() -> None:
     topic = Topic()
     service = topic.service()
-    topic.run(3.0 + YOUNG, service)
+    topic.run(SETTLED + YOUNG, service)
     forger = topic.stranger()
     topic.run(30.0, service)
     assert service.publisher is not None
@@ -108,7 +124,7 @@ def test_to_a_stranger_a_settled_service_does_not_give_way_and_says_so() -> None
 def test_one_that_gives_way_says_so_first() -> None:
     topic = Topic()
     service = topic.service()
-    topic.run(3.0 + YOUNG, service)
+    topic.run(SETTLED + YOUNG, service)
     topic.stranger("quadid")
     topic.run(1.0, service)
     assert (service.publisher is not None, service.problem) == (True, BESIDE)
