@@ -26,7 +26,7 @@ from quadid.model.rows import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, inlined, jit, lane_kernel, variant
 
 
 @nb.njit(**inlined)
@@ -39,6 +39,7 @@ def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
     """Right-hand side of `_step_of`: angular acceleration, specific force at the IMU, acceleration in NED."""
 
     @nb.njit(**inlined)
+    @variant(f"{air:d}{hub:d}{solid:d}{rare:d}")
     def body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, o1, do, g, im, lift, wa, wb, lane, s):  # type: ignore[no-untyped-def]
         b = s[C_B + lane]
         if solid:
@@ -149,6 +150,7 @@ def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
     body = _body_of(air, hub, solid, rare)
 
     @nb.njit(**jit)
+    @variant(f"{air:d}{hub:d}{solid:d}{rare:d}")
     def step(dt: float, s: FloatArray) -> None:
         lane_kernel()
         h = 0.5 * dt

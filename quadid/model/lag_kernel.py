@@ -26,7 +26,7 @@ from quadid.model.rows import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel, variant
 
 THIRD = 1.0 / 3.0
 A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
@@ -106,8 +106,10 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
     Args:
         keeps_means: writes what later passes read, the means of speed and its square (rows R_M1 to R_N2).
     """
+    which = "mean" if keeps_means else "turn"
 
     @nb.njit(**inlined)
+    @variant(which)
     def add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s):  # type: ignore[no-untyped-def]
         """Adds one rotor to `keep` times the moments of both half steps.
 
@@ -135,6 +137,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
         s[A_DO + HALF + lane] = keep * s[A_DO + HALF + lane] + spin * inv * (w1 - wm)
 
     @nb.njit(**jit)
+    @variant(which)
     def held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         """Rotor r through one step of constant input a: two pieces, the half steps."""
         lane_kernel()
@@ -148,6 +151,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
             add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
     @nb.njit(**jit)
+    @variant(which)
     def delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         """Rotor r through one step of held input that switches within the step."""
         lane_kernel()
@@ -167,6 +171,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
             add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
     @nb.njit(**jit)
+    @variant(which)
     def sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
         lane_kernel()
@@ -184,6 +189,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
             add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
     @nb.njit(**jit)
+    @variant(which)
     def linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         """Rotor r through one step of piecewise linear input that bends within the step."""
         lane_kernel()
@@ -211,6 +217,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
             add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
     @nb.njit(**inlined)
+    @variant(which)
     def uneven_piece(w0, a, slope, piece, lane, s):  # type: ignore[no-untyped-def]
         """As `_piece`, with the lag of speeding up or of slowing down by where the input lies at its start."""
         at, down, faster = piece + lane, DOWN + piece + lane, a >= w0
@@ -222,6 +229,7 @@ def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
         return _piece(w0, a, slope, tau, e, e1, e2, e3, s[P_H + at])
 
     @nb.njit(**jit)
+    @variant(which)
     def uneven(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         """Rotor r through one step of any input (rows T_) where speeding up and slowing down lag differently."""
         lane_kernel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
 from importlib import resources
 from typing import Any
 
@@ -58,6 +59,24 @@ def _sources() -> int:
 SOURCES = _sources()
 """Captured by the kernels on disk, so that it becomes part of their key: numba alone looks at the file of the function
 that is called, and would run an old version of what that function calls."""
+
+
+def variant(which: str) -> Callable[[Any], Any]:
+    """Names a function that is compiled several times, each time with other constants of the function around it.
+
+    The linker knows compiled functions by name, types of arguments, and a number counted anew in each process.  Kernels
+    on disk come from several processes: without names of their own, one kernel may be given the other's variant.
+
+    Args:
+        which: tells the variants of one function apart.
+    """
+
+    def name(function: Any) -> Any:
+        function.__name__ += f"_{which}"
+        function.__qualname__ += f"_{which}"
+        return function
+
+    return name
 
 
 def _lane_kernel(context: Any) -> Any:
