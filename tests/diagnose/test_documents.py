@@ -20,9 +20,9 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
     assert set(explained) == set(EFFECTS)
     assert len(parts) == len(EFFECTS)
     for name, part in explained.items():
-        for word in ("**What:**", "**Equation:**", "**Size:**", "**Shows:**", "**Confused with:**", "**Do:**"):
+        for word in ("**What:**", "**Equation:**", "**Size:**", "**Signature:**", "**Confused with:**", "**Advice:**"):
             assert word in part, (name, word)
-        assert "**Apart by:**" in part, name
+        assert "**Separated by:**" in part, name
         assert ("(of the flight)" in part.splitlines()[0]) == EFFECTS[name].per_log, name
 
 
