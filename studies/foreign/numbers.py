@@ -98,21 +98,21 @@ def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")
         return ""
     held = sum(n.inside for n in named)
     lines = [
-        f"Of {len(named)} numbers called identified whose truth is known {held} hold it inside 95 % "
-        f"({held / len(named):.0%}; wanted 90 %). Numbers of another status stand in `foreign.json` only.",
+        f"Of {len(named)} identified values with known truth, {held} have it inside the 95 % interval "
+        f"({held / len(named):.0%}; wanted 90 %). Other statuses: `foreign.json`.",
         "",
     ]
     for group in short:
         mine = [n for n in named if n.data.startswith(group)]
         if mine:
             lines += [f"{group}: {sum(n.inside for n in mine)} of {len(mine)} inside.", ""]
-    lines += ["| data | by | number | estimate [95 %] | truth | |", "|---|---|---|---|---|---|"]
+    lines += ["| data | parameter | estimate [95 %] | truth |", "|---|---|---|---|"]
     for n in named:
         if n.data.startswith(tuple(short)) and n.inside:
             continue
         low, high = n.truth
         truth = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        mark = "inside" if n.inside else f"**outside**, {n.value / min(max(n.value, low), high) - 1.0:+.2%}"
+        mark = "" if n.inside else f", **{n.value / min(max(n.value, low), high) - 1.0:+.2%}**"
         interval = f"{n.value:.3g} [{n.interval[0]:.3g}, {n.interval[1]:.3g}]"
-        lines.append(f"| {n.data} | {n.by} | {n.name} | {interval} | {truth} | {mark} |")
+        lines.append(f"| {n.data}, {n.by} | {n.name} | {interval} | {truth}{mark} |")
     return "\n".join(lines)

@@ -61,16 +61,16 @@ def page(rows: Mapping[str, Row], notes: str = "", others: Sequence[Number] = ()
 
 def _answers(rows: Mapping[str, Row]) -> str:
     """Verdict, error and causes of every set."""
-    lines = ["| data | measured | verdict | error on data not fitted [noise variances] | causes (not confident in "
-             "brackets) |", "|---|---|---|---|---|"]  # fmt: skip
+    lines = ["| data | verdict | error on held-out data [noise variances] | causes (brackets: not confident) |",
+             "|---|---|---|---|"]  # fmt: skip
     for name, row in rows.items():
         if row.diagnosed is None:
-            lines.append(f"| {name} | {row.date} | refused | | {row.failed.partition('; fix')[0]} |")
+            lines.append(f"| {name} | refused | | {row.failed.partition('; fix')[0].partition(': ')[2]} |")
             continue
         error = row.diagnosed["validation"]
         found = [f["effect"] if f["confident"] else f"({f['effect']})" for f in row.diagnosed["findings"]]
         lines.append(
-            f"| {name} | {row.date} | {row.diagnosed['verdict']} | {error['mse_nominal']:.3g} → "
+            f"| {name} | {row.diagnosed['verdict']} | {error['mse_nominal']:.3g} → "
             f"{error['mse_extended']:.3g} | {', '.join(found)} |"
         )
     return "\n".join(lines)
@@ -79,9 +79,9 @@ def _answers(rows: Mapping[str, Row]) -> str:
 def _ahead(rows: Mapping[str, Row]) -> str:
     """Half-second errors of all sets beside each other."""
     lines = [
-        f"Errors {AHEAD:g} s ahead on unseen flights as shares of no change, {' / '.join(QUANTITIES)}; in bold what is "
-        "below ridge and random features. Without a prediction file the physical one stands in its column.", "",
-        "| data | physical file | prediction file | ridge | random features | logged velocity alone: position, scale |",
+        f"Errors {AHEAD:g} s ahead on unseen flights, relative to predicting no change: {', '.join(QUANTITIES)}; bold: better "
+        "than ridge and random features. Without a prediction file, its column shows the physical file.", "",
+        "| data | physical file | prediction file | ridge | random features | position error and scale of logged velocity |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for name, row in rows.items():
@@ -90,8 +90,8 @@ def _ahead(rows: Mapping[str, Row]) -> str:
         ours = row.prediction.get("prediction file", row.prediction["physical file"])
         rivals = np.min([row.prediction[who] for who in _LEARNT], axis=0)
         best = [f"**{_share(a)}**" if a < b else _share(a) for a, b in zip(ours, rivals, strict=True)]
-        cells = [" / ".join(_share(s) for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
-        cells.insert(1, " / ".join(best))
+        cells = [", ".join(_share(s) for s in row.prediction[who]) for who in ("physical file", *_LEARNT)]
+        cells.insert(1, ", ".join(best))
         cells.append(f"{_share(row.velocity[1])}, {_share(row.velocity[0])}")
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) if len(lines) > 4 else ""

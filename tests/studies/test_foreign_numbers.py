@@ -32,8 +32,8 @@ def test_the_share_counts_identified_numbers_and_names_those_outside() -> None:
     answers = {"identify": answered(6.1e-6, "identified"), "diagnose": answered(9.0e-6, "identified")}
     unused = of_set("iris", IRIS, {"diagnose": answered(9.0e-6, "unreliable")})
     text = table([*of_set("iris", IRIS, answers), *unused])
-    assert "Of 2 numbers called identified whose truth is known 1 hold it" in text
-    assert text.count("**outside**") == 1
+    assert "Of 2 identified values with known truth, 1 have it inside" in text
+    assert text.count("**+") == 1
 
 
 def test_refused_data_have_no_numbers() -> None:
