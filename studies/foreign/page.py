@@ -79,9 +79,9 @@ def _answers(rows: Mapping[str, Row]) -> str:
 def _ahead(rows: Mapping[str, Row]) -> str:
     """Half-second errors of all sets beside each other."""
     lines = [
-        f"Errors {AHEAD:g} s ahead on unseen flights, relative to predicting no change: {', '.join(QUANTITIES)}; bold: better "
-        "than ridge and random features. Without a prediction file, its column shows the physical file.", "",
-        "| data | physical file | prediction file | ridge | random features | position error and scale of logged velocity |",
+        f"Errors {AHEAD:g} s ahead on unseen flights, relative to predicting no change: {', '.join(QUANTITIES)}; "
+        "bold: better than ridge and random features. Without a prediction file, its column has the physical file.", "",
+        "| data | physical file | prediction file | ridge | random features | position error, scale of its velocity |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for name, row in rows.items():
