@@ -105,14 +105,14 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
     rows: Mapping[int, list[Evidence]] = {n: [e for e in evidence if e.row == n] for n in FAULTS}
     green = sum(1 for said in rows.values() if said)
     lines = [
-        "# Faults, what is promised, what happened",
+        "# Faults: promise and observation",
         "",
-        f"Written by `{command}`: tests with the real thing failing. A sentence stands here only when its test passed; "
-        "the shortest of a row is quoted. All sentences, with test and day: `faults.json` beside this page.",
+        f"`{command}`: tests inject each fault and record what happened. Only passed tests count; the shortest record "
+        "of a row is quoted, all are in `faults.json`.",
         "",
         f"{green} of {len(FAULTS)} rows have evidence, from {len({e.test for e in evidence})} tests{_days(evidence)}.",
         "",
-        "| # | fault | promise | what happened |",
+        "| # | fault | promise | observed |",
         "|---|---|---|---|",
         *(_row(number, *FAULTS[number], rows[number]) for number in FAULTS),
     ]
