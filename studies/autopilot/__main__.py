@@ -111,13 +111,14 @@ def row(one: Flown, done: Outcome) -> str:
         sets = (done.published[0], done.published[-1]) if done.published else ()
         cells += ["; ".join(errors_of(s, one.truth)) for s in sets] or ["", ""]
         cells += [f"{sum('**' in ' '.join(errors_of(s, one.truth)) for s in done.published)}"]
-    return "| " + " | ".join([*cells, str(len(done.alarms)), done.status, f"{done.seconds:.0f}"]) + " |"
+    ending = done.status.partition(":")[0] if done.published else done.status
+    return "| " + " | ".join([*cells, str(len(done.alarms)), ending, f"{done.seconds:.0f}"]) + " |"
 
 
 def section(kind: str, way: str, rows: list[str], seconds: float) -> str:
     """Markdown of one kind of flights."""
     truth = ["first set", "last set", "wrong sets"] if kind == "ArduCopter" else []
-    heads = ["flight", "sets", "excited flight before the first [s]", *truth, "alarms", "at the end", "wall [s]"]
+    heads = ["flight", "sets", "excited flight to first set [s]", *truth, "alarms", "at the end", "wall [s]"]
     how = f"`{COMMAND}`, {way}" + (" in real time through `quadid serve`" if way == "live" else "")
     how += f"; the first {seconds:g} s of each log" if seconds < 1e9 else ""
     lines = [f"## {kind}, {way}", "", f"{how}; seed 0.", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]

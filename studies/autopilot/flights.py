@@ -93,16 +93,16 @@ class Outcome:
 
 
 def errors_of(item: Mapping[str, Any], truth: Mapping[str, float]) -> list[str]:
-    """Value, error and status of each parameter whose truth is known; bold where it is called identified and is wrong.
+    """Error of each identified parameter whose truth is known; bold where it is wrong.
 
     Wrong is: more than 3 % and outside its interval, or more than 10 %.
     """
     out = []
     for p in item["parameters"]:
-        if p["name"] in truth:
+        if p["name"] in truth and p["status"] == "identified":
             off = p["value"] / truth[p["name"]] - 1.0
             outside = not p["ci95"][0] <= truth[p["name"]] <= p["ci95"][1]
-            wrong = p["status"] == "identified" and (abs(off) > 0.10 or (outside and abs(off) > 0.03))
-            text = f"{p['name']} {off:+.1%}" + ("" if p["status"] == "identified" else f" ({p['status']})")
+            wrong = abs(off) > 0.10 or (outside and abs(off) > 0.03)
+            text = f"{p['name']} {off:+.1%}"
             out.append(f"**{text}**" if wrong else text)
     return out
