@@ -22,7 +22,7 @@ from studies.ablation.variants import Variant, variants
 
 REMOVED = Path(__file__).with_name("removed.md")
 """What went because of such runs, in words."""
-SHOWN = 3
+SHOWN = 1
 """Answers that one cell of the table tells."""
 IDLE = re.compile(r"\| [^|]+ \|( (\(of \d+\) )?(– )? ?\|){3}")
 """A row in which nothing changes."""
@@ -102,22 +102,21 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
     right = [a for a in base if a.right is not None]
     idle = [r.split(" | ")[0].removeprefix("| ") for r in rows if IDLE.fullmatch(r)]
     return (
-        f"""# Diagnosis: without each rule, without, with half and with twice each number
+        f"""# Diagnosis: ablation of rules and constants
 
 {len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
 
-Class and number of a campaign case are its seed; recorded flights have the seed 0. As it is the diagnosis is right on
-{sum(bool(a.right) for a in right)} of the {len(right)} whose answer is known.
-Size: {"; ".join(line.split(":")[0] for line in sizes)}.
+Class and number of a campaign case are its seed; recorded flights have the seed 0. Unchanged, the diagnosis is right on
+{sum(bool(a.right) for a in right)} of the {len(right)} with known answer. Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 
 {REMOVED.read_text(encoding="utf-8").strip()}
 
-## What is left
-On these flights nothing changes without, with half or with twice {", ".join(idle)}.
+## Each rule removed, each constant removed, halved and doubled
+No change of: {", ".join(idle)}.
 
-+n −n: cases that become right or wrong. An answer differs in this order: names (− no longer, + newly listed), verdict,
-error on unseen data by more than 1 %, width of an interval by more than 5 %, what the rest follows. "Fits" are
-linearisations asked for, where they change by more than 3 %; – : nothing changes; (of n): of fewer flights than all.
++n −n: cases that become right or wrong. The first difference is quoted: names (− no longer, + newly listed), verdict,
+error on unseen data (> 1 %), width of an interval (> 5 %), signal that the residual follows. Fits: linearisations
+(> 3 %); –: no change; (of n): fewer flights.
 
 | changed | without | × 0.5 | × 2 |
 |---|---|---|---|
