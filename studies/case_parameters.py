@@ -81,9 +81,9 @@ def _errors(flown: list[Window], vehicle: Vehicle, answer: dict[str, Any]) -> Fl
 
 def _summary(what: str, errors: list[FloatArray]) -> str:
     z = np.array(errors)
-    mean = ", ".join(f"{name} {m:+.1f}" for name, m in zip(NOMINAL_NAMES, z.mean(axis=0), strict=True))
+    mean = ", ".join(f"{m:+.1f}" for m in z.mean(axis=0))
     inside = np.count_nonzero(np.abs(z) <= INSIDE)
-    return f"{what}: {inside} of {z.size} parameters inside their 95 % interval; mean error in sigma: {mean}."
+    return f"| {what} | {inside} of {z.size} | {mean} |"
 
 
 def main() -> None:
@@ -94,7 +94,12 @@ def main() -> None:
     data = Path(os.environ.get("QUADID_DATA", "../shared/data")) / "cases"
     answers = json.loads((data / "answers.json").read_text(encoding="utf-8"))
     known = [a for a in answers if "unknown" not in a["effects"]]
-    text = ["`python -m studies.case_parameters --out docs/results`", "", (__doc__ or "").split("\n\n")[2].rstrip()]
+    text = [
+        "`python -m studies.case_parameters --out docs/results`: nominal parameters of each flight, with the hidden "
+        "effects known.", "",
+        "| flights | 95 % intervals that contain the truth | mean error in sigma: " + ", ".join(NOMINAL_NAMES) + " |",
+        "|---|---|---|",
+    ]  # fmt: skip
     print(f"| flight | hidden, known here | {' | '.join(NOMINAL_NAMES)} | feedback |")
     errors = []
     for answer in known:
@@ -104,11 +109,11 @@ def main() -> None:
             print(line, flush=True)
     fed = [(e.sloped, e.flat) for e in errors if e.sloped is not None]
     summaries = [
-        _summary(f"The {len(fed)} flights with feedback within samples", [sloped for sloped, _ in fed]),
-        _summary("The same with speeds held flat", [flat for _, flat in fed]),
-        _summary(f"The {len(errors) - len(fed)} without", [e.flat for e in errors if e.sloped is None]),
+        _summary(f"{len(fed)} with feedback within samples, modelled", [sloped for sloped, _ in fed]),
+        _summary("the same, speeds held", [flat for _, flat in fed]),
+        _summary(f"{len(errors) - len(fed)} without", [e.flat for e in errors if e.sloped is None]),
     ]
-    text += [line for summary in summaries for line in ("", summary)]
+    text += summaries
     print("\n".join(summaries))
     if options.out:
         put_section(Path(options.out) / "cases.md", "Independent cases", "parameters", "\n".join(text))

@@ -46,23 +46,24 @@ def row(folder: Path, answer: dict[str, Any]) -> tuple[bool, str]:
     began = time.perf_counter()
     found, _ = diagnose(windows(folder / "train.csv", vehicle), vehicle, windows(folder / "validate.csv", vehicle))
     seconds = time.perf_counter() - began
-    named = "; ".join(
-        f"{f.effect} " + ", ".join(f"{p.name} {p.value:.4g}" for p in f.parameters) for f in found.findings
+    truth = {name: answer["truth"].get(name, {}) for name in answer["effects"]}
+    named = ", ".join(
+        " ".join([f.effect, *(f"{values[k]:.4g}" for k in truth.get(f.effect, {}) if k in values)])
+        for f in found.findings
+        for values in [{p.name: p.value for p in f.parameters}]
     )
-    hidden = "; ".join(
-        f"{name} " + ", ".join(f"{k} {v:.4g}" for k, v in answer["truth"].get(name, {}).items())
-        for name in answer["effects"]
-    )
+    hidden = ", ".join(" ".join([name, *(f"{k} {v:.4g}" for k, v in truth[name].items())]) for name in truth)
     good = right(found, answer)
-    figures = f"{found.validation.nominal:.3f} → {found.validation.extended:.3f} | {seconds:.1f}"
+    figures = f"{found.validation.nominal:.3g} → {found.validation.extended:.3g}, {seconds:.0f} s"
+    verdict = found.verdict.value if good else f"**wrong: {found.verdict.value}**"
     case = f"{folder.parent.name} {answer['case']}"
-    return good, f"| {case} | {hidden or '–'} | {found.verdict.value} | {named or '–'} | {figures} | {good} |"
+    return good, f"| {case} | {hidden or '–'} | {verdict} | {named or '–'} | {figures} |"
 
 
 def main() -> None:
     """Prints the table."""
     data = Path(os.environ.get("QUADID_DATA", "../shared/data"))
-    print("| case | hidden | verdict | found | error on the unseen flight | s | right |\n|---|---|---|---|---|---|---|")
+    print("| case | hidden | verdict | found | error on the unseen flight, time |\n|---|---|---|---|---|")
     results = []
     for folder in FOLDERS:
         for answer in json.loads((data / folder / "answers.json").read_text(encoding="utf-8")):
