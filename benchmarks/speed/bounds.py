@@ -42,14 +42,10 @@ def held(results: Result, rows: float) -> str:
 
 
 def machine_limits(r: Result) -> list[str]:
-    """Lines of the page's table of what the machine can do."""
+    """The page's lines about the machine."""
     rates = {name: f"{1e-6 * r[name]:.0f} MB/s, {1e9 / r[name]:.2g} ms/MB" for name in ("disk_read", "sha256")}
     return [
-        "| what | measured |", "|---|---|",
-        f"| memory, copied | {1e-9 * r['memory_bandwidth']:.1f} GB/s |",
-        f"| disk, written and flushed | {1e-6 * r['disk_write']:.0f} MB/s |",
-        f"| disk, read | {rates['disk_read']} |",
-        f"| SHA-256, which names every log that is read | {rates['sha256']} |",
-        f"| start of Python | {r['python_start']:.3f} s |",
-        f"| ... and import of the fit | {r['fit_import']:.2f} s, {r['fit_import_mb']:.0f} MB |",
-    ]  # fmt: skip
+        f"Memory copy {1e-9 * r['memory_bandwidth']:.1f} GB/s; disk write {1e-6 * r['disk_write']:.0f} MB/s, read "
+        f"{rates['disk_read']}; SHA-256 of every log {rates['sha256']}; start of Python {r['python_start']:.3f} s, "
+        f"with import of the fit {r['fit_import']:.2f} s and {r['fit_import_mb']:.0f} MB."
+    ]

@@ -12,9 +12,8 @@ Result = Mapping[str, Any]
 SHOWN = ("nominal, cost", "motor lag, one a particle, cost", "rotor drag, cost", "every effect, cost")
 """Cases of the kernel in the table."""
 INTRODUCTION = (
-    "Medians of cases that run in turn, round by round. Ratios within a table mean more than its seconds, for other "
-    "programs share the machine. Processor time, in the first table in brackets, is that of all threads and child "
-    "processes. Every number, also of parts not shown here, is in `speed.json`."
+    "Medians of interleaved runs; compare ratios, since other programs share the machine. Processor time (in brackets "
+    "in the first table) is that of all threads and child processes. `speed.json` has every value."
 )
 
 
@@ -57,21 +56,16 @@ def _kernel(r: Result) -> list[str]:
             )
     rows += [f"| {name} | {t['least']:.0f} | {least:.1f} | | |" for name, t in r["numpy"].items()]
     return [
-        "Best runs: processor time on one core, time by the clock on both. The limit is the nominal step's arithmetic "
-        "at the processor's peak; effects need more.", "",
-        *rows, "",
-        f"Measured peak of one core: {r['fma_per_ns']:.1f} fused multiply-adds of float64 per ns. The nominal rollout "
-        f"does {r['operations']} operations a step, which is {r['share_of_peak']:.0%} of that peak. The same step in "
-        f"NumPy at its best takes {r['gain_over_numpy']:.0f} times as long; rotor drag takes "
-        f"{r['extended_over_nominal']:.1f} times the nominal, every effect {r['every_over_nominal']:.1f} times. All in "
-        "float64.",
+        "Best runs in float64: processor time on one core, wall time on both. The limit is the arithmetic of the "
+        f"nominal step ({r['operations']} operations) at the peak of {r['fma_per_ns']:.1f} fused "
+        "multiply-adds per ns and core.", "", *rows,
     ]  # fmt: skip
 
 
 def _optimum(r: Result) -> list[str]:
     rows = [
-        f"Six parameters, 400 short segments of 500 s, {r['seeds']} random starts in the bounds, the same kernel "
-        "for all; until the cost is within 0.1 % of the optimum.", "",
+        f"Six parameters, 400 short segments of 500 s, {r['seeds']} random starts, the same kernel for all; until the "
+        "cost is within 0.1 % of the optimum.", "",
         "| method | reached | seconds | evaluations |", "|---|---|---|---|",
     ]  # fmt: skip
     for name, m in r["methods"].items():
@@ -96,17 +90,16 @@ def _scaling(r: Result) -> list[str]:
     e = r["exponents"]
     return [
         *rows, "",
-        f"Processor time grows with the {e['fit_processor']:.2f}th power of the length, memory with the "
-        f"{e['peak_mb']:.2f}th: of more than an hour a fit takes stretches spread evenly (`identify/long_logs.py`); "
-        "what grows beyond that are the windows themselves, 0.1 kB a sample.", "",
+        f"Exponents: processor time {e['fit_processor']:.2f}, memory {e['peak_mb']:.2f}. Of more than an hour, a fit "
+        "uses stretches spread evenly (`quadid/identify/long_logs.py`).", "",
         "![](speed-scaling.png)",
     ]  # fmt: skip
 
 
 def _logs(r: Result) -> list[str]:
     return [
-        "A 500 s log that `quadid simulate` wrote, and the largest recorded ones. Ours reads, checks, hashes and puts "
-        "all channels on one clock; a large file in a process of its own.", "",
+        "A simulated log of 500 s, and the largest recorded ones. quadid reads, checks, hashes and puts all channels "
+        "on one clock; large files in a process of their own.", "",
         "| what | wall [s] | processor [s] | ms of processor per MB |", "|---|---|---|---|",
         *(f"| {n} | {t['wall']:.3g} | {t['processor']:.3g} | {t['ms_per_mb']:.3g} |" for n, t in r["times"].items()),
     ]  # fmt: skip

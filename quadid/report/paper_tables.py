@@ -27,8 +27,8 @@ PAPER_PARAMETERS: dict[str, float] = {
 """Table 2 of the paper."""
 COLUMN_NAMES = {
     "initial": "initial guess", "quasi_newton": "quasi-Newton", "pso": "PSO", "pso_polish": "PSO + polish",
-    "identified": "quadid, nominal", "extended": "quadid, extended", "true_nominal": "true six numbers",
-    "perfect": "the flown vehicle", "cva": "CVA", "moesp": "MOESP",
+    "identified": "quadid, nominal", "extended": "quadid, extended", "true_nominal": "true parameters",
+    "perfect": "flown vehicle", "cva": "CVA", "moesp": "MOESP",
 }  # fmt: skip
 """Models by name, for people."""
 
@@ -76,7 +76,7 @@ def table_1_more(result: JsonDict) -> Table:
     """The same error of models the paper does not have."""
     names = ("quasi_newton", "pso", "pso_polish", "identified", "true_nominal", "extended", "perfect")
     rows = [[set_name(i), *(text(result["mse_paper"][n][i]) for n in names)] for i in range(3)]
-    return Table("What is left, and why", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
+    return Table("Remaining error", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
 
 
 def table_segments(result: JsonDict) -> Table:

@@ -107,7 +107,8 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
 {len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
 
 Class and number of a campaign case are its seed; recorded flights have the seed 0. Unchanged, the diagnosis is right on
-{sum(bool(a.right) for a in right)} of the {len(right)} with known answer. Size: {"; ".join(line.split(":")[0] for line in sizes)}.
+{sum(bool(a.right) for a in right)} of the {len(right)} with known answer.
+Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 
 {REMOVED.read_text(encoding="utf-8").strip()}
 
