@@ -45,11 +45,10 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
     healthy = [j.flown.airframe for j in judged if j.flown.condition == "healthy"]
     each = " and ".join(f"{healthy.count(name)} of {name}" for name in sorted(set(healthy)))
     return (
-        f"## Recorded flights\n`make health`; {len(judged)} flights of two Crazyflies, each against the healthy "
-        f"flights of its airframe ({each}, both kinds of log), itself left out. Intervals: exact binomial "
-        "(Clopper and Pearson), flights taken for independent.\n\n"
-        f"{recorded.table(judged)}\n\n### Answers\n{recorded.confusion(judged)}\n\n"
-        f"### Score against size\n![Score against millimetres cut]({picture.name})"
+        f"## Recorded flights\n`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy "
+        f"flights of its airframe ({each}). Brackets: exact binomial 95 % intervals.\n\n"
+        f"{recorded.table(judged)}\n\n{recorded.confusion(judged)}\n\n"
+        f"![Score against millimetres cut]({picture.name})"
     )
 
 
@@ -57,10 +56,9 @@ def _simulated(each: int) -> str:
     return (
         f"## Simulated flights\n`make health`, seed {simulated.SEED}; Pelican (plus and X frame) of "
         f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each, in closed loop (`quadid.flight`) and "
-        "by the balance of a hover. From flight to flight every rotor's thrust differs by 1 %, the battery sits 0.7 mm "
-        f"elsewhere, the load differs by 1 % (1 sigma).\n\n{simulated.table(each)}\n\nA rotor that lost thrust "
-        "alone and a weight at its hub have the same trims: no hover tells them apart. The weight, the likelier, is "
-        "the answer."
+        "by the balance of a hover. Between flights, rotor thrust varies by 1 %, the battery by 0.7 mm, the load by "
+        f"1 % (1 sigma).\n\n{simulated.table(each)}\n\nA rotor that lost only thrust and a weight at its hub have "
+        "the same trims; the likelier weight is named."
     )
 
 

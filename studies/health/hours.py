@@ -127,9 +127,9 @@ def quiet(hours: float, session: float) -> str:
     told = sum(report.verdict == "changed" for _ in range(whole) for report in flown.fly(FLIGHT))
     return (
         f"## Online\n`make health-hours`, seed 11. Healthy flights of {FLIGHT // 60} min after {HISTORY} others; "
-        "rotors, battery and load differ from flight to flight (1 %, 1 mm, 1 %: 1 sigma), thrust sags by 15 % an hour: "
-        f"**{raised} alarms in {count * FLIGHT / 3600.0:.0f} h** of the watch's seconds, **{told} in "
-        f"{whole * FLIGHT / 3600.0:.0f} h** of a whole session fed at 50 Hz."
+        "rotors, battery and load vary (1 %, 1 mm, 1 %: 1 sigma), thrust sags by 15 % an hour: "
+        f"**{raised} false alarms in {count * FLIGHT / 3600.0:.0f} h** of the monitor, **{told} in "
+        f"{whole * FLIGHT / 3600.0:.0f} h** of a whole session."
     )
 
 
@@ -138,7 +138,7 @@ def soon(each: int) -> str:
     rng = np.random.default_rng(12)
     lines = [
         f"### A loss in flight\n`make health-hours`, seed 12. A rotor loses thrust and drag torque after {ONSET} s.\n",
-        "| loss of one rotor | through | named within 5 s | alarm names the rotor | median seconds from onset |",
+        "| loss of one rotor | through | named within 5 s | rotor right | median delay [s] |",
         "|---|---|---|---|---|",
     ]
     lines += [_row("watch", loss, each, partial(_practised, rng, loss)) for loss in (0.03, 0.05, 0.1, 0.2)]

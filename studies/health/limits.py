@@ -106,9 +106,8 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
         for size in sizes
     }
     lines = [
-        f"A single cut below {LARGE:g} mm costs {100.0 * light:.1f} % of thrust a millimetre, a larger one "
-        f"{100.0 * large:.1f} % (least squares over all flights). If every cut cost just that, and flights differed "
-        "from the healthy mean as healthy flights do, the single cuts would give:\n",
+        f"A single cut below {LARGE:g} mm costs {100.0 * light:.1f} % of thrust per millimetre, a larger one "
+        f"{100.0 * large:.1f} % (least squares). With exactly these losses and the spread of healthy flights:\n",
         "| single cuts | wanted | expected (95 % of draws) | measured |", "|---|---|---|---|",
     ]  # fmt: skip
     for what, wanted, chosen, right, column in ROWS:
@@ -131,9 +130,8 @@ def _look_alikes(judged: Sequence[Judged], draws: int) -> str:
     ]
     frames = " and ".join(AIRFRAMES)
     return (
-        f"A weight of {100.0 * WEIGHT:.0f} % at a hub is told from that rotor in {shares[0]} of draws for "
-        f"{frames}; {100.0 * NEIGHBOURS:.0f} % lost by each of M1 and M2 is told from a weight between them in "
-        f"{shares[1]}."
+        f"A weight of {100.0 * WEIGHT:.0f} % at a hub is separated from that rotor in {shares[0]} of draws for "
+        f"{frames}; losses of {100.0 * NEIGHBOURS:.0f} % of M1 and M2 from a weight between them in {shares[1]}."
     )
 
 
@@ -173,8 +171,8 @@ def _outside(judged: Sequence[Judged]) -> str:
     cuts = [f"{j.flown.file} ({j.flown.total:g} mm, p = {j.health.p_value:.2f})" for j in uncut]
     yawed = [f"{j.flown.file} ({j.health.distance[2]:+.1f} spreads of yaw)" for j in weights]
     return (
-        f"Outside of this: {' and '.join(cuts)} fly as healthy flights do; nothing in their trims names a rotor. A "
-        f"weight balances without yaw; {' and '.join(yawed)} carry one and yaw as with a cut, and get that answer."
+        f"Outliers: {' and '.join(cuts)} fly like healthy flights; {' and '.join(yawed)} carry a weight but yaw like a "
+        "cut."
     )
 
 
@@ -186,7 +184,7 @@ def _doubles(judged: Sequence[Judged]) -> str:
     three = sum(len(j.named) == 3 for j in again)
     both = sum(set(j.named) == {1, 2} for j in again)
     return (
-        f"Cuts of M1 and M2 are mostly answered with M3 besides, for that set of propellers differs from the healthy "
-        f"flights' at 0.5 mm already. Against its own {len(least)} least cut flights, {three} of {len(again)} are "
-        f"answered with three rotors, {both} with just these two, the others with a weight between them."
+        "Cuts of M1 and M2 are mostly answered with M3 too, because that set of propellers differs from the healthy "
+        f"one from the start. Against its own {len(least)} least cut flights, {three} of {len(again)} are answered "
+        f"with three rotors, {both} with the right two, the others with a weight between them."
     )

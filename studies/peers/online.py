@@ -152,19 +152,18 @@ def _session(seed: int) -> tuple[FloatArray, float, float]:
 def section() -> list[str]:
     """The part of the page."""
     rows = [
-        "| estimator | RMS error after 60 s of " + ", ".join(NAMES) + " [%] | seconds to see +15 % mass | names it | "
-        "processor time, s per s of flight |", "|---|---|---|---|---|",
+        "| estimator | RMS error after 60 s of " + ", ".join(NAMES) + " [%] | delay to +15 % mass [s] | name | "
+        "processor [s per s] |", "|---|---|---|---|---|",
     ]  # fmt: skip
     for who in (*FILTERS, "quadid.online.Session"):
         runs = [_session(seed) if who not in FILTERS else _filtered(who, seed) for seed in SEEDS]
         rms = np.sqrt(np.mean(np.square([error for error, _, _ in runs]), axis=0))
         after, cost = (float(np.median([run[k] for run in runs])) for k in (1, 2))
-        names = "no: b falls" if who in FILTERS else "mass_change"
+        names = "none" if who in FILTERS else "mass_change"
         rows.append(f"| {who} | {', '.join(f'{100 * v:.2g}' for v in rms)} | {after:.1f} | {names} | {cost:.3f} |")
     return [
         "## Online: Kalman filters", "",
         f"`python -m studies.peers online`: {len(SEEDS)} flights of a Pelican (seeds {SEEDS[0]} to {SEEDS[-1]}), the "
-        f"guess off by up to 35 %, J_r known to the filters. Their random walk of {WALK:g} a sample is a "
-        "compromise between exactness and speed. They see it when b has moved half of the change; the "
-        "session when it says mass_change. The filters are told the true noise.", "", *rows,
+        f"guess off by up to 35 %. The filters receive J_r, the true noise and a random walk of {WALK:g} per sample; a "
+        "change counts as seen when b has moved half of it.", "", *rows,
     ]  # fmt: skip

@@ -129,8 +129,8 @@ def section(data: Path) -> list[str]:
     )
     return [
         "## The least squares of sysid.tools on its authors' logs", "",
-        f"`python -m studies.peers recipe`: fitted to {LOG} up to {CUT:g} s and predicted from there; their second "
-        "log is not among the shared data. Errors of the rate are shares of predicting no change.", "", *rows, "",
+        f"`python -m studies.peers recipe`: fitted to {LOG} up to {CUT:g} s, predicted from there; rate errors "
+        "relative to no change.", "", *rows, "",
         f"Recipe: J_xx {j[0]:.2e}, J_yy {j[1]:.2e} kg m^2 "
         f"without intervals, R² of its accelerations {', '.join(f'{v:.2f}' for v in found.r2)}. "
         f"`quadid diagnose` (verdict {diagnosed.result['verdict']}): {told}. The authors' notebook has 1.03e-5 and "
