@@ -72,7 +72,8 @@ def serve(
     from quadid_node.settings import session_settings
     from quadid_node.signing_memory import memory_path
     from quadid_node.store import Store, default_path
-    from quadid_node.worker import ProcessWorker, with_ground
+    from quadid_node.worker import ProcessWorker
+    from quadid_node.workers import with_ground
 
     from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal

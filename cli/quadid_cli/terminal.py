@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from quadid.sanitise import one_line
 from quadid.workflow.progress import Advance as Advance
 from quadid.workflow.progress import silent
+from quadid_cli.compiling import prepare
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,8 +49,6 @@ def progress(compiled: Sequence[str] = ("simulation", "statistics")) -> Iterator
     Args:
         compiled: kernels that the block needs (`quadid.workflow.kernels.PARTS`), compiled first where they are not.
     """
-    from quadid_cli.warmup import prepare
-
     if not sys.stderr.isatty():
         prepare(compiled, silent)
         yield silent

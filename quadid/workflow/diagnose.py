@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from quadid.workflow.files import file_name, write_text
+from quadid.workflow.files import file_name
 from quadid.workflow.identify import origin_remark, out_of_reach, proven
 from quadid.workflow.logs import Given, settled
-from quadid.workflow.outcome import Outcome
 from quadid.workflow.progress import Advance, silent
+from quadid.workflow.reporting import LIBRARY, Reported, provenance, quality
 from quadid.workflow.searching import OPTIMIZERS, search
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosed(Outcome):
+class Diagnosed(Reported):
     """What a diagnosis found.
 
     Attributes:
@@ -129,11 +129,20 @@ class Diagnosed(Outcome):
 
         return save_series(self.sets, self.logs, folder, kinds)
 
-    def report(self, path: str | Path, command: str | None = None) -> Path:
-        """Writes the HTML report; `command` is the command line that led to it, if one did."""
-        from quadid.workflow.reporting import LIBRARY, diagnose_html
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: findings with their pictures, parameters, residuals."""
+        from quadid.report.diagnose_page import diagnose_page
+        from quadid.report.page import render
 
-        return write_text(path, diagnose_html(self, command=command or LIBRARY))
+        rows = provenance(self.logs, command) + [
+            {"name": "seed", "value": str(self.result["seed"])},
+            {"name": "vehicle file", "value": self.result["vehicle_file"] or "not written"},
+        ]
+        logs = [quality(log) for log in self.logs]
+        warnings = self.result["warnings"]
+        return render(
+            diagnose_page(self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps())
+        )
 
     def maps(self) -> dict[str, ResidualMap]:
         """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""

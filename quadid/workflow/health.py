@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording
-from quadid.workflow.outcome import Outcome
 from quadid.workflow.parts import parse_cut
+from quadid.workflow.reporting import LIBRARY, Reported, provenance
 
 if TYPE_CHECKING:
     from quadid.health import FlightTrim
@@ -28,7 +28,7 @@ Flight = str | Path | Log
 
 
 @dataclass(frozen=True, repr=False)
-class HealthOutcome(Outcome):
+class HealthOutcome(Reported):
     """What changed.
 
     Attributes:
@@ -67,12 +67,30 @@ class HealthOutcome(Outcome):
             for low, high in [p["ci95"] or (None, None)]
         ]  # fmt: skip
 
-    def report(self, path: str | Path, command: str | None = None) -> Path:
-        """Writes the HTML report; `command` is the command line that led to it, if one did."""
-        from quadid.workflow.files import write_text
-        from quadid.workflow.reporting import LIBRARY, health_html
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: what changed, a picture of the airframe, how far each flight is from healthy ones."""
+        import numpy as np
 
-        return write_text(path, health_html(self, command=command or LIBRARY))
+        from quadid.health.comparison import distance
+        from quadid.health.trims import AXES
+        from quadid.report.airframe_picture import airframe_picture
+        from quadid.report.health_page import health_page, trim_figure
+        from quadid.report.page import render
+
+        found, healthy = self.found, self.found.healthy
+        now = np.mean([flight.shares for flight in found.flights], axis=0)
+        marked = self.result["changes"] if found.verdict == "changed" else ()
+        picture = airframe_picture(self.vehicle, now.tolist(), healthy.shares.tolist(), marked)
+        rows = [
+            (role, flight.name, distance(flight.mean - healthy.mean, healthy.predictive(1), healthy.freedom).tolist())
+            for role, part in (("measured", found.baseline), ("after", found.flights))
+            for flight in part
+        ]
+        made = provenance([], command) + [
+            {"name": recording.name, "value": f"sha256 {recording.sha256 or 'unknown'}"}
+            for recording in self.recordings
+        ]
+        return render(health_page(self.result, picture, made, [trim_figure(rows, AXES)]))
 
 
 def health(

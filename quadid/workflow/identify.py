@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.errors import NotIdentifiableError
 from quadid.sanitise import LONGEST_LINE, plain
-from quadid.workflow.files import file_name, write_text
+from quadid.workflow.files import file_name
 from quadid.workflow.logs import Given, settled
-from quadid.workflow.outcome import Outcome
 from quadid.workflow.progress import Advance, silent
+from quadid.workflow.reporting import LIBRARY, Reported, known, provenance, quality, told
 from quadid.workflow.searching import OPTIMIZERS, check_optimizer, search
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Identified(Outcome):
+class Identified(Reported):
     """What an identification found.
 
     Attributes:
@@ -101,11 +101,28 @@ class Identified(Outcome):
 
         return save_series(self.sets, self.logs, folder, kinds)
 
-    def report(self, path: str | Path, command: str | None = None) -> Path:
-        """Writes the HTML report; `command` is the command line that led to it, if one did."""
-        from quadid.workflow.reporting import LIBRARY, identify_html
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: parameters, errors of every log, correlations, what the flights excite."""
+        from quadid.report.figures import MOST_LOGS
+        from quadid.report.flight_part import flight_section
+        from quadid.report.identify_page import correlation_section, identify_page
+        from quadid.report.page import render
 
-        return write_text(path, identify_html(self, command=command or LIBRARY))
+        result, fit = self.result, self.fit
+        rows = provenance(self.logs, command) + [
+            {"name": "seed", "value": str(result["seed"])},
+            {
+                "name": "search",
+                "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
+            },
+            {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
+            {"name": "taken as known", "value": known(fit.vehicle)},
+        ]
+        page = identify_page(result, self.sets, fit.noise, [quality(log) for log in self.logs], rows)
+        flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
+        page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
+        page["excitation"] = told(fit, [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"])
+        return render(page)
 
 
 class UnansweredError(NotIdentifiableError):

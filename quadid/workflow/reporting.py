@@ -1,15 +1,19 @@
-"""Reports of results: the pages, the quality of the logs and where everything came from."""
+"""What every report holds: the quality of the logs and where everything came from; and the page of a failure."""
 
 from __future__ import annotations
 
 import datetime
 import importlib.metadata
 import platform
+from abc import abstractmethod
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
+from quadid.workflow.files import write_text
 from quadid.workflow.loading import LONGEST, open_recording
+from quadid.workflow.outcome import Outcome
 from quadid.workflow.parts import parse_cut
 
 if TYPE_CHECKING:
@@ -17,9 +21,6 @@ if TYPE_CHECKING:
     from quadid.inspection import Inspection
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
-    from quadid.workflow.diagnose import Diagnosed
-    from quadid.workflow.health import HealthOutcome
-    from quadid.workflow.identify import Identified
     from quadid.workflow.loading import Log
 
 LIBRARY = "a call of the library"
@@ -27,28 +28,16 @@ LIBRARY = "a call of the library"
 _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
-def identify_html(done: Identified, command: str = LIBRARY) -> str:
-    """The HTML report of an identification."""
-    from quadid.report.figures import MOST_LOGS
-    from quadid.report.flight_part import flight_section
-    from quadid.report.identify_page import correlation_section, identify_page
-    from quadid.report.page import render
+class Reported(Outcome):
+    """A result that has an HTML report."""
 
-    result, fit = done.result, done.fit
-    rows = provenance(done.logs, command) + [
-        {"name": "seed", "value": str(result["seed"])},
-        {
-            "name": "search",
-            "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
-        },
-        {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
-        {"name": "taken as known", "value": known(fit.vehicle)},
-    ]
-    page = identify_page(result, done.sets, fit.noise, [quality(log) for log in done.logs], rows)
-    flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(done.logs[:MOST_LOGS])]
-    page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
-    page["excitation"] = told(fit, [log for log, s in zip(done.logs, done.sets, strict=True) if s.role == "train"])
-    return render(page)
+    @abstractmethod
+    def page(self, command: str = LIBRARY) -> str:
+        """The report as HTML; `command` is the command line that led to it, if one did."""
+
+    def report(self, path: str | Path, command: str = LIBRARY) -> Path:
+        """Writes the HTML report, as `page`."""
+        return write_text(path, self.page(command))
 
 
 def known(vehicle: Vehicle) -> str:
@@ -89,47 +78,6 @@ def failure_html(
             rows.append({"name": f"{text}, inspection", "value": str(unclear)})
             read.append((recording, None))
     return render(failure_page(what, error.found, error.fix, read, rows, error.allowed))
-
-
-def diagnose_html(done: Diagnosed, command: str = LIBRARY) -> str:
-    """The HTML report of a diagnosis."""
-    from quadid.report.diagnose_page import diagnose_page
-    from quadid.report.page import render
-
-    rows = provenance(done.logs, command) + [
-        {"name": "seed", "value": str(done.result["seed"])},
-        {"name": "vehicle file", "value": done.result["vehicle_file"] or "not written"},
-    ]
-    logs = [quality(log) for log in done.logs]
-    warnings = done.result["warnings"]
-    return render(
-        diagnose_page(done.result, done.nominal.name, done.sets, done.noise, logs, rows, warnings, done.maps())
-    )
-
-
-def health_html(done: HealthOutcome, command: str = LIBRARY) -> str:
-    """The HTML report of a comparison with healthy flights."""
-    import numpy as np
-
-    from quadid.health.comparison import distance
-    from quadid.health.trims import AXES
-    from quadid.report.airframe_picture import airframe_picture
-    from quadid.report.health_page import health_page, trim_figure
-    from quadid.report.page import render
-
-    found, healthy = done.found, done.found.healthy
-    now = np.mean([flight.shares for flight in found.flights], axis=0)
-    marked = done.result["changes"] if found.verdict == "changed" else ()
-    picture = airframe_picture(done.vehicle, now.tolist(), healthy.shares.tolist(), marked)
-    rows = [
-        (role, flight.name, distance(flight.mean - healthy.mean, healthy.predictive(1), healthy.freedom).tolist())
-        for role, part in (("measured", found.baseline), ("after", found.flights))
-        for flight in part
-    ]
-    made = provenance([], command) + [
-        {"name": recording.name, "value": f"sha256 {recording.sha256 or 'unknown'}"} for recording in done.recordings
-    ]
-    return render(health_page(done.result, picture, made, [trim_figure(rows, AXES)]))
 
 
 def quality(log: Log) -> dict[str, Any]:

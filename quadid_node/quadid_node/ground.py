@@ -14,7 +14,7 @@ from typing import Any
 
 from quadid.online.jobs import Job
 from quadid_node.parcel import LARGEST, ParcelError, content, pack, unpack
-from quadid_node.zenoh_link import ROOT, ZenohError, config_of, open_session
+from quadid_node.zenoh_session import ROOT, ZenohError, config_of, open_session
 
 WORK = f"{ROOT}/*/work/fit"
 ALIVE = f"{ROOT}/worker/*/alive"
@@ -37,7 +37,7 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
     """Answers requests until `stop` says so; waits for a router that is not there yet.
 
     Args:
-        where: see `zenoh_link.open_session`.
+        where: see `zenoh_session.open_session`.
         stop: asked often.
         told: takes a sentence for people.
 

@@ -44,7 +44,8 @@ from quadid_node.service import Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
 from quadid_node.vehicle_health import health_message
-from quadid_node.worker import ProcessWorker, with_ground
+from quadid_node.worker import ProcessWorker
+from quadid_node.workers import with_ground
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
 """A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""

@@ -19,7 +19,7 @@ from quadid.online.jobs import Job, JobReply
 from quadid_node.ground import ALIVE
 from quadid_node.parcel import LARGEST, ParcelError, pack, unpack
 from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble
-from quadid_node.zenoh_link import ZenohError, config_of, key_of, open_session
+from quadid_node.zenoh_session import ZenohError, config_of, key_of, open_session
 
 FAR_LIMIT = 5.0
 """A ground machine that does not answer a fit within this time [s] is given up for `REST`."""

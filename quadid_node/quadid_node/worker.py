@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from quadid.errors import QuadidError
 from quadid.online.jobs import Job, JobReply
 from quadid.vehicle import Vehicle
 from quadid_node.warm_up import WarmUp
@@ -252,23 +251,6 @@ class ProcessWorker:
                     pipe.close()
         child.kill()
         child.wait()
-
-
-def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
-    """The worker itself, or, with a place on Zenoh, one that lets ground machines there fit for `vehicle`.
-
-    Raises:
-        ZenohError: a configuration that is none.
-    """
-    if not where:
-        return worker
-    from quadid_node.remote_worker import Ground, RemoteWorker  # Zenoh is loaded by those who use it
-
-    try:
-        return RemoteWorker(worker, Ground(where, vehicle))
-    except QuadidError:
-        worker.close()
-        raise
 
 
 def _widen(descriptor: int) -> None:

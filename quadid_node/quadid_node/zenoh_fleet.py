@@ -7,7 +7,8 @@ from typing import Any
 
 import zenoh
 
-from quadid_node.zenoh_link import KINDS, ROOT, key_of, open_session
+from quadid_node.zenoh_link import KINDS
+from quadid_node.zenoh_session import ROOT, key_of, open_session
 
 LARGEST = 1 << 18
 """A payload beyond this is not ours [bytes]."""

@@ -113,7 +113,7 @@ def _too_large(path: Path, allowed: Limits, how: str = "") -> LogError:
 
 def _child(path: Path, preset: str, columns: dict[str, str], memory: int, seconds: float) -> None:
     """What the child does: the answer goes to stdout, and whatever a library prints to stderr."""
-    from quadid_replay.opening import read_here
+    from quadid_replay.formats import read_here
 
     resource.setrlimit(resource.RLIMIT_DATA, (memory * _MIB, memory * _MIB))
     resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 5))

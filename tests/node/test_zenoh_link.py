@@ -13,7 +13,8 @@ import pytest
 import zenoh
 from quadid_cli.watch import snapshot, table
 from quadid_node.zenoh_fleet import Fleet
-from quadid_node.zenoh_link import KINDS, ZenohError, ZenohLink, key_of
+from quadid_node.zenoh_link import KINDS, ZenohLink
+from quadid_node.zenoh_session import ZenohError, key_of
 
 from quadid.online.records import Diagnosed, OnlineFinding
 from quadid_node import zenoh_fleet
