@@ -84,16 +84,15 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
     every = sum(files.values(), Counter())
     least = sorted(files, key=lambda n: percent(files[n]))[:5]
     lines = [
-        "# Coverage: what of `quadid/` the tests run", "",
-        f"`make coverage`, {time.strftime('%Y-%m-%d')}, coverage {coverage.__version__} with branches, in all "
-        "processes that the tests of core, readers and command line start; those of node, ROS, fuzzing and the slow "
-        "ones do not run for it.", "",
+        "# Test coverage of `quadid/`", "",
+        f"`make coverage`, {time.strftime('%Y-%m-%d')}, coverage {coverage.__version__}, tests of core, readers and "
+        "command line with their processes.", "",
         f"**{percent(every):.1f} % of statements and branches** (goal {GOAL:.0f} %): {every['run']:,} of "
-        f"{every['statements']:,} statements, {every['taken']:,} of {every['branches']:,} branches. Left out: the "
-        f"{machine_code:,} statements inside functions that numba compiles, where no line can be counted.", "",
-        "| room | statements run | branches taken | both |", "|---|---|---|---|",
+        f"{every['statements']:,} statements, {every['taken']:,} of {every['branches']:,} branches, without "
+        f"{machine_code:,} statements in compiled functions.", "",
+        "| package | statements | branches | both |", "|---|---|---|---|",
         *(_row(name, c) for name, c in sorted(rooms.items())), "",
-        "Files of which least is run: " + ", ".join(f"`{n}` {percent(files[n]):.0f} %" for n in least) + ".",
+        "Least covered: " + ", ".join(f"`{n}` {percent(files[n]):.0f} %" for n in least) + ".",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 

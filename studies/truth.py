@@ -105,7 +105,7 @@ def table(outcomes: list[Outcome]) -> str:
     n = len(outcomes)
     inside = np.mean(np.abs(error) <= Z95 * sigma, axis=0)
     rows = [
-        "| parameter | RMS error % | bound of one cut % | ratio | bias % ± s.e. | coverage % ± s.e. |",
+        "| parameter | RMS error % | bound of one set of segments % | ratio | bias % ± s.e. | coverage % ± s.e. |",
         "|---|---|---|---|---|---|",
     ]
     for j, name in enumerate(NOMINAL_NAMES):
@@ -131,21 +131,19 @@ def noise_levels(seeds: int, processes: int) -> str:
 
     In a closed loop the inputs answer the noise, which biases a plain regression more the noisier the sensors are.
     """
-    text = [f"## Bias with the noise level: {seeds} flights of 60 s, each flown at three noise levels"]
+    text = [f"## Bias with noise: {seeds} flights of 60 s at three noise levels"]
     parts = {x: study([(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
-    text += ["", "Mean error as a share of the stated standard deviation (± its standard error); coverage in %.", ""]
-    text += ["| parameter | " + " | ".join(f"noise × {x:g} | coverage" for x in NOISE_SCALES) + " |"]
-    text += ["|---" * (2 * len(NOISE_SCALES) + 1) + "|"]
+    text += [
+        "",
+        f"Mean error in stated standard deviations (standard error {1.0 / np.sqrt(seeds):.2f}), coverage in %.",
+        "",
+    ]
+    text += ["| parameter | " + " | ".join(f"noise × {x:g}" for x in NOISE_SCALES) + " |"]
+    text += ["|---" * (len(NOISE_SCALES) + 1) + "|"]
     shares = {x: np.array([o.error / o.sigma for o in part]) for x, part in parts.items()}
     for j, name in enumerate(NOMINAL_NAMES):
-        cells = [
-            f"{np.mean(z[:, j]):+.3f} ± {np.std(z[:, j]) / np.sqrt(len(z)):.3f} | "
-            f"{100.0 * np.mean(np.abs(z[:, j]) <= Z95):.1f}"
-            for z in shares.values()
-        ]
+        cells = [f"{np.mean(z[:, j]):+.2f}, {100.0 * np.mean(np.abs(z[:, j]) <= Z95):.1f}" for z in shares.values()]
         text.append(f"| {name} | " + " | ".join(cells) + " |")
-    worst = max(float(np.abs(np.mean(z, axis=0)).max()) for z in shares.values())
-    text += ["", f"The largest mean error is {worst:.2f} standard deviations."]
     return "\n".join(text)
 
 
@@ -154,7 +152,7 @@ def status(seeds: int, processes: int) -> str:
     profiles = ("hover", "one_axis", "roll_pitch")
     parts = [study([(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
     text = [
-        f"## Status: {seeds} flights of 60 s each, and the bound in %", "",
+        f"## Status in {seeds} flights of 60 s, and the bound [%]", "",
         "| parameter | " + " | ".join(profiles) + " |", "|---" * (len(profiles) + 1) + "|",
     ]  # fmt: skip
     for j, name in enumerate(NOMINAL_NAMES):
@@ -185,8 +183,8 @@ def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
 def memories(seeds: int, processes: int) -> str:
     """Section on attitude noise that is remembered for another time."""
     text = [
-        f"## Memory of the attitude noise: {seeds} flights of 120 s each, gyro scale up to 5 % hidden and fitted", "",
-        "| memory s | found s, median (least … most) | coverage of gyro scale % | RMS error, standard deviations |",
+        f"## Correlation time of attitude noise: {seeds} flights of 120 s, gyro scale of up to 5 % fitted", "",
+        "| time [s] | estimate: median (range) | gyro scale: coverage [%] | RMS error [sigma] |",
         "|---|---|---|---|",
     ]  # fmt: skip
     with multiprocessing.get_context("spawn").Pool(processes) as pool:

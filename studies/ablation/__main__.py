@@ -26,6 +26,8 @@ SHOWN = 1
 """Answers that one cell of the table tells."""
 IDLE = re.compile(r"\| [^|]+ \|( (\(of \d+\) )?(– )? ?\|){3}")
 """A row in which nothing changes."""
+NAMES = re.compile(r"\*\*\+|: [−+]\w|confident →")
+"""What a row has in which a name or a verdict changes."""
 
 
 def told(answer: Answer) -> None:
@@ -94,13 +96,22 @@ def main() -> None:
         (options.out / "ablation.md").write_text(page(rows, answers["base"], options), encoding="utf-8")
 
 
+def _sorted(rows: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+    """Subjects of rows in which nothing changes, of rows without another name or verdict, and the other rows."""
+    subject = {row: row.split(" | ")[0].removeprefix("| ") for row in rows}
+    moving = [row for row in rows if not IDLE.fullmatch(row)]
+    telling = [row for row in moving if NAMES.search(row)]
+    slight = [subject[row] for row in moving if row not in telling]
+    return [subject[row] for row in rows if row not in moving], slight, telling
+
+
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
     """The result page: rows that change something as a table, the others by name."""
     command = f"python -m studies.ablation --flights '{options.flights}'"
     command += f" --only '{options.only}'" if options.only else ""
     sizes = str(measured()).splitlines()[:3]
     right = [a for a in base if a.right is not None]
-    idle = [r.split(" | ")[0].removeprefix("| ") for r in rows if IDLE.fullmatch(r)]
+    idle, slight, telling = _sorted(rows)
     return (
         f"""# Diagnosis: ablation of rules and constants
 
@@ -115,14 +126,15 @@ Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 ## Each rule removed, each constant removed, halved and doubled
 No change of: {", ".join(idle)}.
 
-+n −n: cases that become right or wrong. The first difference is quoted: names (− no longer, + newly listed), verdict,
-error on unseen data (> 1 %), width of an interval (> 5 %), signal that the residual follows. Fits: linearisations
-(> 3 %); –: no change; (of n): fewer flights.
+Only errors, intervals or effort change (more than 3 % of linearisations): {", ".join(slight)}.
+
++n −n: cases that become right or wrong; one difference is quoted: causes (− no longer, + newly listed), verdict, error
+on unseen data (> 1 %). Fits: linearisations (> 3 %); –: no change; (of n): fewer flights.
 
 | changed | without | × 0.5 | × 2 |
 |---|---|---|---|
 """
-        + "\n".join(r for r in rows if not IDLE.fullmatch(r))
+        + "\n".join(telling)
         + "\n"
     )
 

@@ -29,7 +29,7 @@ def write(graded: Sequence[Graded], folder: Path, command: str = COMMAND) -> Pat
     ]
     singles = groups.get("single", [])
     if singles:
-        parts += [_parameters(singles), _oracle(groups), "## Which effect was named first\n"]
+        parts += [_parameters(singles), _oracle(groups), "## First finding\n"]
         confusion(singles, folder / "diagnosis-confusion.png")
         parts.append("![Hidden effect against first finding](diagnosis-confusion.png)\n")
     sizes = {float(k.split("_")[1]): v for k, v in groups.items() if k.startswith("size_")}
@@ -44,13 +44,12 @@ def write(graded: Sequence[Graded], folder: Path, command: str = COMMAND) -> Pat
 
 def _classes(groups: dict[str, list[Graded]]) -> str:
     rows = [
-        "| class | first finding right | all found | nothing else named | wholly right | verdicts | median s |",
-        "|---|---|---|---|---|---|---|",
+        "| class | all found | nothing else named | correct | verdicts | median [s] |",
+        "|---|---|---|---|---|---|",
     ]
     for name, graded in groups.items():
         hides = name not in ("null", "outside")
         cells = [
-            _count(summary.first_right(graded)) if hides else "–",
             _count(summary.all_found(graded)) if hides else "–",
             _count(summary.nothing_else(graded)),
             str(summary.wholly_right(graded)),
@@ -59,9 +58,8 @@ def _classes(groups: dict[str, list[Graded]]) -> str:
         ]
         rows.append(f"| {name} | " + " | ".join(cells) + " |")
     note = (
-        "\nWholly right: a null is left alone; an effect outside the catalogue gets no confident name; in clutter "
-        "(every effect at a twentieth of its size, one large) the large one comes first and nothing absent is named; "
-        "elsewhere exactly what was hidden is named.\n"
+        "\nCorrect: exactly the hidden effects are named; nothing on a null; no confident name for an effect outside "
+        "the catalogue; in clutter (every effect at a twentieth of its size, one large) the large one first.\n"
     )
     return "## By class\n\n" + "\n".join(rows) + "\n" + note
 
@@ -73,7 +71,7 @@ def _count(share: summary.Share) -> str:
 def _parameters(singles: Sequence[Graded]) -> str:
     errors, inside = summary.parameter_errors(singles), summary.coverage(singles)
     rows = [
-        "| effect | found | median error % | largest error % | 95 % interval holds the truth |",
+        "| effect | found | median error % | largest error % | truth in the 95 % interval |",
         "|---|---|---|---|---|",
     ]
     for effect, values in errors.items():
@@ -84,8 +82,8 @@ def _parameters(singles: Sequence[Graded]) -> str:
     everything = [e for v in errors.values() for e in v]
     total = summary.Share(sum(s.k for s in inside.values()), sum(s.n for s in inside.values()))
     rows.append(f"| **all** | {_sizes(everything)} | {total} |")
-    head = f"The rows of effects that were always found within {NEAR:.0%} and inside their intervals are left out."
-    return f"## The effect's own parameters\n\n{head}\n\n" + "\n".join(rows) + "\n"
+    head = f"Effects always found within {NEAR:.0%} and inside their intervals are left out."
+    return f"## Parameters of the effects\n\n{head}\n\n" + "\n".join(rows) + "\n"
 
 
 def _sizes(errors: Sequence[float]) -> str:
@@ -100,14 +98,14 @@ def _oracle(groups: dict[str, list[Graded]]) -> str:
         if ratios:
             high = summary.Share(sum(r >= 0.95 for r in ratios), len(ratios))
             rows.append(f"| {name} | {len(ratios)} | {np.median(ratios):.3f} | {min(ratios):.3f} | {high} |")
-    head = "## Gain on an unseen flight, relative to an oracle that knows the true structure\n\n"
+    head = "## Gain on an unseen flight, relative to the true structure\n\n"
     return head + "\n".join(rows) + "\n"
 
 
 def _misses(graded: Sequence[Graded]) -> str:
     wrong = [g for g in graded if not right(g)]
     listed = "\n".join(f"* {_told(g)}" for g in wrong)
-    return f"## Every answer that was not wholly right ({len(wrong)})\n\n{listed}\n"
+    return f"## Wrong answers ({len(wrong)})\n\n{listed}\n"
 
 
 def _told(g: Graded) -> str:

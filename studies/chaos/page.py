@@ -17,29 +17,25 @@ def page(
     """Markdown: totals, then recovery by fault."""
     lines = [
         "# Chaos: random faults at the running service", "",
-        f"`{command}` (`make chaos`), {time.strftime('%Y-%m-%d')}: `quadid serve` with its fit process, history and "
-        f"a signing key, a signed vehicle flying over MAVLink in real time; {len(entries)} faults in {minutes:.0f} min "
-        f"on {os.cpu_count()} cores, load average {np.mean([e['load'] for e in entries] or [0]):.0f} (mean).", "",
-        f"* Crashes, unasked ends, tracebacks, no recovery: **{len(crashes)}**",
-        "* Wrong publications (b, J_xx or J_yy more than 5 % off the truth, in no history, or under another set's "
-        f"number): **{len(wrong)}**, "
-        f"among {sets} sets on the wire", "",
-        "Recovery: from the end of the fault to the next estimate in the history; a window of 5 s has to be flown "
-        "first.", "",
-        "| row | fault | times | recovery s: median | longest | what was done (last) |",
-        "|---|---|---|---|---|---|",
+        f"`{command}` (`make chaos`), {time.strftime('%Y-%m-%d')}: `quadid serve` with history and signing, a signed "
+        f"vehicle flying over MAVLink in real time; {len(entries)} faults in {minutes:.0f} min on {os.cpu_count()} "
+        f"cores, load average {np.mean([e['load'] for e in entries] or [0]):.0f}.", "",
+        f"* Crashes, unexpected ends, tracebacks, no recovery: **{len(crashes)}**",
+        "* Wrong publications (b, J_xx or J_yy more than 5 % off, not in the history, or under another set's number): "
+        f"**{len(wrong)}** of {sets} sets", "",
+        "Recovery: from the end of the fault to the next estimate; a window takes 5 s.", "",
+        "| row | fault | times | recovery [s]: median, longest |",
+        "|---|---|---|---|",
     ]  # fmt: skip
     for name, (row, _) in FAULTS.items():
         found = [e for e in entries if e["name"] == name]
         times = [e["recovered"] for e in found if e["recovered"] is not None]
         if not found:
-            lines.append(f"| {row} | {name} | 0 | – | – | not drawn in this time |")
+            lines.append(f"| {row} | {name} | 0 | – |")
         elif times:
-            lines.append(
-                f"| {row} | {name} | {len(found)} | {np.median(times):.1f} | {max(times):.1f} | {found[-1]['did']} |"
-            )
+            lines.append(f"| {row} | {name} | {len(found)} | {np.median(times):.1f}, {max(times):.1f} |")
         else:
-            lines.append(f"| {row} | {name} | {len(found)} | **none** | **none** | {found[-1]['did']} |")
+            lines.append(f"| {row} | {name} | {len(found)} | **none**: {found[-1]['did']} |")
     for title, items in (("Crashes", crashes), ("Wrong", wrong)):
         if items:
             lines += ["", f"{title}:", *(f"* {item}" for item in items)]

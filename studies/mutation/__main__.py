@@ -74,16 +74,16 @@ def survivor(module: str, name: str, judged: Mapping[str, Mapping[str, str]]) ->
 def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivor]]) -> str:
     """Markdown: counts, then survivors by module."""
     lines = [
-        "# Mutation: lines of gate, active set and session spoilt one by one", "",
-        f"`make mutation`, {time.strftime('%Y-%m-%d')}, mutmut {version('mutmut')}. A mutant is the module with one "
-        "small change. Noticed: a test of those in `[tool.mutmut]` went red, or ran into its time limit. What nothing "
-        "noticed is judged by a person, line by line in `studies/mutation/judged.yaml`.", "",
-        "| module | mutants | noticed | of these by time | unnoticed | not run | noticed of those run |",
+        "# Mutation tests of gate, active set and session", "",
+        f"`make mutation`, {time.strftime('%Y-%m-%d')}, mutmut {version('mutmut')}. A mutant is detected if a test of "
+        "`[tool.mutmut]` fails or exceeds its time limit. Undetected ones are judged in "
+        "`studies/mutation/judged.yaml`.", "",
+        "| module | mutants | detected | by time limit | undetected | not run | detected of those run |",
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for module, c in counts.items():
         if not c:
-            lines.append(f"| `online/{module}.py` | – | – | – | – | **not spoilt yet** | – |")
+            lines.append(f"| `online/{module}.py` | – | – | – | – | **not run yet** | – |")
             continue
         unnoticed, waiting = sum(c[v] for v in UNNOTICED), c["not checked"]
         noticed = c.total() - unnoticed - waiting
@@ -93,7 +93,7 @@ def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivo
             f"| {share:.1f} % |"
         )
     counted = Counter(_kind(s) for found in left.values() for s in found)
-    lines += ["", "Of the unnoticed: " + "; ".join(f"{count} {what}" for what, count in counted.most_common()) + "."]
+    lines += ["", "Undetected: " + "; ".join(f"{count} {what}" for what, count in counted.most_common()) + "."]
     return "\n".join(lines) + "\n"
 
 

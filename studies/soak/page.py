@@ -16,9 +16,9 @@ Result = Mapping[str, Any]
 def page(results: Result) -> str:
     """Markdown of the parts that were measured."""
     out = [
-        "# Soak: memory, files, latency and lost samples over many hours", "",
-        "`make soak`, or `python -m studies.soak --only accelerated|live`. The accelerated part drives session, fits, "
-        "diagnoses and history in one process; the part in real time is the node over DDS with its fit process.", "",
+        "# Soak", "",
+        "`make soak`: session, fits, diagnoses and history in one process at accelerated time; the node over DDS with "
+        "its fit process in real time. Points over time are in `soak.json`.", "",
     ]  # fmt: skip
     for name, title, write in (
         ("accelerated", "At accelerated time", _accelerated), ("live", "In real time", _live),
@@ -40,20 +40,14 @@ def _accelerated(r: Result) -> list[str]:
     )
     lines = [
         f"**{last['hours']:.1f} h of flight**{short} in {r['wall_seconds'] / 60:.0f} min: {FLIGHT:.0f} s flown, "
-        f"{GROUND:.0f} s of silence, and again; a fit every {r['refit']:.0f} s, a diagnosis every "
-        f"{r['diagnose']:.0f} s ({last['fits']} in all), {last['published']} sets published. The history keeps the "
-        f"newest {r['kept']} candidates and events here, so that its limit is reached (in service "
-        f"{KEPT['candidates']} and {KEPT['events']}).", "",
+        f"{GROUND:.0f} s of silence, and again; {last['fits']} fits, a diagnosis every {r['diagnose']:.0f} s, "
+        f"{last['published']} sets published. The history keeps the newest {r['kept']} candidates and events here (in "
+        f"service {KEPT['candidates']} and {KEPT['events']}).", "",
         f"Samples sent {last['sent']:,}, taken {last['taken']:,}, dropped {last['dropped']:,}: "
-        f"**{last['sent'] - last['taken'] - last['dropped']} lost without a word**. Slopes over the last three "
-        f"quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files {slope(points, 'files_mib'):+.3f} MiB/h, "
-        f"processor time {slope(points, 'us_a_sample'):+.3f} us a sample per hour.", "",
-        "| flight h | memory MiB | history MiB | us a sample |",
-        "|---|---|---|---|",
-    ]  # fmt: skip
-    chosen = points[:: -max(len(points) // 3, 1)][::-1]
-    lines += [
-        f"| {p['hours']:.1f} | {p['memory_mib']:.1f} | {p['files_mib']:.1f} | {p['us_a_sample']:.1f} |" for p in chosen
+        f"**{last['sent'] - last['taken'] - last['dropped']} lost**. Memory {last['memory_mib']:.0f} MiB at the end. "
+        f"Slopes over the last three quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files "
+        f"{slope(points, 'files_mib'):+.3f} MiB/h, processor time {slope(points, 'us_a_sample'):+.3f} us a sample per "
+        "hour.",
     ]  # fmt: skip
     return lines
 
@@ -65,24 +59,17 @@ def _live(r: Result) -> list[str]:
     p99 = np.array([m["p99"] for m in minutes if m["p99"] is not None])
     third = max(len(p99) // 3, 1)
     lines = [
-        f"**{points[-1]['hours'] * 60:.0f} min**; IMU 100 Hz, everything else 100 Hz, a fit every second, a diagnosis "
-        f"every minute: {minutes[-1]['fits']} fits, set {minutes[-1]['in_force']} in force at the end, exit code "
-        f"{r['exit_code']}, {len(r['problems'])} warnings or errors said.", "",
+        f"**{points[-1]['hours'] * 60:.0f} min**; all inputs at 100 Hz, a fit every second, a diagnosis every minute: "
+        f"{minutes[-1]['fits']} fits, set {minutes[-1]['in_force']} in force at the end, exit code {r['exit_code']}, "
+        f"{len(r['problems'])} warnings or errors.", "",
         f"Messages sent {sum(sent.values()):,}, taken {sum(taken.values()):,}; "
         f"**lost: {', '.join(f'{t} {n}' for t, n in lost.items() if n) or 'none'}**; samples dropped by the session: "
         f"{minutes[-1]['dropped'] or 'none'}. Slopes over the last three quarters: memory "
         f"{slope(points, 'memory_mib'):+.2f} MiB/h, fit process {slope(points, 'worker_mib'):+.2f} MiB/h, files "
-        f"{slope(points, 'files_mib'):+.2f} MiB/h. IMU latency p99, median of the minutes: first third "
-        f"{np.median(p99[:third]):.1f} ms, last third {np.median(p99[-third:]):.1f} ms (other programs share the "
-        f"machine).", "",
-        "| min | memory MiB | fit process MiB | history and log MiB | handles | load average |",
-        "|---|---|---|---|---|---|",
-    ]  # fmt: skip
-    every = max(len(points) // 3, 1)
-    lines += [
-        f"| {60 * p['hours']:.0f} | {p['memory_mib']:.1f} | {p['worker_mib']:.1f} | {p['files_mib']:.2f} | "
-        f"{p['handles']:.0f} | {p['load']:.1f} |" for p in points[::-every][::-1]
+        f"{slope(points, 'files_mib'):+.2f} MiB/h; handles {points[0]['handles']:.0f} → {points[-1]['handles']:.0f}. "
+        f"IMU latency p99: first third {np.median(p99[:third]):.0f} ms, last third {np.median(p99[-third:]):.0f} ms "
+        f"(load average {points[0]['load']:.0f} → {points[-1]['load']:.0f}).",
     ]  # fmt: skip
     if r["problems"]:
-        lines += ["", "Said: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]
+        lines += ["", "Warnings: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]
     return lines
