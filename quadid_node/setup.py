@@ -18,6 +18,7 @@ setup(
         (f"share/{NAME}/config", sorted(glob("config/*"))),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
     zip_safe=True,
     maintainer="The quadid developers",
     maintainer_email="quadid@users.noreply.github.com",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,17 @@ def test_node_builds_and_lands_where_ros2_looks(options: list[str], tmp_path: Pa
     colcon(tmp_path, "build", *options, "--base-paths", str(package))
     assert_layout(tmp_path / "install" / "quadid_node", package)
     assert sorted(path.name for path in package.iterdir()) == before, "the build left something in the checkout"
+
+
+def test_colcon_runs_the_tests_of_the_node(tmp_path: Path, repository: Path) -> None:
+    package = str(repository / "quadid_node")
+    colcon(tmp_path, "build", "--base-paths", package)
+    colcon(tmp_path, "test", "--base-paths", package, "--return-code-on-test-failure")
+    told = colcon(tmp_path, "test-result", "--all")
+    counted = re.search(r"Summary: (\d+) tests, (\d+) errors, (\d+) failures", told)
+    assert counted is not None, told
+    assert int(counted[1]) >= 5
+    assert counted[2] == counted[3] == "0"
 
 
 @pytest.mark.slow

@@ -1,0 +1,43 @@
+"""What `colcon test` asks of this package without a running middleware: its manifest, its launch files, its lint."""
+
+from __future__ import annotations
+
+import ast
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1]
+ROS = ("_msgs", "_interfaces", "_srvs")
+"""Ends of the names of interface packages; the others begin with one of:"""
+LIBRARIES = ("rclpy", "ament_", "launch", "rosidl_", "rpyutils", "tf2_")
+
+
+def depends(kind: str) -> set[str]:
+    """Packages that the manifest names for a purpose."""
+    return {element.text or "" for element in ET.parse(PACKAGE / "package.xml").findall(kind)}
+
+
+def test_every_ros_package_that_is_imported_is_named() -> None:
+    roots = set()
+    for file in (*PACKAGE.glob("quadid_node/*.py"), *PACKAGE.glob("launch/*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            roots |= {name.split(".")[0] for name in names}
+    used = {name for name in roots if name.endswith(ROS) or name.startswith(LIBRARIES)}
+    assert {"rclpy", "launch_ros"} <= used
+    missing = used - depends("exec_depend")
+    assert not missing, f"package.xml: name {sorted(missing)} as exec_depend"
+
+
+@pytest.mark.parametrize("file", sorted(PACKAGE.glob("launch/*.launch.py")), ids=lambda file: file.name)
+def test_a_launch_file_has_what_ros2_launch_calls(file: Path) -> None:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    assert "generate_launch_description" in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+
+
+def test_the_manifest_is_valid_by_its_schema() -> None:
+    xmllint = pytest.importorskip("ament_xmllint.main", reason="on no package index: runs where ROS is installed")
+    assert xmllint.main(argv=[str(PACKAGE)]) == 0
