@@ -6,6 +6,18 @@ for action in session.poll(): ...           what to fit, publish and journal
 session.deliver(job.run())                  the answer to a `Job`
 
 The same samples, commands and seed give the same actions bit for bit, however `push` and `poll` are interleaved.
+
+What stands between samples and the parameter topic, in this order; each says why it holds something back:
+
+    resampler           a sample belongs to a channel, is finite, and in time
+    consistency         gyro, attitude and accelerometer agree; while they do not, nothing is learned
+    grid_buffer         a window has gyro, rotors and four fifths of its rows
+    quality             no sensor is stuck or saturated, units fit, the vehicle flies
+    window_fit          the motion reveals roll and pitch, or there is no estimate
+    answered            a reply can be one to its request
+    fusion              the window agrees with those before it, or is left out
+    gate                the fused estimate is possible, narrow, agreed upon, better than the set in force, and near it
+    active_set          a person approves where that is wanted; what predicts worse than its predecessor is taken back
 """
 
 from quadid.online.gate import GateSettings
@@ -16,11 +28,11 @@ from quadid.online.records import (
     OnlineSet,
     Phase,
     Publish,
+    SessionStatus,
     SetState,
 )
 from quadid.online.session import Session
 from quadid.online.settings import SessionSettings
-from quadid.online.status import SessionStatus
 from quadid.online.window_fit import FitReply, FitRequest
 
 __all__ = [

@@ -15,7 +15,6 @@ from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 if TYPE_CHECKING:
@@ -29,8 +28,6 @@ _SIX = len(NOMINAL_NAMES)
 
 def answers(request: FitRequest, reply: FitReply) -> bool:
     """Whether a reply has the form of an answer to this request."""
-    if reply.vehicle is not None and not _is_same(reply.vehicle, request.vehicle):
-        return False
     channels = {min((_channels(w) for w in request.windows), default=0)}
     if request.noise is not None:
         channels.add(len(request.noise.white))
@@ -41,11 +38,6 @@ def answers(request: FitRequest, reply: FitReply) -> bool:
         and (reply.theta is None or _is_vector(reply.theta, request.theta, no_numbers))
         and (reply.estimate is None or _is_estimate(reply.estimate, request))
     )
-
-
-def _is_same(other: Vehicle, vehicle: Vehicle) -> bool:
-    """Whether two differ in nothing but first guesses."""
-    return other.model_copy(update={"parameters": vehicle.parameters}) == vehicle
 
 
 def _channels(window: Window) -> int:

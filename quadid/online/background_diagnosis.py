@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from quadid.chi_square import Z95
 from quadid.errors import QuadidError
+from quadid.online.consistency import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, Diagnosed, OnlineFinding
@@ -75,11 +76,18 @@ def _online(f: Finding) -> OnlineFinding:
 
 
 class BackgroundDiagnosis:
-    """Asks for diagnoses of one vehicle, and tells what is new in their answers."""
+    """Asks for diagnoses of one vehicle, and tells what is new in their answers.
 
-    def __init__(self, vehicle: Vehicle, store: GridBuffer, every: float, seed: int) -> None:
-        """Studies the rows of `store` every so many seconds of flight [s]; 0: never."""
-        self._vehicle, self._store, self._every, self._seed = vehicle, store, every, seed
+    Attributes:
+        wrong_scale: what the last answer says of a sensor's scale, too large for calibrated ones; empty: nothing.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, store: GridBuffer, every: float, seed: int, stamp: Callable[[float], float]
+    ) -> None:
+        """Studies the rows of `store` every so many seconds of flight [s]; 0: never; `stamp` as of `Outbox`."""
+        self._vehicle, self._store, self._every, self._seed, self._stamp = vehicle, store, every, seed, stamp
+        self.wrong_scale = ""
         self._asked: DiagnosisRequest | None = None
         self._reply: DiagnosisReply | None = None
         self._last = -math.inf
@@ -109,8 +117,8 @@ class BackgroundDiagnosis:
         if self._asked is not None and self._asked.is_answered_by(reply) and isinstance(reply, DiagnosisReply):
             self._reply = reply
 
-    def answer(self, tick: float, since: float) -> tuple[DiagnosisRequest, DiagnosisReply] | None:
-        """What was asked and found, when it is time to use it.
+    def answer(self, tick: float, since: float) -> Diagnosed | None:
+        """What there is to publish of an answer, when it is time to use it; None where it was said before.
 
         Args:
             tick: now [s].
@@ -122,27 +130,20 @@ class BackgroundDiagnosis:
         self._asked = self._reply = None
         if asked.start < since:
             return None
-        return asked, reply
-
-    def news(self, asked: DiagnosisRequest, reply: DiagnosisReply, stamp: Callable[[float], float]) -> Diagnosed | None:
-        """What there is to publish of an answer; None when it was said before.
-
-        Args:
-            asked: the question.
-            reply: its answer.
-            stamp: turns session time into time of the stamps [s].
-        """
+        self.wrong_scale = next((f.evidence for f in reply.findings if f.confident and _is_wrong_scale(f)), "")
         if reply.problem or (self._told is not None and _same(self._told, reply)):
             return None
-        self._told = reply
-        findings = tuple(_stamped(f, stamp) for f in reply.findings)
-        return Diagnosed(stamp(asked.stop), stamp(asked.start), stamp(asked.stop), findings, reply.verdict)
+        self._told, stop = reply, self._stamp(asked.stop)
+        return Diagnosed(stop, self._stamp(asked.start), stop, tuple(map(self._stamped, reply.findings)), reply.verdict)
+
+    def _stamped(self, finding: OnlineFinding) -> OnlineFinding:
+        if "time" not in finding.values:
+            return finding
+        return replace(finding, values={**finding.values, "time": self._stamp(finding.values["time"])})
 
 
-def _stamped(finding: OnlineFinding, stamp: Callable[[float], float]) -> OnlineFinding:
-    if "time" not in finding.values:
-        return finding
-    return replace(finding, values={**finding.values, "time": stamp(finding.values["time"])})
+def _is_wrong_scale(finding: OnlineFinding) -> bool:
+    return finding.effect == "gyro_scale" and max(map(abs, finding.values.values()), default=0.0) > ALLOWED
 
 
 def _same(old: DiagnosisReply, new: DiagnosisReply) -> bool:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.online.resampler import Rows
+from quadid.online.rows import Rows
 from quadid.turning import down, integrated, turn
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
@@ -69,7 +69,7 @@ class Factor:
         return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
 
 
-class _Lately:
+class _Fading:
     """Moments of data that tell a factor, fading; what is older than `GONE` leaves no trace."""
 
     def __init__(self, *shape: int) -> None:
@@ -99,8 +99,8 @@ class Consistency:
     def restart(self) -> None:
         """Begins anew: another stream."""
         # Moments of (1, turn by gyro, change of rate, tilt, turn by attitude), an axis each.
-        self._turns = [_Lately(5, 5) for _ in AXES]
-        self._force = _Lately()
+        self._turns = [_Fading(5, 5) for _ in AXES]
+        self._force = _Fading()
 
     def add(self, rows: Rows | None) -> None:
         """Takes in rows of a second or so."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,10 +13,11 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.layout import B, Layout
 from quadid.model.thrust import ThrustModel
+from quadid.online.active_set import ActiveSet
+from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import DRIFT, Fusion, WindowEstimate
 from quadid.online.gate import Case
 from quadid.online.grid_buffer import Cut
-from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
@@ -61,11 +63,13 @@ class Estimator:
         self.vehicle, self._memory, self._seed = vehicle, memory, seed
         self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
-        self._asked: tuple[Window, ...] = ()
-        self.take_model(vehicle, flexible=False)
+        self._begin(vehicle, flexible=False)
 
-    def take_model(self, model: Vehicle, flexible: bool) -> None:
-        """Fits later windows with `model`, whose parameters are first guesses; nothing else is kept."""
+    def fit_along(self) -> None:
+        """Later windows are fitted with every effect that moves the vehicle; what was learned is forgotten."""
+        self._begin(with_room(self.vehicle), flexible=True)
+
+    def _begin(self, model: Vehicle, flexible: bool) -> None:
         self.model, self.flexible = model, flexible
         self._layout = Layout(model)
         self._initial = self._layout.initial(model)
@@ -131,30 +135,27 @@ class Estimator:
 
     def request(self, number: int, cut: Cut, start: float, stop: float) -> FitRequest:
         """The fit of a window."""
-        self._asked = cut.windows
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
             number, self.model, cut.windows, start, stop, self.theta, self.noise, self._search, self._seed, measure,
             self.flexible, cut.spacing,
         )  # fmt: skip
 
-    def take(self, reply: FitReply, trusted: bool) -> None:
-        """Fuses a reply; one that is not trusted (it disagrees) leaves the estimate as it was."""
+    def take(self, request: FitRequest, reply: FitReply) -> None:
+        """Fuses a reply, where it holds an estimate."""
         if reply.excitation is not None:
             self.excitation = reply.excitation
-        if reply.estimate is None or reply.theta is None or not trusted:
+        if reply.estimate is None or reply.theta is None:
             return
         self._pool_noise(reply)
         if reply.misfit is not None:
             self.misfit = reply.misfit
         self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
-        for window in self._asked:
+        for window in request.windows:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
             self.start = window.t0 if math.isnan(self.start) else self.start
-        dt = self._asked[0].dt if self._asked else 0.0
-        if dt:
-            new = reply.estimate.stop - max(self.fusion.counted, reply.estimate.start)
-            self.rows += round(max(new, 0.0) / dt)
+        new = reply.estimate.stop - max(self.fusion.counted, reply.estimate.start)
+        self.rows += round(max(new, 0.0) / request.windows[0].dt)
         self.fusion.add(reply.estimate)
         self._search = False
         fused = self.fusion.estimate()
@@ -224,32 +225,25 @@ class Estimator:
         return self._free.scaled(theta[self._free.index])
 
     def case(
-        self, parameters: ParameterSet, quality: Quality, reply: FitReply, in_force: OnlineSet | None,
-        baseline: OnlineSet | None, approval: str, most: int, seen: float, unexplained: str,
-        unproven: str,
-    ) -> Case:  # fmt: skip
-        """What the gate needs to know about the present estimate.
+        self, parameters: ParameterSet, request: FitRequest, reply: FitReply, sets: ActiveSet, windows: int
+    ) -> Case:
+        """What the gate needs to know about the present estimate; what speaks against the sensors is not in it.
 
         Args:
             parameters: the estimate.
-            quality: of the newest window.
-            reply: its fit.
-            in_force: as in `Case`.
-            baseline: as in `Case`.
-            approval: as in `Case`.
-            most: windows whose agreement is asked for.
-            seen: end of the data that the set in force rests on [s]; minus infinity for none of this flight.
-            unexplained: as in `Case`.
-            unproven: as in `Case`.
+            request: of the newest fit.
+            reply: its answer.
+            sets: what was published before.
+            windows: whose agreement is asked for.
         """
-        agreeing, odd = self.fusion.agreement(max(most, 3))
+        most = max(windows, 3)
+        agreeing, odd = self.fusion.agreement(most)
         disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
-        gains = self._held_out(in_force, seen)
-        ratio = self._thrust_ratio()
+        missed = () if reply.between_rows is None else zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)
         return Case(
-            parameters, quality, reply.excited, ratio, agreeing, disagreement, gains, in_force, baseline, approval,
-            self.fusion.counted - seen, unexplained, unproven, self._stated, self._walked(max(most, 3)),
-            {} if reply.between_rows is None else dict(zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)),
+            parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
+            self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
+            self.fusion.counted - sets.seen, stated=self._stated, walked=self._walked(most), between_rows=dict(missed),
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:
@@ -284,11 +278,11 @@ class Estimator:
                 out.append((window.deviance(reference) - window.deviance(earlier)) / self._scatter)
         return tuple(out)
 
-    def _thrust_ratio(self) -> float:
-        """Thrust by the model over what the accelerometer felt, newest window."""
-        lift = [-w.accel[:, 2] for w in self._asked if w.accel is not None]
+    def _thrust_ratio(self, windows: Sequence[Window]) -> float:
+        """Thrust by the model over what the accelerometer felt."""
+        lift = [-w.accel[:, 2] for w in windows if w.accel is not None]
         felt = float(np.nanmean(np.concatenate(lift))) if lift else GRAVITY
-        total = float(np.mean(np.concatenate([self.thrust.total(w.rotor_speed) for w in self._asked])))
+        total = float(np.mean(np.concatenate([self.thrust.total(w.rotor_speed) for w in windows])))
         return total / (self.vehicle.mass * max(felt, 1e-3))
 
 

@@ -52,8 +52,23 @@ LASTING = 75.0
 long windows err alike, and what they miss counts once."""
 ROLL_PITCH = [NOMINAL_NAMES.index(name) for name in ("J_xx", "J_yy")]
 """One set of sticks, loops and readings: two tries at the size of one error."""
+ROOM = 16.0
+"""A bare guess may be wrong by this factor each way; how sure it is stays as it was.
+
+What the nominal model made of a flight that it misses is no better guess: it may be wrong by as much.
+"""
 MOVING = ("command", "rotor", "air", "body")
 """Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
+
+
+def with_room(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with wide bounds about its bare guesses, as sure of these as before; bounds that it gives stay."""
+    parameters = {}
+    for name, given in vehicle.parameters.items():
+        bounds = given.bounds or (given.initial / ROOM, given.initial * ROOM)
+        sigma = given.sigma or (None if given.bounds else given.log_sigma * given.initial)
+        parameters[name] = given.model_copy(update={"bounds": bounds, "sigma": sigma})
+    return vehicle.model_copy(update={"parameters": parameters})
 
 
 def moving_names(problem: Shooting) -> list[str]:

@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from quadid.model.layout import Layout
-from quadid.online.resampler import Rows
+from quadid.online.rows import Rows
 from quadid.resample import median
 from quadid.turning import conjugate, rotated
 from quadid.types import FloatArray

@@ -89,25 +89,6 @@ class Fused:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How a window agrees with what was known before it.
-
-    Attributes:
-        statistic: squared Mahalanobis distance; limit: its allowed value.
-        known: False when nothing was known before it.
-    """
-
-    statistic: float
-    limit: float
-    known: bool = True
-
-    @property
-    def agrees(self) -> bool:
-        """True when the window fits what was known."""
-        return not self.known or self.statistic <= self.limit
-
-
-@dataclass(frozen=True)
 class _Sum:
     """Accumulated information up to a time."""
 
@@ -145,16 +126,14 @@ class Fusion:
         self.windows.clear()
         self._sums.clear()
 
-    def judge(self, window: WindowEstimate) -> Verdict:
-        """Compares a window with the estimate from data before it (chi-square with the honest drift allowed)."""
+    def agrees(self, window: WindowEstimate) -> bool:
+        """Whether a window fits the estimate from data before it, where there is one (chi-square)."""
         earlier = self._before(window.start)
-        limit = exceeded(CHANGE_PROBABILITY, len(self._mean))
         if earlier is None:
-            return Verdict(0.0, limit, known=False)
-        before, own = self._solve(earlier), self.alone(window)
-        spread = before.covariance + own.covariance + np.diag(self.drift**2)
-        difference = own.z - before.z
-        return Verdict(float(difference @ np.linalg.solve(spread, difference)), limit)
+            return True
+        before = self._solve(earlier)
+        distance = self._distance(window, before.z, before.covariance + np.diag(self.drift**2))
+        return distance <= exceeded(CHANGE_PROBABILITY, len(self._mean))
 
     def add(self, window: WindowEstimate) -> None:
         """Takes a window in, with the share of its time that is new."""
@@ -197,19 +176,15 @@ class Fusion:
         windows = self.disjoint()
         if len(windows) < 3:
             return 1.0
-        total = 0.0
-        for window in windows:
-            own = self.alone(window)
-            difference = own.z - z
-            total += float(difference @ np.linalg.solve(own.covariance, difference))
+        total = sum(self._distance(window, z, 0.0) for window in windows)
         freedom = len(z) * (len(windows) - 1)
         return max((total + SCATTER_PRIOR) / (freedom + SCATTER_PRIOR), 1.0)
 
-    def distance(self, window: WindowEstimate, z: FloatArray) -> float:
-        """Squared Mahalanobis distance of a window's own estimate from `z`, honest drift allowed."""
-        own = self.alone(window)
+    def _distance(self, window: WindowEstimate, z: FloatArray, covariance: FloatArray | float) -> float:
+        """Squared Mahalanobis distance of a window's own estimate from `z`, which has a covariance too."""
+        own = self._alone(window)
         difference = own.z - z
-        return float(difference @ np.linalg.solve(own.covariance + np.diag(self.drift**2), difference))
+        return float(difference @ np.linalg.solve(own.covariance + covariance, difference))
 
     def agreement(self, most: int) -> tuple[int, tuple[int, float] | None]:
         """How many of the newest disjoint windows agree in a row with the fused estimate, `most` at most.
@@ -220,7 +195,7 @@ class Fusion:
         windows = self.disjoint(most) if fused is not None else []
         limit = exceeded(AGREEMENT_PROBABILITY, len(self._mean))
         for agreeing, window in enumerate(windows):
-            if fused is not None and self.distance(window, fused.z) > limit:
+            if fused is not None and self._distance(window, fused.z, np.diag(self.drift**2)) > limit:
                 spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.drift**2)
                 away = window.z - fused.z
                 farthest = int(np.argmax(np.abs(away) / spread))
@@ -237,14 +212,14 @@ class Fusion:
         windows = self.disjoint(most)
         if len(windows) < 2:
             return None
-        newest, oldest = self.alone(windows[0]), self.alone(windows[-1])
+        newest, oldest = self._alone(windows[0]), self._alone(windows[-1])
         variance = share @ (newest.covariance + oldest.covariance) @ share
         return float(share @ (newest.z - oldest.z)), math.sqrt(variance)
 
     def _before(self, start: float) -> _Sum | None:
         return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)
 
-    def alone(self, window: WindowEstimate) -> Fused:
+    def _alone(self, window: WindowEstimate) -> Fused:
         """What a window says with nothing but the prior."""
         matrix = window.scale * window.information
         vector = window.scale * (window.information @ window.z - window.score)

@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.chi_square import Z95
 from quadid.identify.covariance import PRIOR_SHARE
-from quadid.online.quality import Quality
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
 
@@ -62,7 +61,6 @@ class Case:
 
     Attributes:
         parameters: the estimate.
-        quality: of the newest window.
         excited: whether the newest window revealed anything.
         thrust_ratio: thrust by this estimate over measured specific force times mass, newest window.
         agreeing: windows without a common sample, newest first, that agree with it, up to the first that does not.
@@ -81,7 +79,6 @@ class Case:
     """
 
     parameters: ParameterSet
-    quality: Quality
     excited: bool
     thrust_ratio: float
     agreeing: int
@@ -134,14 +131,6 @@ def _doubled(settings: GateSettings) -> GateSettings:
     return settings.model_copy(update=wide)
 
 
-def _quality(case: Case, settings: GateSettings) -> str | None:
-    return case.quality.fault or None
-
-
-def _flying(case: Case, settings: GateSettings) -> str | None:
-    return case.quality.grounded or None
-
-
 def _sensors(case: Case, settings: GateSettings) -> str | None:
     return case.unproven or None
 
@@ -187,7 +176,8 @@ def _width(case: Case, settings: GateSettings) -> str | None:
                 missed = Z95 * case.between_rows.get(p.name, 0.0)
                 text = f"{p.name} is known to {half:.2%} only, wanted {settings.width:.2%}: keep flying"
                 unseen = f"; what the rotors do between readings moves it by {missed:.0%}"
-                return f"{text}{unseen}: log faster, or fly more smoothly" if missed > settings.width else text
+                way = "log motors faster (80 Hz, not 50), or fly more smoothly"
+                return f"{text}{unseen}: {way}" if missed > settings.width else text
         elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
             return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
     return None
@@ -283,8 +273,6 @@ def _gain_text(case: Case) -> str:
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
-    ("data_quality", _quality),
-    ("flying", _flying),
     ("excitation", _excitation),
     ("model", _model),
     ("physical_bounds", _bounds),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.online.resampler import Rows
+from quadid.online.rows import Rows
 from quadid.resample import true_runs
 from quadid.types import BoolArray, FloatArray
 from quadid.window import Window
@@ -57,10 +57,6 @@ class GridBuffer:
         total = sum(len(b.t) for b in self._blocks)
         while total - len(self._blocks[0].t) >= self._most:
             total -= len(self._blocks.pop(0).t)
-
-    def clear(self) -> None:
-        """Forgets everything."""
-        self._blocks.clear()
 
     def span(self, start: float, stop: float) -> Rows | None:
         """Rows with start <= t < stop, whatever they hold; None when there are none."""

@@ -1,4 +1,4 @@
-"""What a session hands out: parameter sets with their story, findings, and events worth a line in the history."""
+"""What a session hands out: parameter sets with their story, findings, events for the history, its status."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from quadid.health.trims import FlightTrim
 from quadid.parameters import ParameterSet
+from quadid.types import FloatArray
 
 WAITS = "waits for approval: "
 """Begins the reason of a set that passed every check; what follows stays true once it is approved."""
@@ -165,3 +166,38 @@ class Event:
     level: str
     kind: str
     text: str
+
+
+@dataclass(frozen=True)
+class SessionStatus:
+    """What a session is doing.
+
+    Attributes:
+        t: newest sample [s, time of the stamps]; NaN before the first.
+        phase: what; reason: why, and what would change it.
+        excitation: relative standard deviation of each nominal parameter that the newest window allows; NaN: unknown.
+        samples: grid rows in the newest window; window_seconds: usable time in it [s]; gaps: cuts in it.
+        mse: of the newest window, 1 at the noise floor; NaN before.
+        fits, rejected: fits done, and those the gate refused.
+        in_force, pending: sequence numbers, 0 for none; stale: the set in force is from an earlier run.
+        approval: auto or manual, now.
+        faults: dropped samples by reason.
+        backlog: time of data that waits for a running fit [s].
+    """
+
+    t: float
+    phase: Phase
+    reason: str
+    excitation: FloatArray
+    samples: int
+    window_seconds: float
+    gaps: int
+    mse: float
+    fits: int
+    rejected: int
+    in_force: int
+    pending: int
+    stale: bool
+    approval: str
+    faults: Mapping[str, int]
+    backlog: float

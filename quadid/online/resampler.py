@@ -20,13 +20,13 @@ from quadid.mounting import in_body_axes
 from quadid.online.channel_buffer import ChannelBuffer
 from quadid.online.clock import StreamClock
 from quadid.online.command_reconstruction import CommandReconstruction
-from quadid.online.grid_columns import columns_on_grid
+from quadid.online.rows import Rows, columns_on_grid
 from quadid.resample import HALF_WIDTH, lowpass
 from quadid.resampling_plan import make_plan
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import CHANNELS, Block, Recording, Sample, Sampling
+from quadid.window import CHANNELS, Block, Recording, Sample
 
 SETTLE = 0.5
 """Rows leave this long [s] after their time, so that slower and delayed channels are there."""
@@ -38,28 +38,6 @@ _LARGE = 1e150
 _COUNT = " values instead of "
 MOST_SAMPLES = 400_000
 """A channel holds no more samples than this; a flood beyond is dropped and counted."""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Consecutive rows of the grid.
-
-    Attributes:
-        t: times [s], shape (n,).
-        columns: values by channel, NaN where nothing was measured; only channels that say something.
-        sampling: meaning of the rotor rows; source: where the rotor speeds come from.
-        fresh: True when the grid was anchored anew before the first row: nothing may be joined across.
-        problem: why there are no rotor speeds, or empty.
-        spacing: time between two readings of the rotors [rows].
-    """
-
-    t: FloatArray
-    columns: dict[str, FloatArray]
-    sampling: Sampling
-    source: str
-    fresh: bool = False
-    problem: str = ""
-    spacing: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,10 @@ from quadid.online.health_supervisor import HealthSupervisor
 from quadid.online.jobs import Job, JobReply
 from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality
-from quadid.online.records import OnlineSet, Phase, Publish, SetState
-from quadid.online.resampler import Resampler, Rows
+from quadid.online.records import OnlineSet, Phase, Publish, SessionStatus, SetState
+from quadid.online.resampler import Resampler
+from quadid.online.rows import Rows
 from quadid.online.settings import SessionSettings
-from quadid.online.status import SessionStatus
 from quadid.online.supervisor import Supervisor
 from quadid.online.window_fit import is_excited
 from quadid.online.window_supervisor import WindowSupervisor
@@ -77,15 +77,17 @@ class Session:
         self._consistency = Consistency()
         self._change_supervisor = ChangeSupervisor(vehicle, self._store)
         self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
-        self._diagnosis = BackgroundDiagnosis(vehicle, self._store, self.settings.diagnose, self.settings.seed)
+        self._diagnosis = BackgroundDiagnosis(
+            vehicle, self._store, self.settings.diagnose, self.settings.seed, self._outbox.stamp
+        )
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
         self._supervisor = Supervisor(
-            self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency
+            self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency, self._diagnosis
         )
         self._windows = WindowSupervisor(vehicle, self._store, self.settings, self._outbox, self._supervisor)
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
-        self._land: Callable[[Any], Iterator[None]] = iter
+        self._on_reply: Callable[[Any], Iterator[None]] = iter
         self._outdated = 0
         self._now, self._tick_at = -math.inf, math.nan
         self._work: Iterator[None] | None = None
@@ -129,7 +131,7 @@ class Session:
 
     def fit_now(self) -> Answer:
         """Fits what there is at the next tick, without waiting for a full window."""
-        self._windows.hurry()
+        self._windows.fit_now()
         return Answer(True, "a fit follows at the next tick of the data")
 
     # --- output
@@ -227,7 +229,7 @@ class Session:
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
         self._consistency.add(self._store.span(tick - self._tick - _EPS, tick - _EPS))
-        if not self._supervisor.trusts(tick):
+        if not self._supervisor.sensors_agree(tick):
             self._change_supervisor.restart()
             return
         yield
@@ -237,28 +239,28 @@ class Session:
             what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
             self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
         self._health.look(tick)
-        self._study(tick)
+        self._diagnose(tick)
         yield
         if self._change_supervisor.seen is not None:
-            self._explain(tick)
+            self._isolate(tick)
         elif self._windows.due(tick):
             yield from self._fit(tick)
 
-    def _study(self, tick: float) -> None:
+    def _diagnose(self, tick: float) -> None:
         """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
         estimator, supervisor = self._estimator, self._supervisor
-        answered = self._diagnosis.answer(tick, supervisor.learn_from)
-        if answered is not None:
-            supervisor.diagnosed(*answered, self._diagnosis)
+        told = self._diagnosis.answer(tick, supervisor.learn_from)
+        if told is not None:
+            self._outbox.act(told)
         moving = estimator.learned and is_excited(estimator.excitation)
-        if moving and self._change_supervisor.seen is None and supervisor.quality == Quality():
+        if moving and self._change_supervisor.seen is None and self._windows.quality == Quality():
             since = max(supervisor.learn_from, estimator.start)
             request = self._diagnosis.ask(self._number + 1, tick, since)
             if request is not None:
                 self._number = request.number
                 self._outbox.act(request)
 
-    def _explain(self, tick: float) -> None:
+    def _isolate(self, tick: float) -> None:
         assert self._change_supervisor.seen is not None
         stamp = self._outbox.stamp(self._change_supervisor.seen.at)
         request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
@@ -280,13 +282,13 @@ class Session:
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
-        yield from self._land(reply)
+        yield from self._on_reply(reply)
 
     def _changed(self, request: ChangeRequest, reply: ChangeReply) -> Iterator[None]:
         self._change_supervisor.restart()
         self._supervisor.changed(request, reply)
         yield
 
-    def _await(self, job: Job, land: Callable[[Any], Iterator[None]]) -> None:
-        """Stands still until the reply to a job is there; `land` takes it in."""
-        self._number, self._waiting, self._land = job.number, job, land
+    def _await(self, job: Job, on_reply: Callable[[Any], Iterator[None]]) -> None:
+        """Stands still until the reply to a job is there; `on_reply` takes it in."""
+        self._number, self._waiting, self._on_reply = job.number, job, on_reply

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 from quadid.online.active_set import ActiveSet
-from quadid.online.background_diagnosis import BackgroundDiagnosis, DiagnosisReply, DiagnosisRequest
-from quadid.online.consistency import ALLOWED, Consistency
+from quadid.online.background_diagnosis import BackgroundDiagnosis
+from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.gate import GateSettings, decide
 from quadid.online.outbox import Outbox
-from quadid.online.quality import Quality
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
+from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
 
 _EPS = 1e-6
 
@@ -26,31 +25,28 @@ class Supervisor:
 
     Attributes:
         learn_from: nothing before this time is learned from [s].
-        quality: of the newest window.
         fits, rejected: fits done, and those the gate refused.
     """
 
     def __init__(
-        self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings, consistency: Consistency
-    ) -> None:
+        self, estimator: Estimator, active_set: ActiveSet, outbox: Outbox, gate: GateSettings, consistency: Consistency,
+        diagnosis: BackgroundDiagnosis,
+    ) -> None:  # fmt: skip
         """Works on the estimate of `estimator` and the sets of `active_set`, speaks through `outbox`."""
-        self._consistency = consistency
+        self._consistency, self._diagnosis = consistency, diagnosis
         self._estimator, self._active_set, self._outbox, self._gate = estimator, active_set, outbox, gate
         self.learn_from = -math.inf
-        self.quality = Quality()
         self.fits = self.rejected = 0
-        self._odd_since: float | None = None
-        self._scale = ""
+        self._disagrees_since: float | None = None
 
     def interrupted(self, t: float) -> None:
         """The stream begins anew at `t` [s]."""
-        self.learn_from, self._odd_since = max(self.learn_from, t), None
+        self.learn_from, self._disagrees_since = max(self.learn_from, t), None
 
-    def trusts(self, t: float) -> bool:
+    def sensors_agree(self, t: float) -> bool:
         """Whether the sensors agree at `t` [s]; while they do not, nothing is learned, and what was is forgotten."""
         why = self._consistency.fault
         if why:
-            self.quality = Quality(fault=why)
             if self._estimator.learned:
                 self.relearn(t, "sensors disagree")
             self.interrupted(t)
@@ -75,25 +71,13 @@ class Supervisor:
         self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start + 0.1, "the vehicle has changed")
 
-    @property
-    def unexplained(self) -> str:
-        """What speaks against the model: a sensor's scale that a diagnosis found; empty: nothing."""
-        return f"the diagnosis stands: {self._scale}" if self._scale else ""
-
-    def diagnosed(self, asked: DiagnosisRequest, reply: DiagnosisReply, diagnosis: BackgroundDiagnosis) -> None:
-        """Publishes what is new in a diagnosis; a sensor's wrong scale stops publishing."""
-        self._scale = next((f.evidence for f in reply.findings if f.confident and _wrong_scale(f)), "")
-        told = diagnosis.news(asked, reply, self._outbox.stamp)
-        if told is not None:
-            self._outbox.act(told)
-
     def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
         """Takes in the fit of a window, piece by piece."""
         if reply.problem:
             self._outbox.note(request.stop, Phase.FAILED, reply.problem)
             return
         if reply.estimate is None:
-            self._estimator.take(reply, trusted=False)
+            self._estimator.take(request, reply)
             why = f"roll and pitch move too little: {_unrevealed(reply)}"
             self._outbox.note(request.stop, Phase.NOT_EXCITED, why)
             return
@@ -102,40 +86,40 @@ class Supervisor:
             # Information adds up: one such window would spoil every estimate after it.
             self._outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
-        if reply.vehicle is not None and not self._estimator.flexible:
-            self._join(request, reply, reply.vehicle)
-        if not self._estimator.fusion.judge(reply.estimate).agrees:
-            self._odd(request)
+        if reply.flexible and not self._estimator.flexible:
+            self._join(request, reply)
+        if not self._estimator.fusion.agrees(reply.estimate):
+            self._leave_out(request)
             return
-        self._odd_since = None
-        self._estimator.take(reply, trusted=True)
+        self._disagrees_since = None
+        self._estimator.take(request, reply)
         yield
-        if not self._taken_back(reply):
+        if not self._rolled_back(reply):
             self._judge(request, reply)
 
-    def _join(self, request: FitRequest, reply: FitReply, model: Vehicle) -> None:
+    def _join(self, request: FitRequest, reply: FitReply) -> None:
         """From now on effects are fitted along; what was learned without them is forgotten."""
-        self._estimator.take_model(model, flexible=True)
-        self._odd_since = None
+        self._estimator.fit_along()
+        self._disagrees_since = None
         share = f"{reply.lack.share:.0%} of what" if reply.lack is not None else "what"
         text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"
         self._outbox.say(request.stop, "info", "model", text)
 
-    def _odd(self, request: FitRequest) -> None:
+    def _leave_out(self, request: FitRequest) -> None:
         """Leaves out a window that disagrees; when one without a common sample does too, the vehicle has changed."""
-        if self._odd_since is None:
-            self._odd_since = request.stop
+        if self._disagrees_since is None:
+            self._disagrees_since = request.stop
         self._outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
-        if request.start < self._odd_since - _EPS:
+        if request.start < self._disagrees_since - _EPS:
             return
-        start, stop = self._outbox.stamp(self._odd_since), self._outbox.stamp(request.stop)
+        start, stop = self._outbox.stamp(self._disagrees_since), self._outbox.stamp(request.stop)
         self._outbox.act(Diagnosed(stop, start, stop, (), "unknown"))
         text = "windows disagree with what was known, for as long as a window: learning anew"
         self._outbox.say(request.stop, "warning", "change", text)
         self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start, "the vehicle has changed")
 
-    def _taken_back(self, reply: FitReply) -> bool:
+    def _rolled_back(self, reply: FitReply) -> bool:
         """Watches the set in force; rolls it back when its predecessor predicts new windows better."""
         estimate, active_set = reply.estimate, self._active_set
         if estimate is None or active_set.predecessor is None:
@@ -155,9 +139,10 @@ class Supervisor:
         if parameters is None:
             return
         active_set, outbox = self._active_set, self._outbox
-        case = self._estimator.case(
-            parameters, self.quality, reply, active_set.in_force, active_set.baseline, active_set.approval,
-            self._gate.windows, active_set.seen, self.unexplained, self._consistency.unproven,
+        scale = self._diagnosis.wrong_scale
+        case = replace(
+            self._estimator.case(parameters, request, reply, active_set, self._gate.windows),
+            unexplained=f"the diagnosis stands: {scale}" if scale else "", unproven=self._consistency.unproven,
         )  # fmt: skip
         decision = decide(case, self._gate)
         mse, unseen = self._estimator.scores()
@@ -182,10 +167,6 @@ class Supervisor:
             return Phase.PENDING
         force = self._active_set.in_force
         return Phase.ACCEPTED if force is not None and force.state is not SetState.STALE else Phase.CANDIDATE
-
-
-def _wrong_scale(finding: OnlineFinding) -> bool:
-    return finding.effect == "gyro_scale" and max(map(abs, finding.values.values()), default=0.0) > ALLOWED
 
 
 def _unrevealed(reply: FitReply) -> str:

@@ -20,10 +20,18 @@ from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.online.answered import answers
-from quadid.online.flexible_fit import EFFECT_WIDTH, alike, flexible_fit, moving_names, reduced, sampling_error, widened
+from quadid.online.flexible_fit import (
+    EFFECT_WIDTH,
+    alike,
+    flexible_fit,
+    moving_names,
+    reduced,
+    sampling_error,
+    widened,
+    with_room,
+)
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
-from quadid.online.model_vehicle import with_room
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -133,8 +141,7 @@ class FitReply(JobReply):
             1 where the model misses nothing; with `measured`, or where noise was found anew, and effects were not
             fitted along.
         lack: what effects of the catalogue would explain; with `misfit`.
-        vehicle: where every effect that moves the vehicle was fitted along, what it was fitted with: that of the
-            request, with room for its bare guesses where effects joined.
+        flexible: every effect that moves the vehicle was fitted along.
         between_rows: standard deviations, log scale, by what the rotors do between readings, shape (6,); in `estimate`.
     """
 
@@ -146,7 +153,7 @@ class FitReply(JobReply):
     measured: NoiseModel | None = None
     misfit: FloatArray | None = None
     lack: LackOfFit | None = None
-    vehicle: Vehicle | None = None
+    flexible: bool = False
     between_rows: FloatArray | None = None
 
 
@@ -163,17 +170,17 @@ def _fit(request: FitRequest) -> FitReply:
         return request.failed("no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
     bounds = bounds_of(shooting.linearise(theta, free).information)
-    drowned = not is_excited(bounds) and _is_drowned(shooting, theta, free)
-    if not is_excited(bounds) and not drowned:
+    spoilt = not is_excited(bounds) and _noise_is_spoilt(shooting, theta, free)
+    if not is_excited(bounds) and not spoilt:
         return FitReply(request.number, excitation=bounds)
     if request.flexible:
-        return _flexible(request, theta, None if drowned else noise)
+        return _flexible(request, theta, None if spoilt else noise)
     sensor = None
-    if request.search or noise is None or drowned:
-        theta, sensor = _search(replace(request, noise=None) if drowned else request, layout)
+    if request.search or noise is None or spoilt:
+        theta, sensor = _search(replace(request, noise=None) if spoilt else request, layout)
         noise = _missed(request, layout, theta, sensor)
         shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
-        if drowned and not is_excited(bounds := bounds_of(shooting.linearise(theta, free).information)):
+        if spoilt and not is_excited(bounds := bounds_of(shooting.linearise(theta, free).information)):
             return FitReply(request.number, excitation=bounds)
     result = _polish(shooting, theta, free)
     if not np.isfinite(result.cost):
@@ -214,7 +221,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     wide = widened(estimate, alike(estimate) * missed)
     reply = FitReply(
         request.number, "", bounds, is_excited(bounds), wide, result.theta, shooting.noise,
-        vehicle=vehicle, between_rows=np.sqrt(np.diag(missed)),
+        flexible=True, between_rows=np.sqrt(np.diag(missed)),
     )  # fmt: skip
     return replace(reply, measured=residual_noise(shooting, result)) if request.measure else reply
 
@@ -240,7 +247,7 @@ def is_excited(bounds: FloatArray) -> bool:
     return bool(np.all(bounds[[NOMINAL_NAMES.index(name) for name in RATED]] <= EXCITED))
 
 
-def _is_drowned(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
+def _noise_is_spoilt(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
     """Whether the motion suffices with usual noise, and the noise at hand is far above that.
 
     Noise once taken from bad data would call every later motion too small, and so never be measured again.

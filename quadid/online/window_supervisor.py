@@ -27,6 +27,7 @@ class WindowSupervisor:
 
     Attributes:
         cut: the newest window, complete or not.
+        quality: of the newest complete one.
     """
 
     def __init__(
@@ -35,10 +36,10 @@ class WindowSupervisor:
         """Cuts the rows of `store`, which are of `vehicle`."""
         self._vehicle, self._store, self._settings = vehicle, store, settings
         self._outbox, self._supervisor = outbox, supervisor
-        self.cut = Cut((), 0.0, 0)
+        self.cut, self.quality = Cut((), 0.0, 0), Quality()
         self._last_fit, self._asked_now = -math.inf, False
 
-    def hurry(self) -> None:
+    def fit_now(self) -> None:
         """Makes the next tick due, without waiting for a full window."""
         self._asked_now = True
 
@@ -63,11 +64,10 @@ class WindowSupervisor:
             self._incomplete(tick, start)
             return None
         yield
-        quality = judge(self.cut.windows, self._vehicle, estimator.thrust, estimator.learned)
-        self._supervisor.quality = quality
-        if quality != Quality():
-            phase = Phase.BLOCKED if quality.fault else Phase.NOT_FLYING
-            self._outbox.note(tick, phase, quality.fault or quality.grounded)
+        self.quality = judge(self.cut.windows, self._vehicle, estimator.thrust, estimator.learned)
+        if self.quality != Quality():
+            phase = Phase.BLOCKED if self.quality.fault else Phase.NOT_FLYING
+            self._outbox.note(tick, phase, self.quality.fault or self.quality.grounded)
             return None
         yield
         self._last_fit = tick

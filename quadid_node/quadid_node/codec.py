@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SetState
-from quadid.online.status import SessionStatus
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
 
 

@@ -9,8 +9,7 @@ import math
 from typing import Any
 
 from quadid.chi_square import Z95
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SetState
-from quadid.online.status import SessionStatus
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
 from quadid_node.stamps import stamp

@@ -15,8 +15,7 @@ from pathlib import Path
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
 from quadid.online.outbox import Action
-from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish, SetState
-from quadid.online.status import SessionStatus
+from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish, SessionStatus, SetState
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 from quadid_node.publication import Output, Publication

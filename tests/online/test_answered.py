@@ -12,10 +12,9 @@ import pytest
 
 from quadid.identify.noise_model import NoiseModel
 from quadid.online import FitReply, FitRequest, Session
+from quadid.online.background_diagnosis import _is_wrong_scale
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import OnlineFinding
-from quadid.online.supervisor import _wrong_scale
-from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import published
 from tests.online.made_up import PELICAN, QUICK, light_flight, tells, works
@@ -54,8 +53,6 @@ SPOILT: dict[str, Spoil] = {
     "noise of three": fields(noise=noise(3)), "noise of two lengths": fields(noise=noise(9, 3)),
     "noise without memory": fields(noise=noise(9, memory=0.0)), "measured of three": fields(measured=noise(3)),
     "spectrum of one": fields(noise=replace(noise(9), shape=np.ones((1, 1)))),
-    "another vehicle": fields(vehicle=Vehicle.shipped("crazyflie")),
-    "another mass": fields(vehicle=PELICAN.model_copy(update={"mass": 100.0})),
 }  # fmt: skip
 
 
@@ -86,4 +83,4 @@ def test_a_session_that_hears_what_cannot_be_an_answer_goes_on(what: str, happen
 
 
 def test_a_finding_without_numbers_is_no_wrong_scale() -> None:
-    assert not _wrong_scale(OnlineFinding("gyro_scale", {}, {}, {}, 3.0, 1.0, 1e-9, (), "seen"))
+    assert not _is_wrong_scale(OnlineFinding("gyro_scale", {}, {}, {}, 3.0, 1.0, 1e-9, (), "seen"))

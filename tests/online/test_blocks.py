@@ -9,7 +9,8 @@ import pytest
 
 from quadid.flight import fly
 from quadid.online.channel_buffer import ChannelBuffer
-from quadid.online.resampler import Resampler, Rows
+from quadid.online.resampler import Resampler
+from quadid.online.rows import Rows
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Recording
 from tests.online.test_resampler import next_rows, same

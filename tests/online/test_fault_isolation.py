@@ -9,7 +9,7 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.change_detection import Change, ChangeDetector
 from quadid.online.fault_isolation import ChangeRequest
-from quadid.online.resampler import Rows
+from quadid.online.rows import Rows
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 

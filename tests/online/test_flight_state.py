@@ -15,7 +15,8 @@ from quadid.online.change_supervisor import ChangeSupervisor, Seen
 from quadid.online.estimator import Estimator
 from quadid.online.flight_state import Velocity, step_beside
 from quadid.online.grid_buffer import GridBuffer
-from quadid.online.resampler import Resampler, Rows
+from quadid.online.resampler import Resampler
+from quadid.online.rows import Rows
 from quadid.turning import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

@@ -90,10 +90,10 @@ def test_a_change_is_seen_and_noise_is_not() -> None:
     alarms = 0
     for k in range(200):
         item = window(float(k), 1e-3 * rng.normal(size=P), information)
-        alarms += not fusion.judge(item).agrees
+        alarms += not fusion.agrees(item)
         fusion.add(item)
     assert alarms == 0
-    assert not fusion.judge(window(200.0, np.array([0.15, 0.0, 0.0]), information)).agrees
+    assert not fusion.agrees(window(200.0, np.array([0.15, 0.0, 0.0]), information))
 
 
 def test_poor_residuals_make_a_window_count_less() -> None:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from quadid.chi_square import Z95
 from quadid.online.gate import CHECKS, Case, GateSettings, decide
-from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia
 from quadid.vehicle import Vehicle
@@ -39,7 +38,7 @@ def online_set(values: dict[str, float], state: SetState = SetState.ACCEPTED, si
 
 
 def good(**changes: Any) -> Case:
-    case = Case(parameter_set(TRUE), Quality(), True, 1.0, 3, "", (50.0, 60.0), None, None, "auto")
+    case = Case(parameter_set(TRUE), True, 1.0, 3, "", (50.0, 60.0), None, None, "auto")
     return replace(case, **changes)
 
 
@@ -52,12 +51,12 @@ def test_rotors_too_light_to_be_seen_hold_nothing_back() -> None:
 
 def test_it_says_where_faster_logs_are_missing_and_no_longer_flight() -> None:
     wide = good(parameters=parameter_set(TRUE, sigma=0.04), between_rows={"J_xx": 0.2})
-    assert "log faster" not in decide(wide, GateSettings()).reason, "b is asked for first, and the rows tell it"
+    assert "faster" not in decide(wide, GateSettings()).reason, "b is asked for first, and the rows tell it"
     narrow = {name: 0.04 if name == "J_xx" else 0.005 for name in TRUE}
     some = parameter_set(TRUE)
     some = ParameterSet(tuple(replace(p, sigma=abs(p.value) * narrow[p.name]) for p in some), some.covariance)
-    assert "log faster" in decide(good(parameters=some, between_rows={"J_xx": 0.2}), GateSettings()).reason
-    assert "log faster" not in decide(good(parameters=some, between_rows={"J_xx": 0.01}), GateSettings()).reason
+    assert "log motors faster" in decide(good(parameters=some, between_rows={"J_xx": 0.2}), GateSettings()).reason
+    assert "faster" not in decide(good(parameters=some, between_rows={"J_xx": 0.01}), GateSettings()).reason
 
 
 def scaled(**factors: float) -> dict[str, float]:
@@ -72,8 +71,6 @@ def test_a_good_estimate_is_accepted_or_waits_for_a_person() -> None:
 @pytest.mark.parametrize(
     ("changes", "check", "word"),
     [
-        ({"quality": Quality(fault="gyro is stuck")}, "data_quality", "stuck"),
-        ({"quality": Quality(grounded="on the ground")}, "flying", "ground"),
         ({"excited": False}, "excitation", "sticks"),
         ({"parameters": parameter_set(scaled(b=-1.0))}, "physical_bounds", "not positive"),
         ({"parameters": parameter_set(scaled(J_zz=1.8))}, "physical_bounds", "triangle"),
@@ -205,27 +202,27 @@ numbers = st.floats(-1e6, 1e6) | st.sampled_from([math.nan, math.inf, -math.inf]
     agreeing=st.integers(0, 6),
     held_out=st.lists(st.floats(-50.0, 100.0) | numbers, max_size=4),
     force=st.none() | st.lists(st.floats(0.7, 1.4), min_size=6, max_size=6),
-    fault=st.sampled_from(["", "stuck"]),
+    unproven=st.sampled_from(["", "yaw"]),
     approval=st.sampled_from(["auto", "manual"]),
 )
 def test_nothing_is_accepted_that_breaks_a_promise(
     factors: list[float], sigma: float, statuses: list[Status], excited: bool, ratio: float, agreeing: int,
-    held_out: list[float], force: list[float] | None, fault: str, approval: str,
+    held_out: list[float], force: list[float] | None, unproven: str, approval: str,
 ) -> None:  # fmt: skip
     values = {n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, factors, strict=True)}
     named = dict(zip(NOMINAL_NAMES, statuses, strict=True))
     before = None if force is None else online_set({n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, force, strict=True)})
     settings = GateSettings()
     case = Case(
-        parameter_set(values, sigma, **named), Quality(fault=fault), excited, ratio, agreeing, "", tuple(held_out),
-        before, before, approval,
+        parameter_set(values, sigma, **named), excited, ratio, agreeing, "", tuple(held_out), before, before, approval,
+        unproven=unproven,
     )  # fmt: skip
     decision = decide(case, settings)
     assert decision.reason
     assert decision.check in {name for name, _ in CHECKS} | {"approval"}
     if decision.state is SetState.REJECTED:
         return
-    assert not fault
+    assert not unproven
     assert excited
     assert agreeing >= settings.windows
     assert all(math.isfinite(v) and v > 0.0 for v in values.values())

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from quadid.flight import fly
 from quadid.grid import to_windows
 from quadid.online.grid_buffer import GridBuffer
-from quadid.online.resampler import BLOCK, SETTLE, Resampler, Rows
+from quadid.online.resampler import BLOCK, SETTLE, Resampler
+from quadid.online.rows import Rows
 from quadid.vehicle import Vehicle
 from quadid.window import Sample
 from tests.faults.evidence import Happened

@@ -11,8 +11,9 @@ from quadid.model.layout import Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.estimator import Estimator
+from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import WindowEstimate
-from quadid.online.model_vehicle import with_room
+from quadid.online.grid_buffer import Cut
 from quadid.parameters import Status
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import ParameterPrior
@@ -38,13 +39,14 @@ def test_where_the_coupling_is_free_yaw_claims_no_more_than_the_vehicle_file() -
     """A simulator without gyroscopic coupling gave a yaw inertia 10 to 18 % off, identified now and then."""
     model = with_room(PELICAN)
     learner = Estimator(PELICAN, 60.0, 0)
-    learner.take_model(model, flexible=True)
+    learner.fit_along()
     layout = Layout(model)
     off = np.log(layout.initial(model)[:6]) + np.array([0.1, 0.3, 0.2, 0.2, 0.3, 0.3])
     sure = WindowEstimate(0.0, 10.0, off, np.diag(np.full(6, 1e6)), np.zeros(6), 900.0, 900.0)
     theta = layout.initial(model)
     theta[:6] = np.exp(off)
-    learner.take(FitReply(1, excitation=np.full(6, 0.01), excited=True, estimate=sure, theta=theta), trusted=True)
+    asked = learner.request(1, Cut((flight(24.0, 5, effects=LAGGING).window.slice(0, 500),), 10.0, 0), 0.0, 10.0)
+    learner.take(asked, FitReply(1, excitation=np.full(6, 0.01), excited=True, estimate=sure, theta=theta))
     found = learner.parameters()
     assert found is not None
     assert found["J_xx"].status is Status.IDENTIFIED

@@ -1,18 +1,41 @@
-"""Channels of a live stream read on a few rows of the grid, piece by piece."""
+"""Rows of the grid, and channels of a live stream read on them, piece by piece."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from quadid.resample import split_stretches
 from quadid.resampling_plan import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
 from quadid.types import FloatArray
+from quadid.window import Sampling
 
 LOST = 2.05
 """Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Consecutive rows of the grid.
+
+    Attributes:
+        t: times [s], shape (n,).
+        columns: values by channel, NaN where nothing was measured; only channels that say something.
+        sampling: meaning of the rotor rows; source: where the rotor speeds come from.
+        fresh: True when the grid was anchored anew before the first row: nothing may be joined across.
+        problem: why there are no rotor speeds, or empty.
+        spacing: time between two readings of the rotors [rows].
+    """
+
+    t: FloatArray
+    columns: dict[str, FloatArray]
+    sampling: Sampling
+    source: str
+    fresh: bool = False
+    problem: str = ""
+    spacing: float = 1.0
 
 
 def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
