@@ -30,6 +30,7 @@ from quadid.window import Sample
 from quadid.workflow.loading import load_vehicle
 from studies.autopilot.flights import ARDUCOPTER, OTHERS, Flown, Outcome, errors_of
 from studies.autopilot.live import serve
+from studies.autopilot.readings import telemetry
 from studies.page import put_section
 
 TITLE = "Flights of real autopilots, online"
@@ -72,6 +73,8 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     begin = time.monotonic()
     vehicle = load_vehicle(str(file))
     recording = open_log(str(data / one.log), "auto", vehicle.columns)
+    if one.interval:
+        recording = telemetry(recording, one.interval)
     service = Service(vehicle, session_settings("auto", seed=0), InlineWorker())
     outputs: list[Output] = []
     for count, sample in enumerate(until(stream(recording), seconds)):

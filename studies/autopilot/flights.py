@@ -21,16 +21,19 @@ class Flown:
     Attributes:
         log, vehicle: below the data folder; a vehicle that begins with ``studies`` is one of the repository.
         truth: of the parameters that are known.
+        interval: the log as a live link would bring it, with rotor readings so far apart [s]; 0: as it is.
     """
 
     log: str
     vehicle: str
     truth: Mapping[str, float] = field(default_factory=dict)
+    interval: float = 0.0
 
     @property
     def name(self) -> str:
         """Log and vehicle file."""
-        return f"{self.log} with {self.vehicle.rsplit('/', 1)[-1]}"
+        thinned = f", rotors every {self.interval * 1e3:g} ms" if self.interval else ""
+        return f"{self.log} with {self.vehicle.rsplit('/', 1)[-1]}{thinned}"
 
 
 ARDUCOPTER = (
@@ -42,6 +45,8 @@ ARDUCOPTER = (
     Flown(f"{SITL}/quad_sq.tlog", f"{SITL}/quad_sq_pwm.yaml", SQUARE),
     Flown(f"{SITL}/x.tlog", f"{SITL}/sitl_x_pwm.yaml", X_PWM),
     Flown(f"{SITL}/x_zero_rpm.tlog", f"{SITL}/sitl_x_pwm.yaml", X_PWM),
+    *(Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x.yaml", X, interval) for interval in (0.02, 0.0125)),
+    *(Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq.yaml", SQUARE, interval) for interval in (0.02, 0.0125)),
 )
 """A real autopilot in a simulator of others: the truth is known, and nothing changes in flight."""
 OTHERS = (

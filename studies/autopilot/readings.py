@@ -1,0 +1,102 @@
+"""How far apart rotor readings may be, and in step with what: snapshots of one rate loop, taken at other intervals.
+
+    python -m studies.autopilot.readings
+
+prints what snapshots of the loop's output (RATE.ROut and POut at 400 Hz of x.bin and quad_sq.bin) make of slow torque.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pymavlink.DFReader import DFReader_binary
+
+from quadid.types import FloatArray
+from quadid.window import Channel, Recording
+
+LOOP = 0.0025
+"""Time between two runs of the loop [s]."""
+SLOW = 20
+"""Slow torque is what three running means over so many runs of the loop leave."""
+INTERVALS = (4, 5, 6, 7, 8, 9, 10)
+"""Between snapshots, in runs of the loop."""
+PARTS = ((30.0, 75.0), (75.0, 95.0), (95.0, 200.0))
+"""Of the log [s]; the excited flight begins 41 s after its first row."""
+MOTION = {"gyro": 0.01, "accel": 0.01, "attitude": 0.02}
+"""Time between messages, as `quadid serve` asks for them [s]."""
+REACH = 8
+"""Logged readings on each side that one between them is made of."""
+
+
+def telemetry(recording: Recording, interval: float) -> Recording:
+    """A DataFlash flight as a live link would bring it.
+
+    Args:
+        recording: its rotor readings are evenly spaced.
+        interval: between two rotor readings [s]; those between logged ones are band-limited (Lanczos).
+    """
+    channels = dict(recording.channels)
+    for name, step in MOTION.items():
+        channels[name] = _every(channels[name], step)
+    rotors = channels["rotor_speed"]
+    period = float(np.median(np.diff(rotors.t)))
+    at = np.arange(rotors.t[REACH], rotors.t[-REACH - 1], interval)
+    near = np.searchsorted(rotors.t, at)[:, None] + np.arange(-REACH, REACH)
+    away = (at[:, None] - rotors.t[near]) / period
+    weight = np.where(np.abs(away) < REACH, np.sinc(away) * np.sinc(away / REACH), 0.0)
+    values = np.einsum("nk,nkr->nr", weight / weight.sum(axis=1, keepdims=True), rotors.values[near])
+    channels["rotor_speed"] = replace(rotors, t=at, values=values)
+    return replace(recording, channels=channels)
+
+
+def _every(channel: Channel, step: float) -> Channel:
+    rows = slice(None, None, max(round(step / float(np.median(np.diff(channel.t)))), 1))
+    return replace(channel, t=channel.t[rows], values=channel.values[rows])
+
+
+def _slow(torque: FloatArray) -> FloatArray:
+    for _ in range(3):
+        torque = np.convolve(torque, np.full(SLOW, 1.0 / SLOW), "same")
+    return torque[5 * SLOW : -5 * SLOW]
+
+
+def errors(torque: FloatArray, runs: int) -> list[float]:
+    """Size of slow torque by lines between snapshots over the true one, minus 1, by where the snapshots begin."""
+    true, out = _slow(torque), []
+    for first in range(runs):
+        at = np.arange(first, len(torque), runs)
+        seen = _slow(np.interp(np.arange(len(torque)), at, torque[at]))
+        out.append(float(seen @ true / (true @ true)) - 1.0)
+    return out
+
+
+def loop_output(log: Path) -> FloatArray:
+    """Roll and pitch output of the rate loop, on a grid of `LOOP`, shape (n, 2)."""
+    reader, rows = DFReader_binary(str(log)), []
+    while (row := reader.recv_match(type="RATE")) is not None:
+        rows.append((row.TimeUS * 1e-6, row.ROut, row.POut))
+    t, *outputs = np.array(rows).T
+    return np.column_stack([np.interp(np.arange(t[0], t[-1], LOOP), t, output) for output in outputs])
+
+
+def main() -> None:
+    """Prints a row for each flight and interval: rms error of slow torque in parts of the flight."""
+    data = Path(os.environ.get("QUADID_DATA", "../shared/data")) / "ardupilot_sitl"
+    print("| flight | between readings [ms] | " + " | ".join(f"{a:g} to {b:g} s" for a, b in PARTS) + " |")
+    print("|---|---|" + "---|" * len(PARTS))
+    for name in ("x.bin", "quad_sq.bin"):
+        output = loop_output(data / name)
+        for runs in INTERVALS:
+            cells = []
+            for a, b in PARTS:
+                part = output[round(a / LOOP) : round(b / LOOP)]
+                found = errors(part[:, 0], runs) + errors(part[:, 1], runs)
+                cells.append(f"{np.sqrt(np.mean(np.square(found))):.1%}")
+            print(f"| {name} | {runs * LOOP * 1e3:g} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
