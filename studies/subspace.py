@@ -140,14 +140,12 @@ def main() -> None:
         "# CVA and MOESP: poles of known systems, prediction of flights", "",
         f"`python -m studies.subspace --seeds {options.seeds} --seconds {options.seconds:g} --out docs/results`", "",
         "## Poles", "",
-        f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: standard deviation of the innovations over that of "
-        "the output without them, under feedback over 1. The order is given. Of each form: median and largest pole "
-        "error in %, how many within 1 %. `closed` is the form that quadid uses; `open` is for records without "
-        "feedback.", "",
+        f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without them. "
+        "The order is given. Median and largest pole error [%], records within 1 %. quadid uses the form `closed`.", "",
         *poles(options.seeds), "",
         "## Flights", "",
         f"Three simulated Pelican flights of {options.seconds:g} s under the stabiliser, fitted on the first; mean "
-        "squared error over 1 s, divided by what a perfect physical model leaves at nominal noise.", "",
+        "squared error over 1 s relative to a perfect physical model.", "",
         *flights(options.seconds, (12, 22)), "",
     ])  # fmt: skip
     print(text)

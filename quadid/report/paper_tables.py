@@ -59,15 +59,15 @@ def set_name(i: int) -> str:
 def table_1(result: JsonDict) -> Table:
     """The paper's Table 1 with our numbers beside it."""
     mse = result["mse_paper"]
-    head = ["set", *(f"{COLUMN_NAMES[n]}: {who}" for n in PAPER_MSE for who in ("paper", "here"))]
-    head += [f"gain over {COLUMN_NAMES[n]}: {who}" for n in PAPER_GAIN for who in ("paper", "here")]
+    head = ["set (paper, here)", *(COLUMN_NAMES[n] for n in PAPER_MSE)]
+    head += [f"gain over {COLUMN_NAMES[n]}" for n in PAPER_GAIN]
     rows = []
     for i in range(3):
         row = [set_name(i)]
         for name, printed in PAPER_MSE.items():
-            row += [text(printed[i]), text(mse[name][i])]
+            row.append(f"{text(printed[i])}, {text(mse[name][i])}")
         for name, gains in PAPER_GAIN.items():
-            row += [percent(gains[i]), percent(1.0 - mse["pso"][i] / mse[name][i])]
+            row.append(f"{percent(gains[i])}, {percent(1.0 - mse['pso'][i] / mse[name][i])}")
         rows.append(row)
     return Table("Table 1: mean squared error of the closed-loop simulation", head, rows)
 
@@ -91,17 +91,18 @@ def table_segments(result: JsonDict) -> Table:
 def table_2(result: JsonDict) -> Table:
     """The paper's Table 2, with what it lacks: the truth, intervals, status, spread over seeds."""
     head = [
-        "parameter", "unit", "paper", "true here", "initial", "quasi-Newton", "PSO, median of seeds",
-        "PSO, range over seeds", "quadid, nominal", "95 % interval", "status", "quadid, extended", "95 % interval",
+        "parameter", "unit", "paper", "true here", "initial", "quasi-Newton", "PSO: median (range) of seeds",
+        "quadid, nominal [95 % interval], status", "quadid, extended [95 % interval]",
     ]  # fmt: skip
     rows = []
     for name in NOMINAL_NAMES:
         p = result["parameters"][name]
-        spread = f"{text(min(p['pso_seeds']))} … {text(max(p['pso_seeds']))}"
+        swarm = f"{text(p['pso'])} ({text(min(p['pso_seeds']))} … {text(max(p['pso_seeds']))})"
+        nominal = f"{text(p['identified'])} [{_interval(p['ci95'])}], {p['status']}"
+        extended = f"{text(p['extended'])} [{_interval(p['extended_ci95'])}]"
         rows.append([
             name, NOMINAL_UNITS[name], text(PAPER_PARAMETERS[name]), text(p["truth"]), text(p["initial"]),
-            text(p["quasi_newton"]), text(p["pso"]), spread, text(p["identified"]), _interval(p["ci95"]), p["status"],
-            text(p["extended"]), _interval(p["extended_ci95"]),
+            text(p["quasi_newton"]), swarm, nominal, extended,
         ])  # fmt: skip
     return Table("Table 2: parameters", head, rows)
 
@@ -127,9 +128,9 @@ def table_findings(result: JsonDict) -> Table:
         for p in finding["parameters"]:
             rows.append([
                 f"{finding['effect']}.{p['name']}", p["unit"], text(flown.get(p["name"])), text(p["value"]),
-                _interval(p["ci95"]), text(finding["gain"]["mse_before"]), text(finding["gain"]["mse_after"]),
+                _interval(p["ci95"]), f"{text(finding['gain']['mse_before'])} → {text(finding['gain']['mse_after'])}",
             ])  # fmt: skip
-    head = ["cause", "unit", "flown", "found", "95 % interval", "error without it", "with it"]
+    head = ["cause", "unit", "flown", "found", "95 % interval", "error without → with"]
     return Table("What the nominal model lacks (error on sets 2 and 3, 1 = noise floor)", head, rows)
 
 

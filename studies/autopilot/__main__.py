@@ -109,19 +109,21 @@ def until(samples: Iterator[Sample], seconds: float) -> Iterator[Sample]:
 def row(one: Flown, done: Outcome) -> str:
     """The line of one flight."""
     first = "none" if done.first is None else f"{done.first:.0f}"
-    cells = [one.name, str(len(done.published)), first]
+    wrong = sum("**" in " ".join(errors_of(s, one.truth)) for s in done.published) if one.truth else None
+    counts = [len(done.published), *([] if wrong is None else [wrong]), len(done.alarms)]
+    cells = [one.name, ", ".join(map(str, counts)), first]
     if one.truth:
         sets = (done.published[0], done.published[-1]) if done.published else ()
         cells += ["; ".join(errors_of(s, one.truth)) for s in sets] or ["", ""]
-        cells += [f"{sum('**' in ' '.join(errors_of(s, one.truth)) for s in done.published)}"]
     ending = done.status.partition(":")[0] if done.published else done.status
-    return "| " + " | ".join([*cells, str(len(done.alarms)), ending, f"{done.seconds:.0f}"]) + " |"
+    return "| " + " | ".join([*cells, ending]) + " |"
 
 
 def section(kind: str, way: str, rows: list[str], seconds: float) -> str:
     """Markdown of one kind of flights."""
-    truth = ["first set", "last set", "wrong sets"] if kind == "ArduCopter" else []
-    heads = ["flight", "sets", "excited flight to first set [s]", *truth, "alarms", "at the end", "wall [s]"]
+    truth = ["first set", "last set"] if kind == "ArduCopter" else []
+    counts = "sets, wrong ones, alarms" if truth else "sets, alarms"
+    heads = ["flight", counts, "excited flight to first set [s]", *truth, "at the end"]
     how = f"`{COMMAND}`, {way}" + (" in real time through `quadid serve`" if way == "live" else "")
     how += f"; the first {seconds:g} s of each log" if seconds < 1e9 else ""
     lines = [f"## {kind}, {way}", "", f"{how}; seed 0.", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]

@@ -111,9 +111,9 @@ def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str
         if first in ("pso", "pso_algorithm_1") and successes(outcomes, first)[0]:
             alone.append(f"{kind}, {bounds} bounds")
     return [
-        f"A swarm before least squares gains at least {GAIN:.0%} of the runs over least squares alone on: "
+        f"A swarm before least squares gains at least {GAIN:.0%} of the runs on: "
         + (f"{'; '.join(worth)}." if worth else "none of these problems."), "",
-        f"A swarm without polish is the best of all on: {'; '.join(alone) if alone else 'none of them'}.",
+        f"A swarm without polish is best on: {'; '.join(alone) if alone else 'none of them'}.",
     ]  # fmt: skip
 
 
@@ -122,21 +122,19 @@ def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -
     lines = [
         "# When is a particle swarm worth it?", "",
         f"`python -m studies.optimisers --seeds {seeds} --out docs/results`", "",
-        "Each seed is a new individual Pelican, flight, and random start in the box, the same for all methods. One "
-        "evaluation is one simulation of one parameter vector, finite differences included. Success: cost within "
-        f"{SUCCESS - 1.0:.0%} of the lowest that any method, or least squares from the truth, found for that seed.", "",
-        f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, stretches of {SEGMENT:g} s, "
+        "Each seed is a new Pelican, flight and random start, the same for all methods. Success: cost within "
+        f"{SUCCESS - 1.0:.0%} of the lowest of any method, or of least squares from the truth.", "",
+        f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, segments of {SEGMENT:g} s, "
         f"{BUDGET['smooth']} evaluations.",
-        f"* Non-smooth: flights of {SECONDS['non-smooth']:g} s in which commands come {1e3 * DELAY:g} ms late and "
-        f"rotors saturate at {KNEE:g} hover speeds. The simulation is late by whole samples (20 ms) only and clips at "
-        "a speed to be found: eight parameters, one without a gradient, one with a gradient only where rotors "
-        f"saturate; {BUDGET['non-smooth']} evaluations.",
+        f"* Non-smooth: flights of {SECONDS['non-smooth']:g} s with a command delay of {1e3 * DELAY:g} ms and rotors "
+        f"that saturate at {KNEE:g} hover speeds. Delay (whole samples, no gradient) and saturation speed are fitted "
+        f"too; {BUDGET['non-smooth']} evaluations.",
         "* Bounds: " + ", ".join(f"{name} a factor of {factor:g} each way" for name, factor in BOUNDS.items())
         + f", off centre by up to a factor of {np.exp(OFF_CENTRE):.2f}.", "",
-        "## Answer", "", *answer(results), "",
+        *answer(results), "",
     ]  # fmt: skip
     lines += [
-        "Successes, median of the evaluations to them, median and largest cost over the optimum:", "", *table(results),
+        "Successes, median evaluations to success, median and largest cost over the optimum:", "", *table(results),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
