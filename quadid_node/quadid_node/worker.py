@@ -1,7 +1,7 @@
 """Where fits run: a child process beside the service, or inline for replays.
 
 The child is polled, never waited for.  One that dies, hangs or eats its memory is replaced after a growing pause, and
-the request it was working on is given to the next one; after three tries the session is told that the fit failed.
+the request that it had, or that waits for it, goes to the next one; after three the session is told so.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FIT_LIMIT = 30.0
 STUDY_LIMIT = 600.0
 """... and a diagnosis."""
 TRIES = 3
-"""Workers that may fail on one request before it is given up."""
+"""Workers that may fail on one request, or while it waits for one to be ready, before it is given up."""
 BACKOFF = (0.2, 1.0, 5.0, 20.0, 60.0)
 """Pauses before the next start [s], by failures in a row."""
 CALM = 60.0
@@ -186,7 +186,6 @@ class ProcessWorker:
     def _give(self) -> None:
         assert self._request is not None
         self._out += frame(self._request)
-        self._tries += 1
         self.state, self._since = "busy", self._clock()
 
     def _pump(self) -> None:
@@ -235,8 +234,9 @@ class ProcessWorker:
         self._last_failure = self._clock()
         self.state, self._since = "resting", self._clock() + pause
         self._told.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
+        self._tries += 1
         if self._request is not None and self._tries >= TRIES:
-            problem = f"{TRIES} {self._name} processes failed on this window (the last one {why})"
+            problem = f"{TRIES} {self._name} processes failed before this window was done (the last one {why})"
             replies.append(self._request.failed(problem))
             self._told.append(Trouble("error", problem))
             self._request = None

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 import quadid_node.worker as working
+from quadid_node.warm_up import STILL
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
@@ -60,15 +61,20 @@ def wait(worker: InlineWorker | ProcessWorker, seconds: float = 90.0) -> tuple[l
 @pytest.fixture
 def worker() -> Iterator[ProcessWorker]:
     """A warm worker."""
-    made = ProcessWorker(PELICAN)
-    deadline = time.monotonic() + 120.0
-    while not made.ready and time.monotonic() < deadline:
-        assert made.poll() == []
-        time.sleep(0.01)
-    assert made.ready
+    made = warm(ProcessWorker(PELICAN))
     yield made
     made.close()
     assert made.pid == 0
+
+
+def warm(worker: ProcessWorker) -> ProcessWorker:
+    """The worker, once its kernels are warm."""
+    deadline = time.monotonic() + 120.0
+    while not worker.ready and time.monotonic() < deadline:
+        assert worker.poll() == []
+        time.sleep(0.01)
+    assert worker.ready
+    return worker
 
 
 def same(a: FitReply, b: FitReply) -> bool:
@@ -106,10 +112,8 @@ def test_a_killed_child_is_replaced_and_the_fit_done(
     happened(11, f"fit process ended by {number.name}: replaced, the same window fitted, said")
 
 
-def test_a_stopped_child_is_replaced(
-    worker: ProcessWorker, requests: list[FitRequest], monkeypatch: pytest.MonkeyPatch, happened: Happened
-) -> None:
-    monkeypatch.setattr(working, "FIT_LIMIT", 1.5)
+def test_a_stopped_child_is_replaced(requests: list[FitRequest], happened: Happened) -> None:
+    worker = warm(ProcessWorker(PELICAN, limit=4.0))
     old = worker.pid
     os.kill(old, signal.SIGSTOP)
     begin = time.monotonic()
@@ -118,7 +122,8 @@ def test_a_stopped_child_is_replaced(
     (reply,), told = wait(worker)
     assert reply.estimate is not None
     assert worker.pid not in (0, old)
-    assert any("hung" in t.text for t in told)
+    assert any("hung for 4 s" in t.text for t in told)
+    worker.close()
     happened(11, "fit process stopped (SIGSTOP): the parent was not held up; replaced, the window fitted, said")
 
 
@@ -147,6 +152,29 @@ def test_after_three_deaths_the_session_is_told(
     (reply,) = answers(worker, requests[1])
     assert reply.estimate is not None, "the next window is fitted again"
     happened(11, f"killed on every try: given up after 3, said; pauses {pauses} s; the next window was fitted")
+
+
+def test_a_window_that_waits_behind_children_hung_in_their_warm_up_is_given_up(
+    requests: list[FitRequest], happened: Happened
+) -> None:
+    """No child ever took it: it once waited for good, and the session with it."""
+    now, begin = 0.0, time.monotonic()
+    worker = ProcessWorker(PELICAN, clock=lambda: now + time.monotonic() - begin)
+    worker.submit(requests[0])
+    replies: list[FitReply] = []
+    hung: set[int] = set()
+    while not replies and now < 20 * STILL:
+        if worker.pid not in hung and worker.pid:
+            os.kill(worker.pid, signal.SIGSTOP)
+            hung.add(worker.pid)
+        replies = [o for o in worker.poll() if isinstance(o, FitReply)]
+        now += 1.0
+    assert len(hung) == 3
+    assert "3 fit processes failed" in replies[0].problem
+    (reply,) = answers(worker, requests[1])
+    assert reply.estimate is not None, "the next window is fitted by the next child"
+    worker.close()
+    happened(30, f"3 children hung in their warm-up: the window that waited is given up after {now:.0f} s, said")
 
 
 def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest], happened: Happened) -> None:
