@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Hashable
 
+import numpy as np
+from quadid_replay.frame_numbers import two_rows
+
 Address = Hashable
 SILENT = 3.0
 """A source that is silent for so long [s] may be replaced by another: the vehicle came back from elsewhere."""
-GAPS = 20.0
-"""Two streams in one have a mean step of the frame numbers near 128; losses of 95 % look like this many."""
-JUDGED = 40
-"""Frames after which the steps are judged."""
+JUDGED, ROWS = 40, 160
+"""Whether frame numbers come in two rows is judged after so many frames, of the last so many."""
 CALM = 2.0
 """Frame numbers must follow for so long [s] before a stream that two had mixed is believed again."""
 REPEATS, REPEAT_SECONDS = 3, 10.0
 """A number that comes again with something else in it, so often within this time [s], comes from a second sender: one
-that follows the first one's numbers, whose steps look like those of one."""
+that follows the first one's numbers, which then look like those of one."""
 PAUSE = 0.1
 """After so long without a frame [s] numbers may have run on unheard: none is known then."""
 HELLOS, HELLO_SECONDS = 2, 0.5
@@ -39,8 +40,8 @@ class Source:
         self.problem, self.refused = "", 0
         self._address: Address | None = None
         self._heard, self._mixed_until, self._refused_at = -1e9, -1e9, -1e9
-        self._last: int | None = None
-        self._steps = self._frames = 0
+        self._numbers: deque[int] = deque(maxlen=ROWS)
+        self._frames = 0
         self._contents: dict[int, int] = {}
         self._newest, self._counted = 0, -1e9
         self._repeated: deque[float] = deque(maxlen=REPEATS)
@@ -48,7 +49,8 @@ class Source:
     def take(self, address: Address | None, now: float) -> bool:
         """Whether a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
         if now - self._heard > SILENT:
-            self._address, self._last = address, None
+            self._address = address
+            self._numbers.clear()
         if address != self._address:
             self.refused, self._refused_at = self.refused + 1, now
             self.problem = f"a second source {address} sends as our vehicle ({self._address}): its frames are refused"
@@ -71,14 +73,12 @@ class Source:
             return
         if address is not None and self._repeats(sequence, now, hash(frame)):
             self._mixed_until = now + REPEAT_SECONDS
-        if self._last is not None:
-            self._steps += (sequence - self._last) % 256
-            self._frames += 1
-        self._last = sequence
+        self._numbers.append(sequence)
+        self._frames += 1
         if self._frames >= JUDGED:
-            if self._steps > GAPS * self._frames:
+            self._frames = 0
+            if two_rows(np.array(self._numbers)):
                 self._mixed_until = now + CALM
-            self._steps = self._frames = 0
 
     def _repeats(self, sequence: int, now: float, content: int) -> bool:
         """Whether numbers used a moment ago have come with something else in them again and again."""
