@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from quadid_replay.boot_clock import BootClock
-from quadid_replay.motors import MOTOR_FUNCTION, ardupilot_motor_outputs, unheld
 from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
 
 from quadid.window import Sample
 from quadid_node.chooser import Chooser
+from quadid_node.motor_order import MotorOrder
 
-ARDUPILOT = 3
 REBOOT = 1.0
 """The vehicle's clock this far back [s] is one that began anew."""
 MOTOR_PREFERENCE = {
@@ -36,17 +35,13 @@ class MavlinkDecoder:
 
     Attributes:
         counts: messages by name.
-        parameters: those parameters of the autopilot that tell which output is which motor.
-        autopilot: its MAV_AUTOPILOT.
-        problem: why its outputs are not used; empty where they are.
+        order: of its motors among its outputs.
     """
 
     def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
         """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
         self.counts: Counter[str] = Counter()
-        self.parameters: dict[str, float] = {}
-        self.autopilot = 0
-        self.problem = ""
+        self.order = MotorOrder(rotors)
         self._rotors = rotors
         self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
@@ -64,10 +59,9 @@ class MavlinkDecoder:
         name = message.get_type()
         self.counts[name] += 1
         if name == "PARAM_VALUE":
-            if MOTOR_FUNCTION.fullmatch(str(message.param_id)):  # any other name would only take memory
-                self.parameters[str(message.param_id)] = float(message.param_value)
+            self.order.tell(str(message.param_id), float(message.param_value))
             return
-        if name not in READERS or (name == "RAW_IMU" and self.autopilot != ARDUPILOT):
+        if name not in READERS or (name == "RAW_IMU" and not self.order.ardupilot):
             return
         readings = [r for r in READERS[name](message) if r.known]
         if not readings:
@@ -78,7 +72,7 @@ class MavlinkDecoder:
         for waited, t in placed:
             if t is not None:
                 for reading in waited:
-                    yield from self._channel(self._absolute(t), reading)
+                    yield from self._channel(self._absolute(t), reading, received)
 
     def _absolute(self, boot: float) -> float:
         """UNIX time of a time of the vehicle's clock, set by ours when it is first heard and when it reboots."""
@@ -87,27 +81,18 @@ class MavlinkDecoder:
         self._newest = max(self._newest, boot)
         return boot + self._epoch
 
-    def _channel(self, t: float, reading: Reading) -> Iterator[Sample]:
+    def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Sample]:
         source = reading.source.split(" ")[0]
         if reading.signal == "esc":
             yield from self._escs(t, reading, source)
             return
         channel, values = reading.signal, tuple(float(v) for v in reading.values)
         if channel in ("servo", "actuator"):
-            channel, values = "motor_command", self._motors(channel, values)
+            channel = "motor_command"
+            values = self.order.take(values, source, received)
         rank = RANKS.get((channel, source))
         if rank is not None and values and all(math.isfinite(v) for v in values):
             yield from self._chooser.take(Sample(t, channel, values), rank)
-
-    def _motors(self, signal: str, values: tuple[float, ...]) -> tuple[float, ...]:
-        """The outputs that are motors: as the autopilot's parameters say, else the first ones; none where they lack."""
-        if signal != "servo":
-            return values[: self._rotors]
-        order = ardupilot_motor_outputs(self.parameters)[: self._rotors]
-        if len(order) < self._rotors:
-            order = list(range(self._rotors))
-        self.problem = unheld(order, len(values), "SERVO_OUTPUT_RAW")
-        return () if self.problem else tuple(values[i] for i in order)
 
     def _escs(self, t: float, reading: Reading, source: str) -> Iterator[Sample]:
         """Joins the messages of one round to a row at the time of the first."""

@@ -145,14 +145,13 @@ class MavlinkLink:
         if found:
             self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
         self._wire.peers.hello(self._wire.source, time.monotonic(), self._is_vehicle(message))
-        if not found:
-            return
-        self._wire.mav.srcSystem = self.vehicle_system
-        self._decoder.autopilot = message.autopilot
-        for n in range(1, 13):
-            name = f"SERVO{n}_FUNCTION".encode()
-            if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
-                self._wire.send(dialect.MAVLink_param_request_read_message(self.vehicle_system, self._target, name, -1))
+        if found:
+            self._wire.mav.srcSystem = self.vehicle_system
+            self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+        if self._is_vehicle(message):
+            for name in self._decoder.order.lacking():
+                wanted = self.vehicle_system, self._target, name.encode(), -1
+                self._wire.send(dialect.MAVLink_param_request_read_message(*wanted))
 
     def _on_ack(self, message: Any) -> None:
         """Notes a refused request for a message."""
@@ -234,7 +233,7 @@ class MavlinkLink:
     def traffic(self) -> Traffic:
         """What comes over the link."""
         wire = self._wire
-        problems = [self._source.problem, self._decoder.problem, wire.memory_problem]
+        problems = [self._source.problem, self._decoder.order.problem, wire.memory_problem]
         if not self._key and wire.signed:
             problems.append("the frames are signed, but no key is given to check them: give --key")
         if self._key and wire.refused and not self.vehicle_system and not wire.signed:

@@ -22,10 +22,10 @@ from quadid_replay.frames import from_euler
 from quadid_replay.motors import (
     RPM,
     active_outputs,
-    ardupilot_motor_outputs,
-    changed_functions,
+    changed_within,
+    frame_rotors,
     merge_instances,
-    unheld,
+    motor_outputs,
 )  # fmt: skip
 
 _ATTITUDE = ("Roll", "Pitch", "Yaw")
@@ -33,6 +33,8 @@ _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
 _RATES = ("R", "P", "Y")
 _QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
 _QUATERNION = ("Q1", "Q2", "Q3", "Q4")
+_ESCS = 32
+"""Instances of ESC that ArduPilot may log."""
 _VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
 
 
@@ -72,9 +74,9 @@ def read_dataflash(path: Path) -> Recording:
         *_states(index, times, parameters),
         *_battery(index, times),
         *_outputs(index, times, parameters, notes),
-        *_esc(index, times, parameters),
+        *_esc(index, times, parameters, notes),
     ]
-    changed = changed_functions(names, values)
+    changed = changed_within(names, values)
     notes += [changed] if changed else []
     recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters)
     return replace(recording, modes=_modes(index, times))
@@ -246,11 +248,11 @@ def _outputs(
     source = _source(index, times, "RCOU", columns)
     if source is None or not columns:
         return []
+    found = motor_outputs(parameters, frame_rotors(_frame(index)), len(columns), "RCOU", ardupilot=True)
+    notes += [found.problem] if found.problem else []
     pulses = _stack(index, source, columns)
-    motors = ardupilot_motor_outputs(parameters, _frame(index)) or active_outputs(pulses)
-    missing = unheld(motors, len(columns), "RCOU")
-    notes += [missing] if missing else []
-    if not motors or missing:
+    motors = [] if found.problem else found.columns or active_outputs(pulses)
+    if not motors:
         return []
     label = "RCOU " + " ".join(columns[i] for i in motors)
     return [RawChannel("motor_command", source.t, pulses[:, motors], label, source.refused)]
@@ -261,13 +263,19 @@ def _frame(index: DataflashIndex) -> str:
     return next((text.split(":", 1)[1].strip() for text in texts if text.startswith("Frame:")), "")
 
 
-def _esc(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+def _esc(
+    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+) -> list[RawChannel]:
     """ESC telemetry comes one motor at a time; instances are output columns."""
     number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
     if number is None or "ESC" not in times or not index.has("ESC", "RPM"):
         return []
     instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
-    motors = ardupilot_motor_outputs(parameters, _frame(index)) or sorted({int(i) for i in instance})
+    found = motor_outputs(parameters, frame_rotors(_frame(index)), _ESCS, "ESC", ardupilot=True)
+    if found.problem:
+        notes.append(found.problem)
+        return []
+    motors = found.columns or sorted({int(i) for i in instance})
     series = []
     for motor in motors:
         rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)

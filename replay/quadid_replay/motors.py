@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,52 +17,88 @@ _FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8, "OCTAQUAD": 8, "O
 MOST_ROTORS = 12
 """ArduPilot and PX4 mix no more."""
 _LARGEST_WHOLE = 1e9
-MOTOR_FUNCTION = re.compile(r"SERVO(?:[1-9]|[12]\d|3[0-2])_FUNCTION")
-"""Parameters of ArduPilot that say what an output drives."""
+MOTOR_FUNCTION = re.compile(r"SERVO([1-9]|[12]\d|3[0-2])_FUNCTION|PWM_(?:MAIN|AUX)_FUNC([1-9]|1[0-6])")
+"""Parameters of ArduPilot and PX4 that say what an output drives."""
+_ARDUPILOT_MOTORS = {**{33 + k: k for k in range(8)}, **{82 + k: 8 + k for k in range(4)}}
+_PX4_MOTORS = {101 + k: k for k in range(MOST_ROTORS)}
+_TRICOPTER, _TAIL = (0, 1, 3), 6
+"""ArduPilot's tricopter has motors 1, 2 and 4; its motor 7 is the servo of the tail."""
 _PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
+_NAMED = 4
 
 
-def ardupilot_motor_outputs(parameters: Mapping[str, float], frame: str = "") -> list[int]:
-    """Returns the output columns (0 is the first) of motors 1, 2, 3 …; empty when the log does not say.
+class Outputs(NamedTuple):
+    """Which outputs are motors.
 
-    SERVOn_FUNCTION 33..40 and 82..85 are motors 1..8 and 9..12; older logs only tell the frame in a message.
-
-    Args:
-        parameters: ArduPilot parameters of the log.
-        frame: text after ``Frame:`` in the log's messages, such as ``QUAD/X``.
+    Attributes:
+        columns: of the rotors one by one, 0 is the first output; empty where that is not known.
+        problem: why no output can be used; empty where they can, or where nothing is said of them.
+        told: whether the autopilot says so, and it is not only what goes without saying.
     """
-    motors: dict[int, int] = {}
-    for output in range(1, 33):
-        motor = _motor_of(_whole(parameters, f"SERVO{output}_FUNCTION"))
-        if motor is not None:
-            motors[motor] = output - 1
-    if motors and sorted(motors) == list(range(len(motors))):
-        return [motors[i] for i in range(len(motors))]
-    return list(range(_FRAMES.get(frame.split("/")[0].strip().upper(), 0)))
+
+    columns: list[int]
+    problem: str = ""
+    told: bool = False
 
 
-def unheld(motors: Sequence[int], width: int, message: str) -> str:
-    """Says which motors stand on outputs that a message does not hold; empty where it holds all.
+def motor_outputs(
+    parameters: Mapping[str, float], rotors: int, width: int, message: str, ardupilot: bool = False
+) -> Outputs:
+    """Finds the motors among the outputs of one message, as the autopilot's parameters say.
+
+    ArduPilot's SERVOn_FUNCTION 33..40 and 82..85 are motors 1..8 and 9..12.  Motor k is on output k where that is not
+    told; where what is told contradicts it, as after a parameter was lost or for outputs of PX4 in another order, no
+    output is used.
 
     Args:
-        motors: their outputs, 0 is the first.
+        parameters: of the autopilot, by name.
+        rotors: how many the vehicle has; 0 for unknown.
         width: how many outputs the message holds.
         message: its name.
+        ardupilot: whether it is an ArduPilot, be none of these parameters known.
     """
-    far = [f"motor {k + 1} on output {output + 1}" for k, output in enumerate(motors) if output >= width]
-    if not far:
-        return ""
-    return (
-        f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
-        f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
-    )
+    said = [(name, *_driven(name, value)) for name, value in parameters.items() if MOTOR_FUNCTION.fullmatch(name)]
+    ardupilot |= any(name.startswith("SERVO") for name, _, _ in said)
+    motors = {motor: output for _, output, motor in said if motor is not None} if ardupilot else {}
+    tricopter = ardupilot and (rotors == 3 or (not rotors and set(motors) == {*_TRICOPTER, _TAIL}))
+    if tricopter:
+        said = [(name, output, None if motor == _TAIL else motor) for name, output, motor in said]
+        motors.pop(_TAIL, None)
+    order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
+    told = bool(motors) and set(motors) == set(order)
+    against = [] if told else [
+        f"{name} {_whole(parameters, name)}" for name, output, motor in said
+        if motor != (output if output in order else None) and (ardupilot or motor in order)
+    ]  # fmt: skip
+    if against:
+        return Outputs([], (
+            f"{', '.join(against[:_NAMED])}: no order of {rotors or 'the'} motors, {message} is not used; "
+            "let all of the autopilot's parameters be heard, or record rotor speeds"
+        ))  # fmt: skip
+    columns = [motors[m] if told else m for m in order]
+    far = [f"motor {m + 1} on output {k + 1}" for m, k in zip(order, columns, strict=True) if k >= width]
+    if far:
+        return Outputs([], (
+            f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
+            f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
+        ))  # fmt: skip
+    return Outputs(columns, told=told)
+
+
+def frame_rotors(frame: str) -> int:
+    """Returns how many rotors a frame of ArduPilot has; 0 for one that is not known.
+
+    Args:
+        frame: text after ``Frame:`` in a log's messages, such as ``QUAD/X``.
+    """
+    return _FRAMES.get(frame.split("/")[0].strip().upper(), 0)
 
 
 def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
-    """Says which SERVOn_FUNCTION of a motor changes within a log; empty where none does.
+    """Names the parameters of outputs whose motor changes; empty where none does.
 
     Args:
-        names: of all parameters in the order in which the log gives them.
+        names: of all parameters in the order in which they are told.
         values: theirs.
     """
     given: dict[str, list[int]] = {}
@@ -72,16 +109,20 @@ def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
             if function not in seen[-1:]:
                 seen.append(function)
     changed = [
-        f"{name} ({', then '.join(map(str, seen[:4]))}{' …' if len(seen) > 4 else ''})"
+        f"{name} ({', then '.join(map(str, seen[:_NAMED]))}{' …' if len(seen) > _NAMED else ''})"
         for name, seen in given.items()
-        if len(seen) > 1 and any(_motor_of(function) is not None for function in seen)
+        if len(seen) > 1 and any(_driven(name, function)[1] is not None for function in seen)
     ]
-    if not changed:
-        return ""
-    more = f" and {len(changed) - 4} more" if len(changed) > 4 else ""
-    return (
-        f"the motor order changes within the log: {', '.join(changed[:4])}{more}; outputs are taken as the last values "
-        "say, so those from before the change are of other motors"
+    more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+    return f"{', '.join(changed[:_NAMED])}{more}"
+
+
+def changed_within(names: Sequence[str], values: Sequence[float]) -> str:
+    """Says of a log, for people, which `changed_functions` it has."""
+    changed = changed_functions(names, values)
+    return changed and (
+        f"the motor order changes within the log: {changed}; outputs are taken as the last values say, so those from "
+        "before the change are of other motors"
     )
 
 
@@ -96,9 +137,9 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
     """
     motors = {}
     for output in range(1, 17):
-        function = _whole(parameters, f"PWM_{bank}_FUNC{output}")
-        if 101 <= function <= 112:
-            motors[function - 101] = output - 1
+        motor = _PX4_MOTORS.get(_whole(parameters, f"PWM_{bank}_FUNC{output}"))
+        if motor is not None:
+            motors[motor] = output - 1
     return [motors[i] for i in range(len(motors))] if sorted(motors) == list(range(len(motors))) else []
 
 
@@ -108,11 +149,12 @@ def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     return count if 0 < count <= MOST_ROTORS else _PX4_TYPES.get(_whole(parameters, "MAV_TYPE"), 0)
 
 
-def _motor_of(function: int) -> int | None:
-    """The motor, 0 for the first, that a SERVOn_FUNCTION stands for."""
-    if 33 <= function <= 40:
-        return function - 33
-    return function - 82 + 8 if 82 <= function <= 85 else None
+def _driven(name: str, value: float) -> tuple[int, int | None]:
+    """Output (0 is the first) that a parameter is about, and the motor (0 is the first) that it says to be on it."""
+    match = MOTOR_FUNCTION.fullmatch(name)
+    assert match is not None
+    motors = _ARDUPILOT_MOTORS if match[1] else _PX4_MOTORS
+    return int(match[1] or match[2]) - 1, motors.get(_whole({name: value}, name))
 
 
 def _whole(parameters: Mapping[str, float], name: str) -> int:

@@ -13,9 +13,10 @@ from quadid.types import IntArray
 from quadid.window import Recording
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.esc_messages import extend_dialect
+from quadid_replay.frame_numbers import two_rows
 from quadid_replay.mavlink_decode import decode, intact
 from quadid_replay.mavlink_frames import Frames, read_frames
-from quadid_replay.motors import active_outputs, ardupilot_motor_outputs, px4_rotor_count, unheld
+from quadid_replay.motors import active_outputs, motor_outputs, px4_rotor_count
 from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES
 from quadid_replay.tlog_vehicle import Told, VehicleLog, vehicle_log
 
@@ -28,8 +29,6 @@ _MOST_SENDERS = 32
 """Of more, those with the fewest frames are not looked into: damage makes senders, and none of them is the vehicle."""
 _NAMED = 8
 """Other vehicles that are named; more are counted."""
-_FAR = 8
-"""Frame numbers that jump by no more come from a frame that is lost, late or there twice."""
 
 
 def read_tlog(path: Path) -> Recording:
@@ -57,7 +56,7 @@ def read_tlog(path: Path) -> Recording:
             "times: two vehicles under one system id", "one vehicle an id",
             "give each vehicle its own SYSID_THISMAV (MAV_SYS_ID) and record again, or record each link by itself",
         )  # fmt: skip
-    if _two_rows(frames.number[(frames.system == who[0]) & (frames.component == who[1])]):
+    if two_rows(frames.number[(frames.system == who[0]) & (frames.component == who[1])]):
         notes.append(
             f"frame numbers of system {who[0]} component {who[1]} come in two rows: two links of one vehicle, or two "
             "vehicles under one id, and then nothing of it can be trusted"
@@ -69,17 +68,6 @@ def read_tlog(path: Path) -> Recording:
         notes.append(f"vehicle {who[0]} used; also in the log: {named}{more}")
     raw = _channels(vehicles[who], notes)
     return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
-
-
-def _two_rows(number: IntArray) -> bool:
-    """Whether frame numbers jump to and fro between two rows: each jump lands where the last one had left off.
-
-    Numbers of one sender jump over what was lost, and never go on where they were before.
-    """
-    step = np.diff(number) % 256
-    jumps = np.flatnonzero((step > _FAR) & (step < 256 - _FAR))
-    back = int(np.count_nonzero(number[jumps[1:] + 1] == (number[jumps[:-1]] + 1) % 256))
-    return back > max(_MOST_BACKWARDS, len(jumps) // 2)
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
@@ -137,14 +125,13 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
             known = ~np.isnan(values).all(axis=0) & (np.nan_to_num(values) != 0.0).any(axis=0)
             width = rotors or int(np.count_nonzero(known))
             raw.append(RawChannel("rotor_speed", t, values[:, :width], f"{source} (rpm)", refused))
-        elif signal == "servo":
-            motors = ardupilot_motor_outputs(vehicle.parameters) or list(range(rotors)) or active_outputs(values)
-            label = f"{source} {' '.join(str(i + 1) for i in motors)}"
-            missing = unheld(motors, values.shape[1], source)
-            notes += [missing] if missing else []
-            if motors and not missing:
-                raw.append(RawChannel("motor_command", t, values[:, motors], label, refused))
-        elif signal == "actuator" and rotors:
-            raw.append(RawChannel("motor_command", t, values[:, :rotors], f"{source} (normalized)", refused))
+        elif signal in ("servo", "actuator"):
+            found = motor_outputs(vehicle.parameters, rotors, values.shape[1], source, vehicle.ardupilot)
+            notes += [found.problem] if found.problem else []
+            guessed = active_outputs(values) if signal == "servo" and not found.problem else []
+            motors = found.columns or guessed
+            which = " ".join(str(i + 1) for i in motors) if signal == "servo" else "(normalized)"
+            if motors:
+                raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}", refused))
     order: Iterable[RawChannel] = sorted(raw, key=lambda r: "ACTUATOR" not in r.source)
     return list(order)

@@ -11,7 +11,7 @@ import numpy as np
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid_replay.clocks import LogClock
 from quadid_replay.mavlink_decode import Messages
-from quadid_replay.motors import MOST_ROTORS, changed_functions
+from quadid_replay.motors import MOST_ROTORS, changed_within
 from quadid_replay.tlog_messages import READERS, Reading, boot_seconds, unix_seconds
 from quadid_replay.tlog_times import Stamps, place
 
@@ -47,6 +47,7 @@ class VehicleLog:
         signals: by channel and message.
         parameters: of the autopilot, by name.
         changed: which of them that name a motor change within the log; empty for none.
+        ardupilot: whether it calls itself one.
         kind: its MAV_TYPE; 0 for unknown.
         rotors: as ESC_INFO says; 0 for unknown, and for more than a vehicle has.
         heard: whether a measurement has its time before the log ends.
@@ -57,6 +58,7 @@ class VehicleLog:
     signals: Mapping[tuple[str, str], Signal]
     parameters: Mapping[str, float]
     changed: str
+    ardupilot: bool
     kind: int
     rotors: int
     heard: bool
@@ -95,7 +97,8 @@ def vehicle_log(told: Mapping[str, Told], received: FloatArray) -> VehicleLog:
     names, values = _parameters(told)
     rotors = 0 if escs is None else int(escs.messages.count.max())
     return VehicleLog(
-        clock, signals, dict(zip(names, values, strict=True)), changed_functions(names, values),
+        clock, signals, dict(zip(names, values, strict=True)), changed_within(names, values),
+        beats is not None and int(beats.messages.autopilot[-1]) == _ARDUPILOT,
         0 if beats is None else int(beats.messages.type[-1]), rotors if rotors <= MOST_ROTORS else 0, heard, backwards,
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ import pytest
 import zstandard
 from quadid_replay import open_log, usd_records
 from quadid_replay.frames import from_euler, to_euler
-from quadid_replay.motors import ardupilot_motor_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.motors import motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
@@ -87,7 +87,7 @@ def test_esc_records_without_a_stamp_are_not_used(tmp_path: Path) -> None:
 
 def test_parameters_that_are_no_numbers_tell_nothing() -> None:
     damaged = {"SERVO1_FUNCTION": float("nan"), "PWM_MAIN_FUNC1": float("inf"), "MAV_TYPE": float("-inf")}
-    assert ardupilot_motor_outputs(damaged) == []
+    assert motor_outputs(damaged, 0, 16, "RCOU") == ([], "", False)
     assert px4_motor_outputs(damaged, "MAIN") == []
     assert px4_rotor_count(damaged) == 0
     for count in (-3.0, 0.5, 1e9, 2.0**100, float("nan")):
@@ -274,9 +274,9 @@ def test_a_motor_order_that_changes_within_a_log_is_said(
     else:
         heard = Tlog()
         heard.add(0.0, heartbeat())
-        for k, value in enumerate((33, 34, *again)):
+        for k, value in enumerate((33, 34, 35, 36, *again)):
             heard.add(0.02 * k, servo(10.0 + 0.02 * k))
-            heard.add(0.02 * k, function(1 + k % 2, value))
+            heard.add(0.02 * k, function(1 + k % 4, value))
         data = bytes(heard.data)
     said = [w for w in open_log(opened(tmp_path, data)).warnings if "motor order" in w]
     assert len(said) == changed

@@ -282,7 +282,7 @@ def test_parameters_nobody_needs_take_no_memory() -> None:
     for k in range(1000):
         name = f"X{k}".encode()
         list(decoder.samples(decoded(dialect.MAVLink_param_value_message(name, 1.0, 9, 100, 0)), 0.0))
-    assert decoder.parameters == {}
+    assert decoder.order._parameters == {}
 
 
 @pytest.mark.parametrize("rotors", [4, 6, 8])
@@ -383,7 +383,7 @@ def test_a_signed_link_without_a_key_is_said(port: int) -> None:
 
 def test_servo_outputs_follow_the_autopilots_motor_functions_and_unwrap() -> None:
     decoder = MavlinkDecoder(4, wall=lambda: 4300.0)
-    decoder.autopilot = 3
+    decoder.order.ardupilot = True
     for output, motor in ((1, 36), (2, 35), (3, 34), (4, 33)):
         name = f"SERVO{output}_FUNCTION".encode()
         list(decoder.samples(decoded(dialect.MAVLink_param_value_message(name, float(motor), 9, 100, output)), 0.0))

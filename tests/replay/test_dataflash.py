@@ -11,7 +11,7 @@ from pymavlink import DFReader
 from quadid_replay import open_log
 from quadid_replay.dataflash_index import index_dataflash
 from quadid_replay.frames import from_euler
-from quadid_replay.motors import RPM, active_outputs, ardupilot_motor_outputs, merge_instances
+from quadid_replay.motors import RPM, Outputs, active_outputs, frame_rotors, merge_instances, motor_outputs
 
 from tests.faults.evidence import Happened
 
@@ -151,10 +151,69 @@ def test_padding_at_the_end_is_no_damage_but_a_cut_record_is_told(tmp_path: Path
     assert index.skipped == 700
 
 
-def test_which_outputs_are_motors() -> None:
-    assert ardupilot_motor_outputs({"SERVO5_FUNCTION": 33, "SERVO2_FUNCTION": 34, "SERVO1_FUNCTION": 35}) == [4, 1, 0]
-    assert ardupilot_motor_outputs({}, "HEXA/X") == list(range(6))
-    assert ardupilot_motor_outputs({"SERVO1_FUNCTION": 34}) == []  # motor 1 is nowhere
+def functions(*told: int, bank: str = "SERVO") -> dict[str, float]:
+    """Parameters that tell what outputs 1, 2, 3 … drive."""
+    form = "SERVO{}_FUNCTION" if bank == "SERVO" else f"PWM_{bank}_FUNC{{}}"
+    return {form.format(output): float(value) for output, value in enumerate(told, 1)}
+
+
+@pytest.mark.parametrize(
+    ("told", "rotors", "columns"),
+    [
+        (functions(35, 34, 0, 0, 33), 0, [4, 1, 0]),
+        (functions(34, 33, 36, 35, 0, 0, 0, 0), 4, [1, 0, 3, 2]),
+        (functions(34, 36, 33, 39), 3, [2, 0, 1]),  # a tricopter: motors 1, 2 and 4, and the servo of its tail
+        (functions(33, 34, 0, 36, 0, 0, 39), 0, [0, 1, 3]),
+        (functions(33, 34), 4, [0, 1, 2, 3]),  # the other two were lost: they are where they always are
+        ({}, 3, [0, 1, 3]),
+        ({}, 6, [0, 1, 2, 3, 4, 5]),
+        ({}, 0, []),
+    ],
+)
+def test_which_outputs_are_motors_of_an_ardupilot(told: dict[str, float], rotors: int, columns: list[int]) -> None:
+    found = motor_outputs(told, rotors, 16, "RCOU", ardupilot=True)
+    assert found.columns == columns
+    assert found.problem == ""
+
+
+@pytest.mark.parametrize(
+    ("told", "rotors", "said"),
+    [
+        (functions(34), 0, "SERVO1_FUNCTION 34"),  # motor 1 is nowhere
+        (functions(34, 33), 4, "SERVO1_FUNCTION 34, SERVO2_FUNCTION 33"),  # and the other two?
+        (functions(33, 34, 0, 36), 4, "SERVO3_FUNCTION 0"),
+        (functions(33, 34, 0, 36, 0, 0, 39), 4, "SERVO3_FUNCTION 0, SERVO7_FUNCTION 39"),
+        (functions(33, 34, 35, 36, 37, 38), 4, "SERVO5_FUNCTION 37, SERVO6_FUNCTION 38"),
+        (functions(33, 34, 35), 3, "SERVO3_FUNCTION 35"),
+        (functions(102, 101, 103, 104, bank="MAIN"), 4, "PWM_MAIN_FUNC1 102, PWM_MAIN_FUNC2 101"),
+    ],
+)
+def test_what_is_no_order_of_the_motors_is_said_and_no_output_guessed(
+    told: dict[str, float], rotors: int, said: str, happened: Happened
+) -> None:
+    """A gap was once filled with the first outputs, as for a tricopter, whose third motor is on the fourth one."""
+    found = motor_outputs(told, rotors, 16, "RCOU")
+    assert found.columns == []
+    assert found.problem.startswith(f"{said}: no order")
+    happened(31, f"{said} of {rotors or 'nobody knows how many'} rotors: no output is taken for a motor, said")
+
+
+def test_outputs_of_px4_in_order_and_frames_by_their_names() -> None:
+    in_order = functions(101, 102, 103, 104, 0, 0, bank="AUX")
+    assert motor_outputs(in_order, 4, 16, "SERVO_OUTPUT_RAW") == Outputs([0, 1, 2, 3])
+    assert [frame_rotors(name) for name in ("HEXA/X", "TRI", "quad/plus", "HELI", "")] == [6, 3, 4, 0, 0]
+
+
+def test_a_tricopters_third_motor_is_on_its_fourth_output(tmp_path: Path) -> None:
+    log = flight(motors=())
+    for output, value in ((1, 33), (2, 34), (4, 36), (7, 39)):
+        log.add("PARM", 0, f"SERVO{output}_FUNCTION".encode(), float(value))
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    assert recording.channels["motor_command"].source == "RCOU C1 C2 C4"
+    assert recording.channels["motor_command"].values[0].tolist() == [1100.0, 1200.0, 1400.0]
+
+
+def test_leading_outputs_that_vary_are_motors() -> None:
     k = np.arange(100.0)[:, None]
     pulses = np.hstack([1100 + k, 1200 + k, 1300 + k, 1400 + k, 1500 + 0 * k, 1600 + k])
     assert active_outputs(pulses) == [0, 1, 2, 3]
