@@ -146,7 +146,7 @@ def _model(case: Case, settings: GateSettings) -> str | None:
 def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
     """Why no vehicle has these parameters, whoever estimated or stored them; None when one may."""
     for p in parameters:
-        if not math.isfinite(p.value) or not math.isfinite(p.sigma):
+        if not math.isfinite(p.value) or not 0.0 <= p.sigma < math.inf:
             return f"{p.name} = {p.value:g} {p.unit} with standard deviation {p.sigma:g} is not a number"
         if p.name in NOMINAL_NAMES and not p.value > 0.0:
             return f"{p.name} = {p.value:g} {p.unit} is not positive"

@@ -137,9 +137,12 @@ class HistoryWriter:
         with contextlib.closing(connect(self._path)) as db, db:
             for row in batch:
                 try:
-                    db.execute(row.statement, row.values)
+                    added = db.execute(row.statement, row.values).rowcount
                 except _UNFIT as error:
                     unfit.append((row, f"{type(error).__name__}: {error}"))
+                else:
+                    if not added:
+                        unfit.append((row, f"number {row.number} stands for another set already"))
             self._since_pruned += len(batch)
             if self._since_pruned >= PRUNE_EVERY:
                 self._since_pruned = 0

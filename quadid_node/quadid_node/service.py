@@ -80,7 +80,7 @@ class Service:
             restored: what an earlier run had left; default: what the history says.
         """
         if restored is None:
-            restored = store.restore(settings.gate) if store is not None else Restored(None, 1)
+            restored = store.restore(settings.gate, vehicle) if store is not None else Restored(None, 1)
         self.vehicle, self.restored, self.boot_id = vehicle, restored, uuid.uuid4().hex
         self.session = Session(
             vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy

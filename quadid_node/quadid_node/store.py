@@ -8,13 +8,12 @@ is waited for, then refused: without it nobody knows which numbers are taken.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,13 +21,15 @@ from typing import IO
 
 from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.trims import FlightTrim
-from quadid.online.gate import GateSettings, implausible
+from quadid.online.gate import GateSettings
 from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Diagnosed, Event, OnlineSet
-from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
+from quadid_node.restored_set import why_none
 from quadid_node.store_file import UNREADABLE, StoreError, connect, is_damage, make_tables, set_aside
+from quadid_node.store_lock import real, take_lock, text
 
 KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets and decisions never."""
@@ -89,9 +90,9 @@ class Store:
             kept: rows that stay, by table; older ones are forgotten.
 
         Raises:
-            StoreError: the name is no text, or another program writes the history of this vehicle or holds the file.
+            StoreError: name or path is none, or another program writes this vehicle's history or holds the file.
         """
-        self.path, self.vehicle = path, _text(vehicle)
+        self.path, self.vehicle = real(path), text(vehicle)
         self.notes: list[str] = []
         self._problem = ""
         self._lock: IO[str] | None = None
@@ -99,13 +100,14 @@ class Store:
         self._standing: dict[str, Row] = {}
         self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = _take_lock(path, vehicle)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock = take_lock(self.path, vehicle)
         except OSError as error:
-            self._problem = f"{path} cannot be written ({error.strerror}): nothing of this run is kept or published"
+            why = f"{self.path} cannot be written ({error.strerror})"
+            self._problem = f"{why}: nothing of this run is kept or published"
         if self._lock is not None:
             self._prepare()
-            self._writer = HistoryWriter(path, kept, self._begins_with, self.notes)
+            self._writer = HistoryWriter(self.path, kept, self._begins_with, self.notes)
             self._writer.problem, self._problem = self._problem, ""
 
     @property
@@ -113,25 +115,29 @@ class Store:
         """Why nothing is written at the moment, or empty."""
         return self._writer.problem or self._problem if self._writer is not None else self._problem
 
-    def restore(self, gate: GateSettings | None = None) -> Restored:
-        """What the last run left; a set is taken up again when it is one that this run's `gate` could let pass."""
+    def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
+        """What the last run left; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
         if self._lock is None or not self.path.is_file():
             return Restored(None, first_number())
         try:
             with contextlib.closing(connect(self.path)) as db:
-                return self._restored(db, gate or GateSettings())
+                return self._restored(db, gate or GateSettings(), vehicle)
         except sqlite3.Error as error:
             self.notes.append(f"the last set cannot be read back ({error})")
             return Restored(None, first_number())
 
-    def _restored(self, db: sqlite3.Connection, gate: GateSettings) -> Restored:
+    def _restored(self, db: sqlite3.Connection, gate: GateSettings, vehicle: Vehicle | None) -> Restored:
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
-        last = self._set(db, gate, "state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
+
+        def newest(which: str) -> OnlineSet | None:
+            return self._set(db, which, lambda found, number: why_none(found, number, gate, vehicle))
+
+        last = newest("state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
         if last is not None:
-            told = self._set(db, gate, "state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC")
+            told = newest("state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC")
             last = replace(last, outdated=told.outdated if told is not None else last.outdated)
-        approved = self._set(db, gate, "approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
-        first = self._set(db, gate, "state = 'accepted' ORDER BY rowid")
+        approved = newest("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
+        first = newest("state = 'accepted' ORDER BY rowid")
         for item in (first, approved, last):
             if item is not None:
                 self._stands(item)
@@ -157,15 +163,15 @@ class Store:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
         return tuple(out)
 
-    def _set(self, db: sqlite3.Connection, gate: GateSettings, which: str) -> OnlineSet | None:
+    def _set(self, db: sqlite3.Connection, which: str, why_none: Callable[[OnlineSet, int], str]) -> OnlineSet | None:
         """The first such set; one that no fresh estimate could be is left out, and said."""
-        row = db.execute(f"SELECT data FROM sets WHERE vehicle = ? AND {which} LIMIT 1", (self.vehicle,)).fetchone()
+        found, query = None, f"SELECT data, sequence FROM sets WHERE vehicle = ? AND {which} LIMIT 1"
+        row = db.execute(query, (self.vehicle,)).fetchone()
         if row is None:
             return None
         try:
             found = set_from_dict(json.loads(row[0]))
-            missing = set(NOMINAL_NAMES) - set(found.parameters.names)
-            why = f"it lacks {', '.join(sorted(missing))}" if missing else implausible(found.parameters, gate)
+            why = why_none(found, row[1])
         except UNREADABLE as error:
             why = f"{type(error).__name__}: {str(error)[:120]}"
         if why:
@@ -206,7 +212,9 @@ class Store:
     def _row(self, item: OnlineSet) -> Row:
         values = (self.vehicle, item.sequence, item.state.value, item.reason, item.approved_by, item.stop, time.time())
         data = json.dumps(set_to_dict(item))
-        return Row("INSERT INTO sets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*values, data), item.sequence)
+        another = "SELECT 1 FROM sets WHERE vehicle = ? AND sequence = ? AND data != ?"
+        statement = f"INSERT INTO sets SELECT ?, ?, ?, ?, ?, ?, ?, ? WHERE NOT EXISTS ({another})"
+        return Row(statement, (*values, data, self.vehicle, item.sequence, data), item.sequence)
 
     def candidate(self, item: OnlineSet) -> None:
         """Journals an estimate and what the gate said of it."""
@@ -290,27 +298,3 @@ class Store:
             (highest,) = db.execute("SELECT max(sequence) FROM sets").fetchone()
         if not isinstance(highest, int | None) or (highest or 0) >= LARGEST_NUMBER:
             raise sqlite3.DatabaseError(f"malformed: set number {highest!r}")
-
-
-def _text(vehicle: str) -> str:
-    """The name as it was given; raises StoreError for one that is no text (bytes of another encoding)."""
-    try:
-        vehicle.encode()
-    except UnicodeEncodeError as error:
-        raise StoreError(f"the name {vehicle!r} is no text", "a name in UTF-8", "give another --id") from error
-    return vehicle
-
-
-def _take_lock(path: Path, vehicle: str) -> IO[str]:
-    """One writer per vehicle and history, for as long as it lives."""
-    plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in vehicle)[:80]
-    lock = path.with_name(f"{path.name}.{plain}.lock").open("w")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        lock.close()
-        raise StoreError(
-            f"another service writes the history of '{vehicle}' in {path}", "one service a vehicle",
-            "stop the other one, give another history, or start as observer",
-        ) from error  # fmt: skip
-    return lock

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import sqlite3
 import subprocess
@@ -278,6 +279,59 @@ def test_a_row_that_never_reaches_the_disk_holds_up_no_later_set(tmp_path: Path,
     assert any(isinstance(o, Event) and "no history can hold" in o.text for o in outputs)
     service.close()
     happened(23, "a set whose reason no history can hold: not published, said; the next one is")
+
+
+def test_two_services_that_reach_one_history_by_two_links_never_give_one_number_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    """Each had a lock beside its own name for the file; begun in one millisecond, they numbered alike."""
+    monkeypatch.setattr(time, "time_ns", lambda: 1_800_000_000_000 * 10**6)
+    path, soft, hard = tmp_path / "h.sqlite", tmp_path / "a" / "soft.sqlite", tmp_path / "hard.sqlite"
+    one = service_with(Store(path, "pelican"))
+    soft.parent.mkdir()
+    soft.symlink_to(path)
+    with pytest.raises(StoreError, match="another service writes the history"):
+        Store(soft, "pelican")
+    hard.hardlink_to(path)
+    other = service_with(Store(hard, "pelican"))
+    first = accept(one)
+    assert [o.item.sequence for o in said(one, 1.5) if isinstance(o, Publish)] == [first.sequence]
+    second = accept(other, b=1.01 * TRUE["b"])
+    assert second.sequence == first.sequence
+    outputs = list(said(other, 1.5))
+    assert not any(isinstance(o, Publish) for o in outputs)
+    (note,) = (o.text for o in outputs if isinstance(o, Event) and o.kind == "history")
+    assert f"number {first.sequence} stands for another set already" in note
+    assert numbers_of(path) == [first.sequence]
+    one.close()
+    other.close()
+    happened(23, "two services on one history by a hard link, numbered alike: the second's set is not published, said")
+
+
+def test_a_lock_that_is_a_link_empties_nothing(tmp_path: Path) -> None:
+    victim = tmp_path / "precious"
+    victim.write_text("kept")
+    (tmp_path / "h.sqlite.pelican.lock").symlink_to(victim)
+    Store(tmp_path / "h.sqlite", "pelican").close()
+    assert victim.read_text() == "kept"
+
+
+@pytest.mark.parametrize("name", ["", ":memory:", "loop", "fifo"])
+def test_a_history_that_is_no_file_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The first was a ValueError; the second a database in memory, of which nothing was ever kept."""
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    os.mkfifo("fifo")
+    store = Store(Path(name), "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=7))
+    assert store.flush(1.0) == store.written(7) == (name == ":memory:")
+    assert bool(store.problem) != store.written(7)
+    store.close()
+
+
+def test_a_path_that_names_no_file_is_one_line() -> None:
+    with pytest.raises(StoreError, match="names no file"):
+        Store(Path("nul\0"), "pelican")
 
 
 def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_decisions(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import sqlite3
 import subprocess
@@ -251,6 +252,11 @@ def kept(path: Path) -> None:
     store.close()
 
 
+def with_all(**fields: object) -> str:
+    """A set as JSON, with other fields of its own."""
+    return json.dumps({**set_to_dict(online_set(TRUE)), **fields})
+
+
 def with_first(**fields: object) -> str:
     """A set as JSON, with other fields in its first parameter."""
     data = set_to_dict(online_set(TRUE))
@@ -263,7 +269,11 @@ HOSTILE_SETS = {
     "a value of 400 digits": with_first(value=10**400),
     "an infinite number": with_first().replace('"samples": ', '"samples": 1e999, "old": '),
     "one bound": with_first(bounds=[1.0]), "no interval": with_first(ci95=[]), "no b": with_first(name="c"),
-    "a mass of 400 digits": json.dumps({**set_to_dict(online_set(TRUE)), "mass": 10**400}),
+    "a mass of 400 digits": with_all(mass=10**400),
+    "a number beyond 64 bits": with_all(sequence=2**64), "another set's number": with_all(sequence=8),
+    "a negative deviation": with_first(sigma=-2e-4),
+    "a covariance of no numbers": with_all(covariance=[[math.nan] * 6] * 6),
+    "a parameter twice": with_all(parameters=2 * set_to_dict(online_set(TRUE))["parameters"], covariance=None),
 }  # fmt: skip
 
 
@@ -282,6 +292,29 @@ def test_a_set_that_none_wrote_is_left_out_and_said(tmp_path: Path, what: str, h
     assert "is no set and is not taken up again" in store.notes[0]
     store.close()
     happened(12, f"a row of the history that holds {what}: '{store.notes[0][:90]}'")
+
+
+HOSTILE_TO_A_VEHICLE = {
+    "a negative mass": with_all(mass=-3.0), "a mass that no float of 32 bits holds": with_all(mass=1e300),
+    "b far outside the vehicle's bounds": with_first(value=1.0, bounds=[0.5, 2.0]),
+    "a deviation that no float of 32 bits holds": with_first(sigma=1e300),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE_TO_A_VEHICLE)
+def test_a_set_that_this_vehicle_cannot_have_is_left_out_and_said(
+    tmp_path: Path, what: str, happened: Happened
+) -> None:
+    """It was judged by the bounds that it gave itself; a mass of 1e300 ended the link that told it."""
+    path = tmp_path / "h.sqlite"
+    kept(path)
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE sets SET data = ?", (HOSTILE_TO_A_VEHICLE[what],))
+    store = Store(path, "v")
+    assert store.restore(vehicle=PELICAN).item is None
+    assert "is no set and is not taken up again" in store.notes[0]
+    store.close()
+    happened(25, f"a stored set with {what}: '{store.notes[0][50:140]}'")
 
 
 ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
