@@ -77,9 +77,12 @@ FAULTS: dict[int, Fault] = {
         "nothing published while sensors disagree; rotor speeds bounded",
     ),
     29: Fault("vehicle changes (mass, thrust) with a set in force", "set published again at once, out of date"),
-    30: Fault("fit process that hangs while it warms up", "replaced after the promised time"),
+    30: Fault(
+        "fit process that hangs while it warms up", "replaced after the promised time; a window waits for three at most"
+    ),
     31: Fault(
-        "two vehicles on one system id, redefined FMT, motor on an unlogged output, changed motor order, "
+        "two vehicles on one system id, redefined FMT, motor on an unlogged output, motor order changed (log or live) "
+        "or contradictory, "
         "shuffled MCAP, `1_0` and a wild first stamp in a CSV",
         "refused, or read correctly; reported",
     ),
