@@ -33,11 +33,10 @@ class Source:
 
     Attributes:
         problem: what speaks against it now, or empty.
-        refused: frames refused as those of a second one.
     """
 
     def __init__(self) -> None:
-        self.problem, self.refused = "", 0
+        self.problem = ""
         self._address: Address | None = None
         self._heard, self._mixed_until, self._refused_at = -1e9, -1e9, -1e9
         self._numbers: deque[int] = deque(maxlen=ROWS)
@@ -52,12 +51,11 @@ class Source:
             self._address = address
             self._numbers.clear()
         if address != self._address:
-            self.refused, self._refused_at = self.refused + 1, now
+            self._refused_at = now
             self.problem = f"a second source {address} sends as our vehicle ({self._address}): its frames are refused"
             return False
         self._heard = now
         if now < self._mixed_until:
-            self.refused += 1
             self.problem = "two sources are mixed in one stream (by their frame numbers): nothing is believed"
             return False
         if now - self._refused_at > SILENT:

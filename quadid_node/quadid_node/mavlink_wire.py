@@ -161,7 +161,7 @@ class Wire:
         refused: frames with a wrong checksum, and with a key those without a good signature.
         dropped: bytes dropped unread because too many came.
         source: of the frame yielded last: UDP address, None on other links.
-        unsigned, signed: whether frames of the two kinds came.
+        signed: whether a signed frame came, believed or not.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class Wire:
         self.refused = self.dropped = 0
         self.source: Any = None
         self.peers = Peers()
-        self.signed = self.unsigned = False
+        self.signed = False
 
     @property
     def memory_problem(self) -> str:
@@ -234,13 +234,12 @@ class Wire:
                 if message_id(frame) not in wanted:
                     continue
                 decoded += 1
+                self.signed |= _is_signed(frame)
                 try:
                     message = self.mav.decode(bytearray(frame))
                 except dialect.MAVError:
                     self.refused += 1
-                    self.signed |= _is_signed(frame)
                     continue
-                self.signed, self.unsigned = self.signed | _is_signed(frame), self.unsigned | (not _is_signed(frame))
                 yield message
         if self._memory is not None:
             self._memory.keep()

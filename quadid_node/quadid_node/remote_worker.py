@@ -133,11 +133,6 @@ class RemoteWorker:
         return "busy" if self._asked is not None else self._local.state
 
     @property
-    def sees_ground(self) -> bool:
-        """Whether the next request would go to a ground machine."""
-        return self._ground.there
-
-    @property
     def restarts(self) -> int:
         """Of the child."""
         return self._local.restarts

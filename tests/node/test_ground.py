@@ -144,7 +144,7 @@ def test_a_ground_machine_fits_and_what_it_leaves_is_fitted_on_board(
     alone, _ = answered(worker, request_)
     assert worker.far == 0
     machine = ground_machine()
-    assert until(lambda: worker.sees_ground, START)
+    assert until(lambda: worker._ground.there, START)
     far, told = answered(worker, request_)
     assert worker.far == 1, told
     assert same(here, alone)
