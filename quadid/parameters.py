@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -81,6 +81,14 @@ class Parameter:
     measured_before: bool = False
 
 
+def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple[Parameter, ...]:
+    """Parameters, with those of `names` that data tell not to be used."""
+    return tuple(
+        replace(p, status=Status.UNRELIABLE, relative_to=None) if p.name in names and p.status not in UNKNOWN else p
+        for p in parameters
+    )
+
+
 @dataclass(frozen=True)
 class ParameterSet:
     """Parameters with their joint covariance.
@@ -111,12 +119,7 @@ class ParameterSet:
 
     def unreliable(self, names: Sequence[str]) -> ParameterSet:
         """The same, with those of `names` that data tell not to be used."""
-        told = {Status.IDENTIFIED, Status.RATIO_ONLY}
-        parts = [
-            replace(p, status=Status.UNRELIABLE, relative_to=None) if p.name in names and p.status in told else p
-            for p in self.parameters
-        ]
-        return ParameterSet(tuple(parts), np.array(self.covariance))
+        return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -23,12 +23,11 @@ import numpy as np
 from scipy import stats
 
 from quadid.chi_square import Z95
-from quadid.diagnose import Diagnosis, diagnose
+from quadid.diagnose import Diagnosis, Search, diagnose
 from quadid.diagnose import log_evidence as rule
 from quadid.diagnose.cross_validation import Gain, paired_gain
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, extend
-from quadid.diagnose.pipeline import Workings
 from quadid.diagnose.residual_tests import ALARM
 from quadid.diagnose.result import FoundParameter
 from quadid.diagnose.score_test import Everything
@@ -48,23 +47,23 @@ def study(case: Case) -> Record:
     key = {"group": case.group, "number": case.number, "effects": list(case.expected)}
     try:
         window, _, vehicle = flown(case)
-        found, workings = diagnose([window], vehicle, seed=case.seed)
+        found, search = diagnose([window], vehicle, seed=case.seed)
     except (FlightError, QuadidError) as error:
         return key | {"verdict": "failed", "note": str(error)}
     key |= {"verdict": found.verdict.value, "named": [f.effect for f in found.findings if f.confident]}
-    return key | _errors(case, found) | ({} if case.expected else {"gates": _gates(workings)})
+    return key | _errors(case, found) | ({} if case.expected else {"gates": _gates(found, search)})
 
 
-def _gates(workings: Workings) -> dict[str, Any]:
+def _gates(found: Diagnosis, search: Search) -> dict[str, Any]:
     """What the parts of the rule say of the selected model: of a null flight, of nothing at all.
 
     A null rarely has a cause worth a refit, so the best three of the screening are refitted here whatever they promise.
     """
-    decisive, model = workings.search.shooting, workings.search.model
+    decisive, model = search.shooting, search.model
     listed = candidates(decisive.layout, decisive.has_velocity, decisive.channels >= 15)
-    scores = [s for s in Everything.of(decisive, model, listed).scores(listed) if s.candidate.timed is None]
+    scores = [s for s in Everything.of(decisive, model, listed).scores() if s.candidate.timed is None]
     trials = [_refit(decisive, model, s.candidate, len(scores)) for s in scores[:3]]
-    left = workings.remainder
+    left = found.remainder
     return {
         "screened": [float(stats.chi2.sf(s.drop, len(s.candidate.names))) for s in scores],
         "gain": sum(t.gain.total > rule.RELEVANT * model.rows for t in trials),

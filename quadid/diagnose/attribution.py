@@ -1,36 +1,41 @@
-"""What each finding is worth on data that neither the fit nor the selection saw, and which ones any vehicle has.
+"""What the findings gain on data that neither the fit nor the selection saw: each of them, and all together.
 
-Every real vehicle has its centre of gravity half a millimetre off and rotors that differ by half a percent.  Taking one
-such cause out of the model and counting what is lost would rank it by what its neighbours were forbidden to take up.
-So the model a cause is measured against may use the whole catalogue, within the small sizes that any vehicle has: a
-cause is worth what none of these can explain.
+A cause is worth what is lost without it, all others refitted, in the segments that decided.  With validation logs the
+parameters stay as fitted there, and values that belong to a flight (`per_log`) are carried over; without such logs
+ten-second blocks of the training log are left out in turn.  Causes no larger than on any vehicle come last.
 
-With validation logs the parameters stay as fitted; values that belong to a flight (`per_log`) are carried over, and, as
-a second figure, refitted on the first half of each validation log and scored on its second half.  Without such logs,
-ten-second blocks of the training log are left out in turn.
+What all of them gain is stated as an identification of the same flights states errors, and the verdict goes by that:
+runs of one second, in the noise that the identification estimated, from the parameters that the identification found
+(`quadid.identify.score`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from typing import NamedTuple
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import block_labels, paired_gain
-from quadid.diagnose.hypotheses import Candidate, all_names
-from quadid.diagnose.model import Model, as_model, free_names, taken_out
+from quadid.diagnose.cross_validation import block_labels, paired_gain, steps_without, sum_by_block
+from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.model import Model, free_names
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import polish
-from quadid.identify.parameterization import Free
-from quadid.identify.score import settle_states
+from quadid.identify.noise_model import NoiseModel
+from quadid.identify.priors import default_prior, posterior_covariance
+from quadid.identify.reliability import MISFIT
+from quadid.identify.score import Tally, mse_score, scored_problem, settle_states, tallied
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 UNTIDY = 0.2
-"""How far, in typical sizes, each effect may be from neutral, or from its found value, on any vehicle."""
+"""How far, in typical sizes, the numbers of an effect may be from neutral on any vehicle."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +52,21 @@ class Benefit:
 
 
 @dataclass(frozen=True)
+class Worth:
+    """Benefit of one cause given all others, and the deviance it takes away; `ordinary`: as on any vehicle."""
+
+    cause: Candidate
+    benefit: Benefit
+    deviance: float
+    ordinary: bool = False
+
+
+@dataclass(frozen=True)
 class Validation:
     """Error on unseen data: flights given for validation, else blocks left out; noise floor 1.
 
     Attributes:
-        nominal, extended: mean squared error without and with the findings, as `stated_errors` has it.
+        nominal, extended: mean squared error without and with the findings, as an identification states it.
         on: ``validation logs`` or ``held-out blocks``.
         deciding: the same two of the segments that decided the diagnosis.
         refitted: extended, with per-log values refitted on the first half of each log and scored on the second; only
@@ -67,120 +82,136 @@ class Validation:
     contradicted: bool = False
 
 
-def untidy_names(listed: Sequence[Candidate]) -> list[str]:
-    """Entries of the catalogue that may be a little off on any vehicle; changes at a moment are events, not clutter."""
-    return all_names([c for c in listed if c.timed is None and not c.refines and not EFFECTS[c.effect].needs])
+def untidy_sized(model: Model, cause: Candidate) -> bool:
+    """Whether no number of `cause` is further from neutral in `model` than it may be on any vehicle."""
+    return bool(np.all(np.abs(model.numbers(cause).from_neutral(model.theta)) <= UNTIDY))
 
 
-def without_in_clutter(shooting: Shooting, model: Model, cause: Candidate | None, listed: Sequence[Candidate]) -> Model:
-    """Refits `model` without `cause` (None: with all its causes) amid clutter.
-
-    Nominal parameters are free, effects that are left move within the sizes of clutter.
-
-    Args:
-        shooting: the problem.
-        model: the extended model.
-        cause: what to take out.
-        listed: the catalogue.
-    """
-    left = taken_out(shooting, model, cause)
-    gone = set(free_names(model.causes)) - set(free_names(left.causes))
-    free = _boxed(shooting, [n for n in clutter_names(model, listed) if n not in gone], left.theta)
-    result = polish(shooting, left.theta, free, states=model.states, iterations=5, tolerance=0.1, settled=True)
-    return as_model(shooting, result, free, left.causes)
+def ordinary(model: Model, cause: Candidate) -> bool:
+    """Whether any vehicle may have `cause` as large as it is in `model`; no event, wind or ground is ordinary."""
+    apart = cause.timed is not None or cause.refines or bool(EFFECTS[cause.effect].needs)
+    return not apart and untidy_sized(model, cause)
 
 
-def ordinary(shooting: Shooting, model: Model, cause: Candidate, listed: Sequence[Candidate]) -> bool:
-    """Whether `cause` is no larger in `model` than it may be on any vehicle."""
-    return untidy_sized(shooting.free(cause.names), model.theta) and set(cause.names) <= set(untidy_names(listed))
+_NONE, _ALL = "no cause", "all causes"
 
 
-def untidy_sized(effects: Free, theta: FloatArray) -> bool:
-    """Whether no number of `effects` is further from neutral at `theta` than it may be on any vehicle."""
-    return bool(np.all(np.abs(effects.from_neutral(theta)) <= UNTIDY))
-
-
-def clutter_names(model: Model, listed: Sequence[Candidate]) -> list[str]:
-    """Entries of the model and of the untidy rest."""
-    return list(dict.fromkeys([*model.free.names, *untidy_names(listed)]))
-
-
-def _boxed(shooting: Shooting, names: Sequence[str], theta: FloatArray) -> Free:
-    """Free parameters whose effects stay within untidy sizes of where `theta` has them."""
-    out = []
-    for entry in shooting.free(names).entries:
-        if entry.name not in NOMINAL_NAMES:
-            room, value = UNTIDY * entry.typical, float(theta[entry.index])
-            entry = replace(entry, lower=max(entry.lower, value - room), upper=min(entry.upper, value + room))
-        out.append(entry)
-    return Free(tuple(out))
-
-
-_NOMINAL, _FOUND, _AMID = "nominal", "found", "amid clutter"
-"""Keys of models beside those from which one cause was taken out: without causes, as found, with all amid clutter."""
-Errors = dict[str, tuple[FloatArray, float]]
-"""Deviance of each block of unseen data, and independent rows, by key of a model."""
-
-
-@dataclass(frozen=True)
-class Worth:
-    """Benefit of one cause given all others; `ordinary` ones are no larger than on any vehicle."""
-
-    cause: Candidate
-    benefit: Benefit
-    deviance: float
-    ordinary: bool = False
-
-
-def validate(
-    decisive: Shooting, nominal: Model, model: Model, logs: Sequence[Window], listed: Sequence[Candidate]
+def worths(
+    decisive: Shooting, nominal: Model, model: Model, without: Mapping[str, Model], logs: Sequence[Window]
 ) -> tuple[tuple[float, float], tuple[Worth, ...]]:
-    """Scores nominal and extended model on unseen data, and each cause by leaving it out (`without_in_clutter`).
+    """Errors on unseen data in the segments that decided, and what each cause takes off them.
 
     Args:
         decisive: the problem that decided.
         nominal: without causes.
         model: the selected one.
+        without: the same without each of its causes, by label.
         logs: validation flights; none: blocks of the training data are left out.
-        listed: the catalogue.
 
     Returns:
-        The errors without and with all causes in the segments that decided, and the worth of each cause: what is larger
-        than on any vehicle first, then by gain.
+        The errors without and with all causes, and the worth of each: what is larger than on any vehicle first, then by
+        gain.
     """
-    models = {_NOMINAL: nominal, _FOUND: model}
-    if model.causes:
-        models[_AMID] = without_in_clutter(decisive, model, None, listed)
-        models |= {c.label: without_in_clutter(decisive, model, c, listed) for c in model.causes}
-    left_out: Errors = {key: (m.held_out, m.rows) for key, m in models.items()}
+    models = {_NONE: nominal, _ALL: model} | without
+    left_out = {key: (m.held_out, m.rows) for key, m in models.items()}
     unseen = left_out
     if logs:
         scorer = decisive.on(logs)
         unseen = {key: block_deviance(scorer, m) for key, m in models.items()}
-    before, after = (float(total.sum()) / rows for total, rows in (unseen[_NOMINAL], unseen[_FOUND]))
-    worth = []
+    out = []
     for cause in model.causes:
         # A value that belongs to the training flight is measured there, on blocks left out.
         errors = left_out if EFFECTS[cause.effect].per_log else unseen
-        worth.append(_worth(cause, errors, ordinary(decisive, model, cause, listed), decisive.seconds))
-    worth.sort(key=lambda w: (w.ordinary, -w.deviance))
-    return (before, after), tuple(worth)
-
-
-def _worth(cause: Candidate, errors: Errors, ordinary: bool, seconds: float) -> Worth:
-    """Worth from the deviance of each block without and with the cause, both amid clutter; runs of so many seconds."""
-    found, rows = errors[_FOUND]
-    gain, mse = paired_gain(errors[cause.label][0], errors[_AMID][0]), float(found.sum()) / rows
-    low, high = gain.interval
-    benefit = Benefit(mse + gain.total / rows, mse, (low / rows, high / rows), seconds)
-    return Worth(cause, benefit, gain.total, ordinary)
+        found, rows = errors[_ALL]
+        gain, mse = paired_gain(errors[cause.label][0], found), float(found.sum()) / rows
+        low, high = gain.interval
+        benefit = Benefit(mse + gain.total / rows, mse, (low / rows, high / rows), decisive.seconds)
+        out.append(Worth(cause, benefit, gain.total, ordinary(model, cause)))
+    out.sort(key=lambda w: (w.ordinary, -w.deviance))
+    before, after = (float(total.sum()) / rows for total, rows in (unseen[_NONE], unseen[_ALL]))
+    return (before, after), tuple(out)
 
 
 def block_deviance(scorer: Shooting, model: Model) -> tuple[FloatArray, float]:
     """Deviance of each block of unseen data with parameters as fitted, and the independent rows."""
-    names = [n for c in model.causes for n in c.names]
-    lin = settle_states(scorer, model.theta, names)
+    lin = settle_states(scorer, model.theta, [n for c in model.causes for n in c.names])
+    return sum_by_block(lin.cost + lin.occam, block_labels(lin)), lin.total_rows
+
+
+class Identified(NamedTuple):
+    """The nominal model and the noise that errors are stated with: vehicle, full vector, noise."""
+
+    vehicle: Vehicle
+    theta: FloatArray
+    noise: NoiseModel
+
+
+def stated_errors(
+    nominal: Identified, model: Model, windows: Sequence[Window], validation: Sequence[Window],
+    deciding: tuple[float, float],
+) -> Validation:  # fmt: skip
+    """Errors without and with the findings, as `mse_score` has them; without validation logs, of blocks left out.
+
+    Args:
+        nominal: identification of `windows`.
+        model: the extended one.
+        windows: what was diagnosed.
+        validation: flights that were not.
+        deciding: errors without and with the findings in the segments that decided.
+    """
+    both, halves = (nominal.theta, model.theta), None
+    if validation:
+        on = "validation logs"
+        before, after = (mse_score(validation, nominal.vehicle, theta, nominal.noise).mse for theta in both)
+        halves = _second_halves(nominal, model, validation)
+    else:
+        on, scorer = "held-out blocks", scored_problem(windows, nominal.vehicle, nominal.noise)
+        names = list(NOMINAL_NAMES), free_names(model.causes)
+        before, after = (left_out_error(scorer, theta, free) for theta, free in zip(both, names, strict=True))
+    # What happens at a moment of one flight happens at none of another.
+    comparable = bool(model.causes) and not (validation and any(c.timed is not None for c in model.causes))
+    without, refitted = halves or (before, after)
+    contradicted = comparable and refitted > MISFIT * without
+    return Validation(before, after, on, deciding, refitted if halves else None, contradicted)
+
+
+def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) -> float:
+    """Error of each block with what the block itself did to the parameters undone, to first order.
+
+    Args:
+        scorer: the data in segments of `SCORE_SECONDS`, with the noise that counts.
+        theta: fitted to these data, full vector.
+        names: what was fitted.
+    """
+    free = scorer.free(names)
+    lin = scorer.linearise(theta, free, settle_states(scorer, theta).states)
+    if not np.isfinite(lin.cost).all():
+        return float("inf")
     labels = block_labels(lin)
-    total = np.zeros(int(labels.max()) + 1)
-    np.add.at(total, labels, lin.cost + lin.occam)
-    return total, lin.total_rows
+    gram, grad = (sum_by_block(a, labels) for a in (lin.gram, lin.grad))
+    prior = default_prior(scorer, free)
+    step = posterior_covariance(lin.information, prior) @ lin.gradient + steps_without(gram, grad, prior.precision)
+    parts = []
+    for block, moved in enumerate(step):
+        kept = [np.flatnonzero(labels[lin.window == i] == block) for i in range(len(scorer.rollouts))]
+        parts.append(tallied(scorer.taking(kept), free.move(theta, moved)))
+    return reduce(add, parts).mse
+
+
+def _second_halves(nominal: Identified, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
+    """Errors of second halves of logs without and with the findings, what belongs to a flight refitted on the first.
+
+    None where nothing belongs to a flight, or no log is long enough.
+    """
+    scorer, per_log = scored_problem(logs, nominal.vehicle, nominal.noise), model.per_log_names
+    totals: list[tuple[Tally, Tally]] = []
+    for window in logs:
+        middle = len(window) // 2
+        if per_log and middle >= 4 * scorer.length:
+            first, second = (scorer.on([w]) for w in (window.slice(0, middle), window.slice(middle, len(window))))
+            refitted = polish(first, model.theta, first.free(per_log), iterations=6).theta
+            totals.append((tallied(second, nominal.theta), tallied(second, refitted)))
+    if not totals:
+        return None
+    without, found = (reduce(add, parts).mse for parts in zip(*totals, strict=True))
+    return without, found

@@ -30,17 +30,10 @@ FEWEST_BLOCKS = 10
 
 def block_labels(lin: Linearised) -> IndexArray:
     """Block number of each segment, shape (segments,): stretches of 10 s, shorter if there would be fewer than ten."""
-    step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
-    total = step * len(lin.time)
-    length = min(BLOCK_SECONDS, max(total / FEWEST_BLOCKS, 2.0 * step))
-    labels = np.empty(len(lin.time), dtype=np.intp)
-    next_label = 0
-    for w in np.unique(lin.window):
-        mine = lin.window == w
-        local = np.floor((lin.time[mine] - lin.time[mine][0] + 1e-9) / length).astype(np.intp)
-        labels[mine] = local + next_label
-        next_label = int(labels[mine].max()) + 1
-    return labels
+    length = min(BLOCK_SECONDS, max(lin.spacing * len(lin.time) / FEWEST_BLOCKS, 2.0 * lin.spacing))
+    _, first, window = np.unique(lin.window, return_index=True, return_inverse=True)
+    number = np.floor((lin.time - lin.time[first][window] + 1e-9) / length)
+    return np.unique(np.stack([window, number]), axis=1, return_inverse=True)[1].reshape(-1)
 
 
 class HeldOut(NamedTuple):
@@ -56,15 +49,14 @@ class HeldOut(NamedTuple):
 
 
 @INFINITE
-def held_out(lin: Linearised, prior_precision: FloatArray, labels: IndexArray) -> HeldOut:
+def held_out(lin: Linearised, prior_precision: FloatArray) -> HeldOut:
     """Deviance of each block in the density that the other blocks predict, and of those.
 
     Twice the negative logarithm of N(r; r(z), I + B V B'), with z and V mean and covariance of the parameters from the
     other blocks and B the derivative of the block's residuals r; less that of the noise alone, N(0; 0, I).
     """
+    labels = block_labels(lin)
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
-    if grad.shape[1] == 0:
-        return HeldOut(cost, cost.sum() - cost)
     z = steps_without(gram, grad, prior_precision)
     moved = np.einsum("bpq,bq->bp", gram, z)
     slope, rest = grad + moved, _rest(gram, prior_precision)

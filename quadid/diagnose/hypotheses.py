@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 from quadid.effects import EFFECTS, NEVER, Effect
@@ -96,11 +96,6 @@ def _refinements(spec: Effect) -> list[Candidate]:
         for names in together
         if names
     ]
-
-
-def all_names(listed: Sequence[Candidate]) -> list[str]:
-    """Entries of all candidates, each once."""
-    return list(dict.fromkeys(n for c in listed for n in c.names))
 
 
 def unset_times(theta: FloatArray, active: set[str]) -> FloatArray:

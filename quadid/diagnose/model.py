@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import block_labels, held_out
+from quadid.diagnose.cross_validation import held_out
 from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import EFFECTS, NEVER
 from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
@@ -37,7 +37,7 @@ class Model(Polished):
     prior: Prior
     held_out: FloatArray
     rest: FloatArray
-    tried: dict[str, float] = field(default_factory=dict)
+    tried: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def deviance(self) -> float:
@@ -70,6 +70,10 @@ class Model(Polished):
         sigma = self.uncertainty.sigma * self.free.jacobian(self.theta)
         return dict(zip(self.free.names, sigma.tolist(), strict=True))
 
+    def numbers(self, cause: Candidate) -> Free:
+        """The free parameters that belong to `cause`."""
+        return Free(tuple(e for e in self.free.entries if e.name in cause.names))
+
     def wald(self, cause: Candidate) -> float:
         """Robust chi-square of the parameters of `cause` against neutral."""
         z = self.free.from_neutral(self.theta)
@@ -100,41 +104,43 @@ def free_names(causes: tuple[Candidate, ...]) -> list[str]:
 
 def fit_model(
     shooting: Shooting, theta: FloatArray, causes: tuple[Candidate, ...], states: InitialStates | None = None,
-    iterations: int = 6, tolerance: float = 0.05,
+    iterations: int = 6, tolerance: float = 0.05, tried: Mapping[str, float] | None = None,
 ) -> Model:  # fmt: skip
     """Fits the model with `causes` from `theta` and `states`; `iterations` and `tolerance` as in `polish`."""
     free = shooting.free(free_names(causes))
-    settled = bool(states)
-    result = polish(shooting, theta, free, states=states, iterations=iterations, tolerance=tolerance, settled=settled)
-    return as_model(shooting, result, free, causes)
-
-
-def as_model(shooting: Shooting, result: Polished, free: Free, causes: tuple[Candidate, ...]) -> Model:
-    """Wraps the result of a polish with the default prior, with its held-out deviance."""
     prior = default_prior(shooting, free)
-    left_out = held_out(result.lin, prior.precision, block_labels(result.lin))
+    settled = bool(states)
+    found = polish(shooting, theta, free, prior, states, iterations, tolerance=tolerance, settled=settled)
+    left_out = held_out(found.lin, prior.precision)
     return Model(
-        result.theta, result.lin, result.cost, result.iterations, result.outcome, causes, free, prior, *left_out
+        found.theta, found.lin, found.cost, found.iterations, found.outcome, causes, free, prior, *left_out, tried or {}
     )
 
 
+def refit(
+    shooting: Shooting, model: Model, states: InitialStates | None, iterations: int = 6, tolerance: float = 0.05
+) -> Model:
+    """Fits what `model` has, from its parameters and `states`; those of other segments are none."""
+    return fit_model(shooting, model.theta, model.causes, states, iterations, tolerance, model.tried)
+
+
 @dataclass(frozen=True)
-class Sketch:
-    """Where one Gauss-Newton step from a start would lead.
+class Start:
+    """Where a refit with another cause begins.
 
     Attributes:
-        theta: full vector after the step.
-        drop: predicted fall of the deviance.
+        theta: full vector.
         states: initial states there.
+        drop: predicted fall of the deviance.
     """
 
     theta: FloatArray
-    drop: float
     states: InitialStates
+    drop: float = 0.0
 
 
-def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Sketch:
-    """What `model` with `candidate` would gain, by one linearisation at its start."""
+def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Start:
+    """Where one Gauss-Newton step from the start of `candidate` leads, and what it would gain."""
     free = shooting.free(free_names((*model.causes, candidate)))
     prior = default_prior(shooting, free)
     theta = model.theta.copy()
@@ -146,47 +152,41 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Sketch:
     here = lin.total_cost + float(lin.occam.sum()) + prior_terms(free, prior, theta)[2]
     deviance = here + float(2.0 * g @ z + z @ h @ z)
     moved = free.move(theta, z)
-    return Sketch(moved, model.deviance - deviance, lin.stepped(free.step(theta, moved)))
+    return Start(moved, lin.stepped(free.step(theta, moved)), model.deviance - deviance)
 
 
 def extend(
-    shooting: Shooting, model: Model, candidate: Candidate, start: FloatArray | Sketch | None = None,
-    iterations: int = 6, tried: float = 1.0,
+    shooting: Shooting, model: Model, candidate: Candidate, start: Start | None = None, iterations: int = 6,
+    tried: float = 1.0,
 ) -> Model:  # fmt: skip
-    """Refits `model` with `candidate` added, from `start` or where its sketch leads.
+    """Refits `model` with `candidate` added.
 
     Args:
         shooting: the problem.
         model: what to extend.
         candidate: the cause to add.
-        start: full vector to start from, or a sketch on the same segments; one without states begins at measured ones.
-        iterations: linearisations to spend; four times as many from measured states.
+        start: where to begin; by default where the sketch leads.
+        iterations: linearisations to spend.
         tried: how many alternatives were looked at.
     """
-    begun = sketch(shooting, model, candidate) if start is None else start
-    theta, states = (begun.theta, begun.states) if isinstance(begun, Sketch) else (begun, model.states)
+    start = start or sketch(shooting, model, candidate)
     new = candidate.split or (candidate,)
-    fitted = fit_model(
-        shooting, theta, (*model.causes, *new), states, iterations if states else 4 * iterations, tolerance=0.2
-    )
-    return replace(fitted, tried={**model.tried, **{c.label: tried for c in new}})
+    known = {**model.tried, **{c.label: tried for c in new}}
+    return fit_model(shooting, start.theta, (*model.causes, *new), start.states, iterations, 0.2, known)
 
 
-def taken_out_causes(causes: Sequence[Candidate], cause: Candidate) -> tuple[Candidate, ...]:
-    """`causes` without `cause` and what requires it."""
-    return tuple(c for c in causes if c.label != cause.label and not cause.carries(c))
+def taken_out_causes(causes: tuple[Candidate, ...], cause: Candidate | None) -> tuple[Candidate, ...]:
+    """`causes` without `cause`, if any, and what requires it."""
+    return tuple(c for c in causes if cause is None or (c.label != cause.label and not cause.carries(c)))
 
 
 def without(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """Refits `model` without `cause` and what requires it."""
-    left = taken_out(shooting, model, cause)
-    return replace(fit_model(shooting, left.theta, left.causes, model.states, tolerance=0.2), tried=model.tried)
+    return refit(shooting, taken_out(shooting, model, cause), model.states, tolerance=0.2)
 
 
-def taken_out(shooting: Shooting, model: Model, cause: Candidate | None) -> Model:
+def taken_out(shooting: Shooting, model: Model, cause: Candidate) -> Model:
     """`model` with `cause` and what requires it at neutral, nothing refitted: its deviance stays that of `model`."""
-    if cause is None:
-        return model
     left = taken_out_causes(model.causes, cause)
     theta = model.theta.copy()
     for c in model.causes:

@@ -2,44 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
-from quadid.diagnose.attribution import validate
+from quadid.diagnose.attribution import Identified, stated_errors, worths
 from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
 from quadid.diagnose.cross_validation import FEWEST_BLOCKS
-from quadid.diagnose.findings import describe, extended_vehicle
 from quadid.diagnose.hypotheses import Candidate, candidates
-from quadid.diagnose.model import Model, fit_model, free_names, without
+from quadid.diagnose.model import Model, free_names, refit, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
-from quadid.diagnose.result import Diagnosis, Verdict
+from quadid.diagnose.result import Diagnosis, Verdict, describe
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
-from quadid.diagnose.stated_errors import Identified, stated_errors
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
 from quadid.identify.answer import on_bounds, possible_moments, tied
 from quadid.identify.covariance import SPREAD_LIMIT, parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
-from quadid.identify.global_search import swarm_search
-from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, noise_floor, residual_noise
+from quadid.identify.global_search import Progress, swarm_search
+from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.reliability import reliability
 from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
+from quadid.identify.result import with_values
 from quadid.identify.shooting import Shooting
 from quadid.model.supply import with_reference_voltage
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, Parameter, Status
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-Progress = Callable[[str, float], None]
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (`segment_schedule.USUAL_SECONDS` says when the longest may), longest first;
@@ -56,22 +53,10 @@ LEAST_OF_EXPLAINED = 1e-3
 """… nor below this share of what is explained: a huge effect is never described to the last digit."""
 
 
-@dataclass(frozen=True)
-class Workings:
-    """Everything a report or a test may want to look into.
-
-    Attributes:
-        search: the selection; remainder: what it leaves.
-    """
-
-    search: Search
-    remainder: Remainder
-
-
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
     progress: Progress | None = None, swarm: bool = False, nominal: Identified | None = None,
-) -> tuple[Diagnosis, Workings]:  # fmt: skip
+) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
     Args:
@@ -92,53 +77,55 @@ def diagnose(
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    begun, search = _select(windows, begun, report)
-    schedule, held = begun.schedule, held_by_quick_motion(windows, begun.short, begun.nominal, search.model)
+    schedule, search = _select(windows, begun, report)
+    held = held_by_quick_motion(windows, schedule[-1], begun.nominal, search.model)
     if held is not None:
         schedule, search = refitted(held, schedule, search)
-    decisive = search.shooting
-    left = remainder(decisive, search.model, seed)
+    decisive, model = search.shooting, search.model
+    left = remainder(decisive, model, seed)
     report("validation", 0.0)
-    deciding, per_finding = validate(decisive, search.nominal, search.model, validation, begun.listed)
+    fewer = {c.label: without(decisive, model, c) for c in model.causes}
+    deciding, worth = worths(decisive, search.nominal, model, fewer, validation)
     nominal = nominal or Identified(vehicle, search.nominal.theta, decisive.noise)
-    outcome = stated_errors(nominal, search.model, windows, validation, deciding)
-    doubts = impossible_causes(search.model) | inconstant_causes(search.model, left)
-    unnamed = sum(max(w.deviance, 0.0) for w in per_finding if w.cause.label in doubts)
-    verdict = judge(search.nominal, search.model, left, unnamed)
+    outcome = stated_errors(nominal, model, windows, validation, deciding)
+    doubts = impossible_causes(model) | inconstant_causes(model, left)
+    unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
+    verdict = judge(search.nominal, model, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
-    if search.model.causes and (outcome.contradicted or saturated or len(doubts) == len(search.model.causes)):
+    if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Verdict.UNKNOWN
-    alike = {c.family for c in search.model.causes if c.label in doubts}
-    parameters, reasons = _nominal_parameters(decisive, schedule[-1], search.model, verdict, doubts, held)
+    doubted = {label: m for label, m in fewer.items() if label in doubts}
+    parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
     parameters, moved = possible_moments(parameters)
-    weak = late_unknown(search.model, parameters) | slight_changes(search.model)
-    believed = [] if verdict is Verdict.UNKNOWN else [c for c in search.model.causes if c.family not in alike]
-    findings = describe(decisive, search, per_finding, [c for c in believed if c.label not in weak])
+    weak = late_unknown(model, parameters) | slight_changes(model)
+    alike = {c.family for c in model.causes if c.label in doubts}
+    believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
+    findings = describe(decisive, search, worth, [] if verdict is Verdict.UNKNOWN else believed)
     warnings = [
         *(f.text for f in faults),
         *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
         *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
         *reasons, *([] if moved is None else [moved]),
     ]  # fmt: skip
-    text = extended_vehicle(vehicle, decisive.layout, search.model, parameters)
+    physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     prediction = None
-    if search.model.reduced_chi_square > POOR:
+    if model.reduced_chi_square > POOR:
         report("prediction", 0.0)
-        prediction = _prediction(windows, text, validation, warnings)
+        prediction = _prediction(windows, physical, validation, warnings)
     result = Diagnosis(
-        verdict, findings, outcome, left, parameters, text,
+        verdict, findings, outcome, left, parameters, physical.to_yaml(),
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)
-    return result, Workings(search, left)
+    return result, search
 
 
 def _prediction(
-    windows: Sequence[Window], physical: str, validation: Sequence[Window], warnings: list[str]
+    windows: Sequence[Window], physical: Vehicle, validation: Sequence[Window], warnings: list[str]
 ) -> Prediction | None:
     """Residual terms beside unchanged physics, where they predict better; says so in `warnings`."""
     try:
-        out = learn_prediction(windows, Vehicle.from_yaml(physical), validation)
+        out = learn_prediction(windows, physical, validation)
     except NotIdentifiableError as error:
         warnings.append(f"no residual terms could be learnt: {error}")
         return None
@@ -147,21 +134,21 @@ def _prediction(
 
 
 def _nominal_parameters(
-    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubts: Collection[str] = (),
+    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubted: Mapping[str, Model] | None = None,
     held: Held | None = None,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
-    Estimates must agree as those of an identification, and with those without each cause in `doubts` (labels): it
-    stands for something else, which may do to them what it does.  Where the cause of the error is unknown, so is what
-    it does to them: none is identified; nor an inertia beside a doubtful moment.  What is `held` is not concerned.
+    Estimates must agree as those of an identification, and with those of the models without each cause that is
+    `doubted` (by label): it stands for something else, which may do to them what it does.  Where the cause of the error
+    is unknown, so is what it does to them: none is to be used; nor an inertia beside a doubtful moment.  What is `held`
+    is not concerned.
     """
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     trust = reliability(decisive, model, model.free, model.prior, brief)
     uncertain, reasons = trust.widened(model.uncertainty), trust.reasons(model.free, model.uncertainty)
     initial = decisive.layout.initial(decisive.vehicle)
-    steps = {label: model.free.step(model.theta, without(decisive, model, c).theta)
-             for c in model.causes if (label := c.label) in doubts}  # fmt: skip
+    steps = {label: model.free.step(model.theta, less.theta) for label, less in (doubted or {}).items()}
     uncertain = uncertain.differing(list(steps.values()))
     for label, step in steps.items():
         moved = [n for n, s in zip(model.free.names, step, strict=True) if n in NOMINAL_NAMES and abs(s) > SPREAD_LIMIT]
@@ -174,14 +161,14 @@ def _nominal_parameters(
     reasons = (*on_bounds(nominal), *reasons)
     for cause in model.causes:
         nominal = tied(nominal, EFFECTS[cause.effect].ties)
-    told = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
-    if turning := [c.label for c in model.causes if c.label in doubts and EFFECTS[c.effect].turns]:
-        told |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
-    for names, why in told.items():
+    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
+    if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
+        spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
+    for names, why in spoilt.items():
         open_to_it = set(names) - set(held.parameters if held else ())
-        if doubted := [p.name for p in nominal if p.status is Status.IDENTIFIED and p.name in open_to_it]:
-            nominal = tuple(replace(p, status=Status.UNRELIABLE) if p.name in doubted else p for p in nominal)
-            reasons = (*reasons, f"{', '.join(doubted)}: not to be used while {why}")
+        if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
+            nominal = unreliable(nominal, lost)
+            reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")
     return nominal, reasons
 
 
@@ -199,11 +186,6 @@ class _Begun:
     nominal: FloatArray
     flexible: FloatArray
     listed: list[Candidate]
-
-    @property
-    def short(self) -> Shooting:
-        """Short segments."""
-        return self.schedule[-1]
 
 
 def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
@@ -238,46 +220,43 @@ def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
     return ["readings" if readings else "commands", *(["battery"] if known else [])]
 
 
-def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[_Begun, Search]:
-    """Selects causes, and again when they show the noise to be less."""
-    search = select(begun.schedule, begun.nominal, begun.listed, report)
+def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[list[Shooting], Search]:
+    """Selects causes, and again when they show the noise to be less; with the schedule under the noise that is left."""
+    schedule, search = begun.schedule, select(begun.schedule, begun.nominal, begun.listed, report)
     if search.model.reduced_chi_square > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
-        general = from_everything(begun.short, begun.flexible, begun.listed)
-        other = select(begun.schedule, begun.nominal, begun.listed, report, general)
+        general = from_everything(schedule[-1], begun.flexible, begun.listed)
+        other = select(schedule, begun.nominal, begun.listed, report, general)
         search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
     while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance
-        noise = _noise_around(windows, begun.short, search.model)
+        noise = _noise_around(windows, schedule[-1], search.model)
         growth = noise.variance / before
         if np.mean(np.log(growth)) > 0.0:
             break  # around the causes there is no less noise than before
-        begun, search = _with_noise(noise, begun, search)
+        schedule, search = _with_noise(noise, schedule, search)
         if np.all(growth > NOISE_FELL):
             break
-        again = select(begun.schedule, begun.nominal, begun.listed, report, search.model)
+        again = select(schedule, begun.nominal, begun.listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    noise, _ = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
-    begun, search = _with_noise(noise, begun, search)
+    noise = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
+    schedule, search = _with_noise(noise, schedule, search)
     # Under other noise a cause may be nothing any more.
-    return begun, replace(search, model=pruned(search.shooting, search.model))
+    return schedule, replace(search, model=pruned(search.shooting, search.model))
 
 
 def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:
     """Re-estimates the noise around the selected model, where the flexible fit is nearly linear."""
     wide = short.free(free_names(model.causes))
-    return noise_floor(windows, short, model.theta, wide, iterations=2)[0]
+    return flexible_fit(windows, short, [model.theta], wide, iterations=2).noise
 
 
-def _with_noise(noise: NoiseModel, begun: _Begun, search: Search) -> tuple[_Begun, Search]:
+def _with_noise(noise: NoiseModel, schedule: Sequence[Shooting], search: Search) -> tuple[list[Shooting], Search]:
     """Problems under another noise model, nominal and selected model refitted there."""
-    begun = replace(begun, schedule=[s.with_noise(noise) for s in begun.schedule])
     decisive = search.shooting.with_noise(noise)
-    model = fit_model(decisive, search.model.theta, search.model.causes, search.model.states)
-    nominal = fit_model(decisive, search.nominal.theta, (), search.nominal.states)
-    model = replace(model, tried=search.model.tried)
-    return begun, replace(search, shooting=decisive, model=model, nominal=nominal)
+    model, nominal = (refit(decisive, m, m.states) for m in (search.model, search.nominal))
+    return [s.with_noise(noise) for s in schedule], replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
 def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Verdict:

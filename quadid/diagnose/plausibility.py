@@ -14,7 +14,6 @@ from quadid.diagnose.attribution import UNTIDY, untidy_sized
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
-from quadid.identify.parameterization import Free
 from quadid.model.layout import Entry
 from quadid.parameters import Parameter, Status, at_bound
 
@@ -48,24 +47,14 @@ def slight_changes(model: Model) -> dict[str, str]:
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
     thrust differs by as much on any vehicle, and a step at the border takes that up.
     """
-    told = {}
-    for cause in (c for c in model.causes if c.timed is not None):
-        own = Free(tuple(e for e in model.free.entries if e.name in cause.names))
-        if untidy_sized(own, model.theta):
-            most = max(own.entries, key=lambda e: abs(float(model.theta[e.index])))
-            told[cause.label] = (
-                f"{most.name} = {float(model.theta[most.index]):.3g} is no larger than parts of a flight differ by on "
-                f"any vehicle ({UNTIDY * most.typical:.3g})"
-            )
-    return told
+    reason = f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what such a change typically is"
+    return {c.label: reason for c in model.causes if c.timed is not None and untidy_sized(model, c)}
 
 
 def impossible(model: Model, cause: Candidate) -> str:
     """Which number of `cause` no vehicle has; empty when all are possible."""
     sigma = dict(zip(model.free.names, model.uncertainty.sigma, strict=True))
-    for e in model.free.entries:
-        if e.name not in cause.names:
-            continue
+    for e in model.numbers(cause).entries:
         value = float(model.theta[e.index])
         size, shown = (value - e.neutral) / e.typical, f"{e.name} = {value:.3g} {e.unit}".rstrip()
         if EFFECTS[cause.effect].sized and abs(size) > LIKELY_SENSOR:

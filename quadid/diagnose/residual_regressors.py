@@ -13,16 +13,18 @@ forces, which follow the command at once.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.diagnose.cross_validation import Gain, block_labels, held_out, paired_gain
+from quadid.diagnose.cross_validation import Gain, held_out, paired_gain
 from quadid.diagnose.model import Model
-from quadid.identify.schur_complement import eliminated
+from quadid.identify.schur_complement import freed
 from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
-from quadid.types import FloatArray, IndexArray
+from quadid.turning import product
+from quadid.types import FloatArray
 
 ERRORS = 2.5
 """Standard errors of a gain on unseen blocks above which a site counts as structured."""
@@ -55,26 +57,22 @@ class Follows:
     Attributes:
         site: where.
         gain: deviance that all signals together take away on unseen blocks.
-        signal: the one that does most alone.
+        alone: what every signal alone takes away, chi-square with one degree of freedom.
     """
 
     site: Site
     gain: Gain
-    signal: str
+    alone: Mapping[str, float]
+
+    @property
+    def signal(self) -> str:
+        """The one that does most alone."""
+        return max(self.alone, key=lambda name: self.alone[name])
 
     @property
     def significant(self) -> bool:
         """Whether the gain stands above its own error."""
         return self.gain.total > ERRORS * self.gain.error
-
-
-@dataclass(frozen=True)
-class Alone:
-    """What one signal alone explains at one site: names of both, chi-square with one degree of freedom."""
-
-    site: str
-    signal: str
-    chi_square: float
 
 
 SITES = tuple(
@@ -89,12 +87,16 @@ SITES = tuple(
 )
 
 
-def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tuple[Alone, ...]]:
-    """Holds what `model` leaves against all signals at all sites.
+def strongest(found: Sequence[Follows]) -> tuple[Follows, ...]:
+    """The best site of each group, best first."""
+    best: dict[str, Follows] = {}
+    for f in sorted(found, key=lambda f: -f.gain.total):
+        best.setdefault(f.site.group, f)
+    return tuple(best.values())
 
-    Returns:
-        All signals together, at the best site of each group, strongest first; and every signal alone at every site.
-    """
+
+def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
+    """Holds what `model` leaves against all signals at every site."""
     parts = list(shooting.columns(model.theta, model.free, model.states))
     named = [signals(part) for part in parts]
     names = tuple(named[0])
@@ -102,16 +104,8 @@ def follows(shooting: Shooting, model: Model) -> tuple[tuple[Follows, ...], tupl
     stacked = [np.stack(list(s.values()), axis=-1) for s in named]
     scale = np.sqrt(np.mean(np.concatenate([np.mean(s**2, axis=(1,)) for s in stacked]), axis=0))
     stacked = [s / np.where(scale > 0.0, scale, 1.0) for s in stacked]
-    labels = block_labels(model.lin)
-    prepared = [_prepare(p, s) for p, s in zip(parts, stacked, strict=True)]
-    best: dict[str, Follows] = {}
-    alone: list[Alone] = []
-    for site in SITES:
-        found, each = _judge(site, names, prepared, model, labels)
-        alone += each
-        if site.group not in best or found.gain.total > best[site.group].gain.total:
-            best[site.group] = found
-    return tuple(sorted(best.values(), key=lambda f: -f.gain.total)), tuple(alone)
+    prepared = [_prepared(p, s) for p, s in zip(parts, stacked, strict=True)]
+    return tuple(_judge(site, names, prepared, model) for site in SITES)
 
 
 @dataclass(frozen=True)
@@ -121,71 +115,58 @@ class _Prepared:
     Attributes:
         part: its segments.
         integrated: signals (segments, length, n), as they are, integrated once and twice.
-        inside: components of parameters and residual along the initial state's directions.
-        gram, grad: products of the parameters, initial states eliminated.
+        beside: parameters and, last, the residual, less what initial states take up, shape (segments, length, channels,
+            P + 1).
+        own: products of the parameters with these, (segments, P, P + 1).
     """
 
     part: Columns
     integrated: tuple[FloatArray, FloatArray, FloatArray]
-    inside: tuple[FloatArray, FloatArray]
-    gram: FloatArray
-    grad: FloatArray
+    beside: FloatArray
+    own: FloatArray
 
 
-def _prepare(part: Columns, signal: FloatArray) -> _Prepared:
+def _prepared(part: Columns, signal: FloatArray) -> _Prepared:
     once = part.window.dt * np.cumsum(signal, axis=1)
-    b, r = part.parameters, part.residual.reshape(len(signal), -1, 1)
-    ab, ar = _t(part.basis) @ b, _t(part.basis) @ r
+    rows = np.concatenate([part.parameters, part.residual.reshape(len(signal), -1, 1)], axis=2)
+    rows = rows - part.basis @ (_t(part.basis) @ rows)
     integrated = (signal, once, part.window.dt * np.cumsum(once, axis=1))
-    return _Prepared(part, integrated, (ab, ar), _t(b) @ b - _t(ab) @ ab, _t(b) @ r - _t(ab) @ ar)
+    return _Prepared(part, integrated, rows.reshape(*part.residual.shape, -1), _t(rows[..., :-1]) @ rows)
 
 
-def _judge(
-    site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model, labels: IndexArray
-) -> tuple[Follows, list[Alone]]:
+def _judge(site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model) -> Follows:
     pieces = [_products(site, p) for p in prepared]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
     own = model.lin.gram.shape[1]
-    precision = np.concatenate([model.prior.precision, _RIDGE * np.einsum("spp->p", gram)[own:] + 1e-9])
+    total, slope = gram.sum(axis=0), grad.sum(axis=0)
+    sizes = np.diag(total)[own:]
+    precision = np.concatenate([model.prior.precision, _RIDGE * sizes + 1e-9])
     both = replace(model.lin, gram=gram, grad=grad)
     none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
-    gain = paired_gain(held_out(none, precision[:own], labels).block, held_out(both, precision, labels).block)
-    each = _chi_squares(gram.sum(axis=0), grad.sum(axis=0), precision, own)
-    alone = [Alone(site.name, n, float(c)) for n, c in zip(names, each, strict=True)]
-    return Follows(site, gain, names[int(np.argmax(each))]), alone
+    gain = paired_gain(held_out(none, precision[:own]).block, held_out(both, precision).block)
+    each = freed(
+        (sizes + precision[own:])[:, None, None], total[own:, None, :own],
+        total[:own, :own] + np.diag(precision[:own]), slope[own:, None], slope[:own],
+    )  # fmt: skip
+    return Follows(site, gain, dict(zip(names, each.tolist(), strict=True)))
 
 
 def _products(site: Site, p: _Prepared) -> tuple[FloatArray, FloatArray]:
     """Products of parameters and probes of each segment, initial states eliminated: gram and gradient."""
-    part, (ab, ar) = p.part, p.inside
     count, length, n = p.integrated[0].shape
-    channels = part.residual.shape[2]
     moved = [c for c, _ in site.channels]
-    each = [part.whiten(p.integrated[order], channel) for channel, order in site.channels]
+    each = [p.part.whiten(p.integrated[order], channel) for channel, order in site.channels]
     x = np.stack(each, axis=2).reshape(count, -1, n)
-    basis = part.basis.reshape(count, length, channels, -1)[:, :, moved].reshape(count, x.shape[1], -1)
-    rows = part.parameters.reshape(count, length, channels, -1)[:, :, moved].reshape(count, x.shape[1], -1)
-    r = part.residual[:, :, moved].reshape(count, -1, 1)
-    ax = _t(basis) @ x
-    own = p.gram.shape[1]
-    gram = np.empty((count, own + n, own + n))
-    gram[:, :own, :own] = p.gram
-    gram[:, own:, own:] = _t(x) @ x - _t(ax) @ ax
-    gram[:, own:, :own] = _t(x) @ rows - _t(ax) @ ab
-    gram[:, :own, own:] = _t(gram[:, own:, :own])
-    return gram, np.concatenate([p.grad, _t(x) @ r - _t(ax) @ ar], axis=1)[..., 0]
+    basis = p.part.basis.reshape(*p.beside.shape[:3], -1)[:, :, moved].reshape(count, x.shape[1], -1)
+    inside = _t(basis) @ x
+    cross = _t(x) @ p.beside[:, :, moved].reshape(count, x.shape[1], -1)
+    probes = _t(x) @ x - _t(inside) @ inside
+    gram = np.block([[p.own[..., :-1], _t(cross[..., :-1])], [cross[..., :-1], probes]])
+    return gram, np.concatenate([p.own[..., -1], cross[..., -1]], axis=1)
 
 
 def _t(a: FloatArray) -> FloatArray:
     return a.transpose(0, 2, 1)
-
-
-def _chi_squares(gram: FloatArray, grad: FloatArray, precision: FloatArray, own: int) -> FloatArray:
-    """How much each probe alone lowers the deviance, the model's own parameters refitted."""
-    alone = np.diag(gram)[own:]
-    h, gain = eliminated(alone[:, None, None], gram[own:, None, :own], gram[:own, :own] + np.diag(precision[:own]))
-    g, left = grad[own:] - gain[:, 0] @ grad[:own], h[:, 0, 0]
-    return np.asarray(np.where(left > 1e-6 * alone, g * g / np.maximum(left, 1e-12), 0.0))
 
 
 def signals(part: Columns) -> dict[str, FloatArray]:
@@ -256,8 +237,6 @@ def _predicted(part: Columns, measured: FloatArray | None, axis: int, channel: i
 
 def _predicted_attitude(part: Columns, measured: FloatArray) -> FloatArray:
     """Predicted quaternion, shape (4, segments, length): the measured one turned by its residual, a body rotation."""
-    w, x, y, z = np.moveaxis(np.nan_to_num(measured[part.rows]), -1, 0)
-    a, b, c = 0.5 * np.moveaxis(part.base[:, :, 3:6], -1, 0)
-    return np.stack(
-        [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a]
-    )
+    error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
+    turned = product(np.nan_to_num(measured[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error]))
+    return turned.T.reshape(4, *part.rows.shape)

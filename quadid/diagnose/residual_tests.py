@@ -16,7 +16,7 @@ import numpy as np
 
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
-from quadid.diagnose.residual_regressors import SITES, Alone, Follows, follows
+from quadid.diagnose.residual_regressors import Follows, follows, strongest
 from quadid.effects import EFFECTS
 from quadid.identify.noise_estimation import SPECTRUM_SECONDS
 from quadid.identify.noise_spectrum import SMOOTH, mode_power
@@ -57,26 +57,28 @@ class Remainder:
 
     Attributes:
         channels: power above the noise, one entry a channel.
-        follows: what can be predicted on unseen blocks, strongest first.
+        sites: what the residual follows at each site.
         rows: independent residuals.
-        alone: what every signal alone explains at every site.
     """
 
     channels: tuple[Structure, ...]
-    follows: tuple[Follows, ...]
+    sites: tuple[Follows, ...]
     rows: float
-    alone: tuple[Alone, ...] = ()
 
     @property
     def deviance(self) -> float:
         """Deviance of the significant structure, by the look that sees more of it; the two overlap."""
-        power = sum(s.deviance for s in self.channels if s.errors > ALARM)
-        return max(power, sum(f.gain.total for f in self.followed))
+        return max(sum(s.deviance for s in self.significant), sum(f.gain.total for f in self.followed))
 
     @property
     def followed(self) -> tuple[Follows, ...]:
         """Generic causes that predict unseen residuals beyond chance, strongest first."""
-        return tuple(f for f in self.follows if f.significant)
+        return tuple(f for f in strongest(self.sites) if f.significant)
+
+    @property
+    def significant(self) -> tuple[Structure, ...]:
+        """Channels with structure, strongest first."""
+        return tuple(sorted((s for s in self.channels if s.errors > ALARM), key=lambda s: -s.deviance))
 
     @property
     def shares(self) -> dict[str, float]:
@@ -88,11 +90,6 @@ class Remainder:
             out[name] = max(out.get(name, 0.0), min(f.gain.total / rows, 1.0))
         return out
 
-    @property
-    def significant(self) -> tuple[Structure, ...]:
-        """Channels with structure, strongest first."""
-        return tuple(sorted((s for s in self.channels if s.errors > ALARM), key=lambda s: -s.deviance))
-
 
 def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
     """Judges what `model` leaves; attitude channels are left out, their slow noise being modelled, not known."""
@@ -103,8 +100,7 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
         if 3 <= c < 6 or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
         out.append(_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
-    followed, alone = follows(shooting, model)
-    return Remainder(tuple(out), followed, model.rows, alone)
+    return Remainder(tuple(out), follows(shooting, model), model.rows)
 
 
 def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
@@ -149,13 +145,15 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
     kind = EFFECTS[cause.effect].constant_on
     if not kind:
         return ""
-    group = {s.name: s.group for s in SITES}
-    most: dict[tuple[str, str], Alone] = {}
-    for a in sorted(left.alone, key=lambda a: a.chi_square):
-        most[group[a.site], a.signal] = a  # at the best of the sites that look alike from afar
     least = max(ALARM**2, CHANGE_SHARE * model.wald(cause))
-    here = [a for a in most.values() if a.site.startswith(kind) and a.signal.startswith(CHANGES)]
-    worst = max(here, key=lambda a: a.chi_square, default=None)
-    if worst is None or worst.chi_square <= least:
-        return ""
-    return f"{cause.effect} is not constant (what remains at {worst.site} follows {worst.signal})"
+    told = [
+        (chi_square, f.site.name, signal)
+        for f in left.sites
+        if f.site.name.startswith(kind)
+        for signal, chi_square in f.alone.items()
+        # Of sites that look alike from afar the best counts.
+        if signal.startswith(CHANGES)
+        and chi_square >= max(g.alone[signal] for g in left.sites if g.site.group == f.site.group)
+    ]
+    chi_square, site, signal = max(told, default=(0.0, "", ""))
+    return f"{cause.effect} is not constant (what remains at {site} follows {signal})" if chi_square > least else ""

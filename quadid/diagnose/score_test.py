@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.diagnose.hypotheses import Candidate, all_names, unset_times
-from quadid.diagnose.model import Model, taken_out_causes
+from quadid.diagnose.hypotheses import Candidate, unset_times
+from quadid.diagnose.model import Model, free_names, taken_out_causes
 from quadid.identify.priors import prior_terms
-from quadid.identify.schur_complement import eliminated
+from quadid.identify.schur_complement import eliminated, freed
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.types import FloatArray, IndexArray
 
@@ -57,50 +57,47 @@ class _Own(NamedTuple):
         return float(self.g @ np.linalg.solve(self.h, self.g))
 
 
-def _open(model: Model, listed: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates but for refinements of what is not in the model."""
-    there = {c.label for c in model.causes}
-    return [c for c in listed if not c.refines or c.requires in there]
-
-
 @dataclass(frozen=True)
 class Everything:
     """The current model linearised with every candidate's entries free.
 
     Attributes:
-        model: the current model; lin: its linearisation; place: column of each entry.
+        model: the current model; listed: the candidates; lin: the linearisation; place: column of each entry.
     """
 
     model: Model
+    listed: Sequence[Candidate]
     lin: Linearised
     place: dict[str, int]
 
     @classmethod
     def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Everything:
-        """Linearises `model` with all of `listed` free."""
-        names = list(dict.fromkeys([*model.free.names, *all_names(_open(model, listed))]))
+        """Linearises `model` with all of `listed` free, but for refinements of what it has not."""
+        there = {c.label for c in model.causes}
+        some = [c for c in listed if not c.refines or c.requires in there]
+        names = list(dict.fromkeys([*model.free.names, *(n for c in some for n in c.names)]))
         theta = unset_times(model.theta, model.effects)
         lin = shooting.linearise(theta, shooting.free(names), model.states)
-        return cls(model, lin, {n: i for i, n in enumerate(names)})
+        return cls(model, listed, lin, {n: i for i, n in enumerate(names)})
 
     def loss(self, gone: Candidate) -> float:
         """Predicted rise of the deviance when `gone`, and what requires it, is dropped."""
         _, own, risen = self._left(gone)
         return risen - own.fall + self._unspent()
 
-    def scores(self, listed: Sequence[Candidate], gone: Candidate | None = None) -> list[Score]:
-        """What each of `listed` that is not in the model would do, in the place of `gone` if given; best first."""
+    def scores(self, gone: Candidate | None = None) -> list[Score]:
+        """What each candidate that is not in the model would do, in the place of `gone` if given; best first."""
         lin, own, risen = self._left(gone)
         risen += self._unspent()
         present = set(self.model.free.names)
         there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
         out = []
-        for candidate in _open(self.model, listed):
+        for candidate in self.listed:
             if present.intersection(candidate.names) or (candidate.requires and candidate.requires not in there):
                 continue
             mine = np.array([self.place[n] for n in candidate.names])
             found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)
-            out.append(replace(found, drop=found.drop - risen, trials=found.trials * len(listed), gone=gone))
+            out.append(replace(found, drop=found.drop - risen, trials=found.trials * len(self.listed), gone=gone))
         return sorted(out, key=lambda s: -s.drop)
 
     def _unspent(self) -> float:
@@ -110,26 +107,17 @@ class Everything:
     def _left(self, gone: Candidate | None) -> tuple[Linearised, _Own, float]:
         """The quadratic, the model's parameters and the rise of the deviance where `gone` is neutral."""
         model = self.model
-        leaving = [] if gone is None else [c for c in model.causes if c not in taken_out_causes(model.causes, gone)]
-        lost = [n for n in model.free.names if any(n in c.names for c in leaving)]
-        kept = [i for i, n in enumerate(model.free.names) if n not in lost]
-        place = np.array([self.place[model.free.names[i]] for i in kept])
-        precision, pull, _ = prior_terms(model.free, model.prior, model.theta)
-        lin, risen = self._moved(lost)
-        h = lin.information[np.ix_(place, place)] + np.diag(precision[kept])
-        return lin, _Own(h, lin.gradient[place] + pull[kept], place), risen
-
-    def _moved(self, lost: Sequence[str]) -> tuple[Linearised, float]:
-        """The quadratic around the point where entries `lost` are neutral, and by how much it is higher there."""
-        if not lost:
-            return self.lin, 0.0
+        stays = np.isin(model.free.names, free_names(taken_out_causes(model.causes, gone)))
+        place = np.array([self.place[n] for n in model.free.names])
         z = np.zeros(len(self.place))
-        away = dict(zip(self.model.free.names, self.model.free.from_neutral(self.model.theta), strict=True))
-        for n in lost:
-            z[self.place[n]] = -away[n]
+        z[place[~stays]] = -model.free.from_neutral(model.theta)[~stays]
         moved = self.lin.gram @ z
-        risen = float(np.sum(2.0 * self.lin.grad @ z + moved @ z))
-        return replace(self.lin, grad=self.lin.grad + moved), risen
+        lin = replace(self.lin, grad=self.lin.grad + moved)
+        precision, pull, _ = prior_terms(model.free, model.prior, model.theta)
+        place = place[stays]
+        h = lin.information[np.ix_(place, place)] + np.diag(precision[stays])
+        own = _Own(h, lin.gradient[place] + pull[stays], place)
+        return lin, own, float(np.sum(2.0 * self.lin.grad @ z + moved @ z))
 
 
 def missed(model: Model, least: float) -> tuple[Candidate, ...]:
@@ -168,11 +156,9 @@ def _fall(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> Flo
         g_m: gradient of the parameters (n, m).
         own: the model's parameters.
     """
-    h, gain = eliminated(h_mm, h_mo, own.h)
-    g, m = g_m - gain @ own.g, range(h_mm.shape[-1])
     # Directions the model's own parameters already explain carry no information; keep them finite.
-    h[:, m, m] += 1e-9 * h_mm[:, m, m] + 1e-2
-    return np.asarray(own.fall + np.sum(g * np.linalg.solve(h, g[..., None])[..., 0], axis=1))
+    kept = np.eye(h_mm.shape[-1]) * (1e-9 * h_mm + 1e-2)
+    return own.fall + freed(h_mm + kept, h_mo, own.h, g_m, own.g)
 
 
 def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:

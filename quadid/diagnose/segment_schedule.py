@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from quadid.diagnose.model import Model, fit_model
+from quadid.diagnose.model import Model, fit_model, refit
 from quadid.identify.shooting import Shooting
 from quadid.types import FloatArray
 
@@ -40,44 +40,37 @@ class Stage:
     @classmethod
     def begin(cls, schedule: Sequence[Shooting], theta: FloatArray, known: Model | None = None) -> Stage:
         """The longest segments that the nominal model at `theta`, or the `known` one, follows; else the shortest."""
-        like = known or fit_model(schedule[-1], theta, ())
-        shortest = cls(schedule, len(schedule) - 1, like)
-        if known is not None:
-            shortest = replace(shortest, model=shortest.refitted(shortest.rung))
-        return shortest.continued()
+        shortest = len(schedule) - 1
+        if known is None:
+            return cls(schedule, shortest, fit_model(schedule[shortest], theta, ())).continued()
+        return cls(schedule, shortest, known).at(shortest).continued()
 
     @property
     def shooting(self) -> Shooting:
         """The problem in use."""
         return self.schedule[self.rung]
 
-    def refitted(self, rung: int) -> Model:
-        """The model on another rung."""
-        fitted = fit_model(self.schedule[rung], self.model.theta, self.model.causes, iterations=10)
-        return replace(fitted, tried=self.model.tried)
+    @property
+    def follows(self) -> bool:
+        """Whether segments are not too long for the model to decide on them."""
+        return self.model.reduced_chi_square < (CLEAN_MISFIT if is_long(self.shooting) else LINEAR_MISFIT)
+
+    def at(self, rung: int) -> Stage:
+        """On another rung, the model refitted there."""
+        return replace(self, rung=rung, model=refit(self.schedule[rung], self.model, None, iterations=10))
 
     def continued(self) -> Stage:
         """On the longest segments that may decide about the model and that it follows, never shorter without need."""
-        longest = 0 if self.model.finds_velocity else self.usual
+        usual = next(rung for rung, shooting in enumerate(self.schedule) if not is_long(shooting))
+        longest = 0 if self.model.finds_velocity else usual
         for rung in range(longest, self.rung):
-            model = self.refitted(rung)
-            if tracks(self.schedule[rung], model):
-                return replace(self, rung=rung, model=model)
-        return self if self.rung >= longest else replace(self, rung=longest, model=self.refitted(longest))
+            if (longer := self.at(rung)).follows:
+                return longer
+        return self if self.rung >= longest else self.at(longest)
 
     def longest(self) -> Stage | None:
         """The longest segments of all, where the model leaves hardly more than noise in them."""
         if self.rung == 0 or not is_long(self.schedule[0]):
             return None
-        model = self.refitted(0)
-        return replace(self, rung=0, model=model) if tracks(self.schedule[0], model) else None
-
-    @property
-    def usual(self) -> int:
-        """Rung of the longest segments of no more than usual length."""
-        return next(rung for rung, shooting in enumerate(self.schedule) if not is_long(shooting))
-
-
-def tracks(shooting: Shooting, model: Model) -> bool:
-    """Whether segments are not too long for `model` to decide on them."""
-    return model.reduced_chi_square < (CLEAN_MISFIT if is_long(shooting) else LINEAR_MISFIT)
+        far = self.at(0)
+        return far if far.follows else None

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.log_evidence import better, worth_a_refit
-from quadid.diagnose.model import Model, Sketch, extend, fit_model, sketch, taken_out, without
+from quadid.diagnose.model import Model, Start, extend, fit_model, refit, sketch, taken_out, without
 from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.score_test import Everything, Score, missed
 from quadid.diagnose.segment_schedule import Stage
@@ -149,7 +151,7 @@ def _round(
     best = None
     for moves in (_adds_and_drops, _swaps):
         if best is None:
-            new = moves(shooting, everything, listed, least)
+            new = moves(shooting, everything, least)
             trials += [t for t in new if _key(shooting, t.model) not in seen]
             best = _best(model, trials)
     return Round(model, tuple(trials), best)
@@ -165,25 +167,22 @@ def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
     return best
 
 
-def _adds_and_drops(
-    shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float
-) -> Iterator[Trial]:
+def _adds_and_drops(shooting: Shooting, everything: Everything, least: float) -> Iterator[Trial]:
     model = everything.model
-    scores = [s for s in everything.scores(listed) if s.candidate.start or s.drop > least]
+    scores = [s for s in everything.scores() if s.candidate.start or s.drop > least]
     yield from _refits(shooting, model, scores, least, NEAR)
     for cause in _removable(model):
         if everything.loss(cause) < 4.0 * least:
             yield Trial(None, cause, without(shooting, model, cause))
 
 
-def _swaps(shooting: Shooting, everything: Everything, listed: Sequence[Candidate], least: float) -> Iterator[Trial]:
+def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator[Trial]:
     """Look-alikes in the place of each cause."""
     model = everything.model
     for cause in _removable(model):
         lost = everything.loss(cause)
-        rivals = [
-            s for s in everything.scores(listed, cause) if _rivals(s, cause, lost + s.drop > max(ALIKE * lost, least))
-        ]
+        wanted = max(ALIKE * lost, least)
+        rivals = [s for s in everything.scores(cause) if _rivals(s, cause, lost + s.drop > wanted)]
         yield from _refits(shooting, taken_out(shooting, model, cause), rivals, least, ALIKE, lost)
 
 
@@ -211,13 +210,15 @@ def _refits(
         lost: deviance that `model` lost when another cause left it, to be gained again.
     """
     gained = 0.0
-    drafts = sorted((_draft(shooting, model, s) for s in scores), key=lambda d: -d[0].drop)
+    drafts = sorted(((s, _start(shooting, model, s)) for s in scores), key=lambda draft: -draft[1].drop)
     for score, start in drafts[:MOST_REFITS]:
-        if lost + score.drop < max(least, near * gained):
+        if lost + start.drop < max(least, near * gained):
             break
-        trial = _tried(shooting, model, score, start)
-        gained = max(gained, lost + model.deviance - trial.model.deviance)
-        yield trial
+        extended = extend(shooting, model, score.candidate, start, tried=score.trials)
+        if score.time is not None:
+            extended = _refine_time(shooting, extended, score.candidate)
+        gained = max(gained, lost + model.deviance - extended.deviance)
+        yield Trial(score.candidate, score.gone, extended)
 
 
 def _removable(model: Model) -> list[Candidate]:
@@ -225,36 +226,31 @@ def _removable(model: Model) -> list[Candidate]:
     return [c for c in model.causes if not any(c.carries(x) and not x.refines for x in model.causes)]
 
 
-def _draft(shooting: Shooting, model: Model, score: Score) -> tuple[Score, FloatArray | Sketch]:
-    """What to expect of a refit and where it starts: causes that no slope at neutral shows, where a sketch leads."""
+def _start(shooting: Shooting, model: Model, score: Score) -> Start:
+    """Where a refit starts and what to expect: a cause that no slope at neutral shows, where its sketch leads.
+
+    One that begins at a moment starts where the scan found it.
+    """
     if score.candidate.start:
-        drawn = sketch(shooting, model, score.candidate)
-        return replace(score, drop=drawn.drop), drawn
-    return score, model.theta
-
-
-def _tried(shooting: Shooting, model: Model, score: Score, start: FloatArray | Sketch) -> Trial:
-    """Refits `model` with a cause; one that begins at a moment where the scan found it, then refined."""
-    if score.time is None:
-        return Trial(score.candidate, score.gone, extend(shooting, model, score.candidate, start, tried=score.trials))
+        return sketch(shooting, model, score.candidate)
     theta = model.theta.copy()
-    theta[score.candidate.timed] = score.time
-    extended = extend(shooting, model, score.candidate, theta, tried=score.trials)
-    return Trial(score.candidate, score.gone, _refine_time(shooting, extended, score.candidate))
+    if score.time is not None:
+        theta[score.candidate.timed] = score.time
+    return Start(theta, model.states, score.drop)
 
 
 def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Model:
     """Moves the onset in ever smaller steps around the best, other parameters fixed, then refits."""
-    assert candidate.timed is not None
     none = shooting.free([])
-    best_theta = model.theta
+
+    def cost(theta: FloatArray) -> float:
+        return shooting.linearise(theta, none, model.states).total_cost
+
+    theta = model.theta
     step = 0.25 * shooting.seconds  # the scan knows it to a segment
     while step > 0.01:
-        costs = []
-        for offset in (-2.0, -1.0, 0.0, 1.0, 2.0):
-            theta = best_theta.copy()
-            theta[candidate.timed] += offset * step
-            costs.append((shooting.linearise(theta, none, model.states).total_cost, offset, theta))
-        best_theta = min(costs, key=lambda c: c[0])[2]
+        moved = np.repeat(theta[None], 5, axis=0)
+        moved[:, candidate.timed] += step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+        theta = min(moved, key=cost)
         step *= 0.25
-    return replace(fit_model(shooting, best_theta, model.causes, model.states, iterations=4), tried=model.tried)
+    return refit(shooting, replace(model, theta=theta), model.states, iterations=4)

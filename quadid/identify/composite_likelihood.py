@@ -41,12 +41,12 @@ class BothCuts:
     Attributes:
         theta: full parameter vector.
         information: of the data on the scaled parameters, shape (P, P).
-        iterations: linearisations spent on the second cut.
+        simulated: parameter vectors simulated for the second cut.
     """
 
     theta: FloatArray
     information: FloatArray
-    iterations: int
+    simulated: int
 
 
 def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prior, robust: bool) -> BothCuts | None:
@@ -75,7 +75,7 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
     step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
     h = 0.5 * (h_one + h_other)
     information = _information(h, *_shared(shooting, second, found, other, free))
-    return BothCuts(free.move(found.theta, np.asarray(step)), information, other.iterations)
+    return BothCuts(free.move(found.theta, np.asarray(step)), information, other.simulated)
 
 
 def _shared(

@@ -113,7 +113,7 @@ def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray,
 
 def score_products(lin: Linearised) -> tuple[FloatArray, int]:
     """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used."""
-    step = float(np.median(np.diff(lin.time))) if len(lin.time) > 1 else 1.0
+    step = lin.spacing
     lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
     scores = lin.grad - lin.grad.mean(axis=0)
     meat = scores.T @ scores

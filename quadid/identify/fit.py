@@ -15,9 +15,6 @@ from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, reweighted_fit
-from quadid.identify.noise_estimation import flexible_names as flexible_names
-from quadid.identify.noise_estimation import noise_floor as noise_floor
-from quadid.identify.noise_estimation import residual_noise as residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
@@ -52,18 +49,14 @@ class FitOptions:
     Attributes:
         particles, iterations: swarm size and most iterations; 0 iterations start from the initial guess.
         swarm: variant of the swarm.
-        polish: run Gauss-Newton after the swarm.
         seed: decides every random number.
-        seconds: length of the shooting segments of the final fit [s].
         robust: down-weight outliers.
     """
 
     particles: int = 64
     iterations: int = 60
     swarm: SwarmOptions = field(default_factory=SwarmOptions)
-    polish: bool = True
     seed: int = 0
-    seconds: float = FIT_SECONDS
     robust: bool = True
 
 
@@ -78,7 +71,7 @@ class Fit:
         noise: estimated sensor noise, in which errors are stated.
         uncertainty: covariance of the scaled parameters.
         outcome: how the polish ended.
-        evaluations: parameter vectors simulated over the data (finite differences included).
+        evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
         warnings: what a user should know.
     """
 
@@ -146,54 +139,42 @@ def fit(
     report = progress or (lambda stage, share: None)
     check_windows(windows)
     windows, said = spread(windows)
-    layout = Layout(vehicle)
-    free_names = list(names or NOMINAL_NAMES)
-    theta = layout.initial(vehicle)
-    short = Shooting.cut(windows, vehicle, SWARM_SECONDS, layout=layout)
-    evaluations = 0
+    short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
+    free = short.free(list(names or NOMINAL_NAMES))
+    theta, evaluations = short.layout.initial(vehicle), 0
     if options.iterations > 0:
         settings = replace(options.swarm, iterations=options.iterations)
-        theta, evaluations = swarm_search(
-            short, theta, short.free(free_names), settings, options.particles, options.seed, report
-        )
-    if not options.polish:
-        free = short.free(free_names)
-        searched = Polished(theta, short.linearise(theta, free), np.nan, 0, Convergence.BUDGET)
-        found = _finish(short, searched, free, default_prior(short, free), evaluations)
-        return final_answer(replace(found, warnings=_warnings(found)), out_of_reach or {})
+        theta, evaluations = swarm_search(short, theta, free, settings, options.particles, options.seed, report)
     report("polish", 0.0)
     short = short.at_most(MOST_SEGMENTS)
-    free = short.free(free_names)
     typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
-    evaluations += first.iterations * (len(free.entries) + 10)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
-    quick = quick_motion(windows, short, first.theta, free_names) if restless(short, first) else None
+    quick = quick_motion(windows, short, first.theta, free.names) if restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
         starts = [quick.found.theta, first.theta]
-        flexible = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS)
-        found = quick_fit(quick, free_names, options.robust, comparable)
-        noise, evaluations = flexible.noise, evaluations + flexible.simulated
+        noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
+        found = quick_fit(quick, free.names, options.robust, comparable)
     else:
-        noise, spent = noise_floor(windows, short, first.theta, free)
+        noise = flexible_fit(windows, short, [first.theta], free).noise
         report("polish", 0.4)
-        final = Shooting.cut(windows, vehicle, options.seconds, noise, layout)
+        final = Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout)
         result = polish(final, first.theta, free, robust=options.robust)
-        noise, more = with_memory(windows, final, result.theta, free_names)
+        noise = with_memory(windows, final, result.theta, free.names)
         final = final.with_noise(noise)
         theta, states = result.theta, result.states
         del result  # of a long log its residuals are a large part of all memory
         result = polish(final, theta, free, states=states, robust=options.robust)
         if not np.isfinite(result.cost):
             final, result = short, first
-        evaluations += spent + more + result.iterations * (len(free.entries) + 10)
         judge = first if comparable else None
-        found = _finish(final, result, free, default_prior(short, free), 0, options.robust, judge)
+        found = _finish(final, result, free, default_prior(short, free), result.simulated, options.robust, judge)
         found = replace(found, warnings=(*found.warnings, *_warnings(found)))
     report("polish", 1.0)
-    found = replace(found, noise=noise, evaluations=evaluations + found.evaluations, warnings=(*said, *found.warnings))
+    evaluations += first.simulated + found.evaluations
+    found = replace(found, noise=noise, evaluations=evaluations, warnings=(*said, *found.warnings))
     return final_answer(found, out_of_reach or {})
 
 
@@ -243,7 +224,7 @@ def _finish(
     both = with_second_cut(shooting, polished, free, prior, robust) if ended else None
     unc = uncertainty(polished.lin, prior, None if both is None else both.information)
     if both is not None:
-        theta, evaluations = both.theta, evaluations + both.iterations * (len(free.entries) + 10)
+        theta, evaluations = both.theta, evaluations + both.simulated
     theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
     doubts: tuple[str, ...] = ()
     if short is not None and ended:

@@ -58,6 +58,11 @@ class Polished:
         """Initial states of the optimum."""
         return self.lin.states
 
+    @property
+    def simulated(self) -> int:
+        """Parameter vectors simulated for it: with one, each direction of the parameters and nine of initial states."""
+        return self.iterations * (self.lin.gram.shape[1] + 10)
+
 
 def robust_weights(shooting: Shooting, lin: Linearised) -> FloatArray:
     """Huber weights of every sample (square roots of the row weights), 0 where nothing was measured, as `Linearised`.

@@ -88,28 +88,15 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
 
 @dataclass(frozen=True)
 class Flexible:
-    """The flexible fit.
-
-    Attributes:
-        noise: what it leaves; theta: its optimum, full vector; simulated: parameter vectors simulated for it.
-    """
+    """The flexible fit: the noise that it leaves, and its optimum, a full vector."""
 
     noise: NoiseModel
     theta: FloatArray
-    simulated: int
-
-
-def noise_floor(
-    windows: Sequence[Window], short: Shooting, theta: FloatArray, free: Free, iterations: int = 4
-) -> tuple[NoiseModel, int]:
-    """Sensor noise from a deliberately flexible fit, and the parameter vectors simulated for it."""
-    found = flexible_fit(windows, short, [theta], free, short.noise, iterations)
-    return found.noise, found.simulated
 
 
 def flexible_fit(
-    windows: Sequence[Window], short: Shooting, starts: Sequence[FloatArray], free: Free, noise: NoiseModel,
-    iterations: int = 4,
+    windows: Sequence[Window], short: Shooting, starts: Sequence[FloatArray], free: Free,
+    noise: NoiseModel | None = None, iterations: int = 4,
 ) -> Flexible:  # fmt: skip
     """Fits everything the catalogue can free at once.
 
@@ -121,65 +108,53 @@ def flexible_fit(
         short: short segments.
         starts: full vectors; the best outcome counts.
         free: nominal free parameters (kept free).
-        noise: weights of the first fit.
+        noise: weights of the first fit; by default that of `short`.
         iterations: linearisations to spend on the short segments.
     """
     names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
     drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
-    tried: list[tuple[Polished, Shooting]] = []
+    few = thinned(windows, short, short.seconds, noise or short.noise, SHORT_SEGMENTS)
+    wide = few.free(names)
+    tried = []
     for theta in starts:
         start = theta.copy()
         start[drag] = np.where(start[drag] == 0.0, FLEXIBLE_DRAG, start[drag])
-        few = thinned(windows, short, short.seconds, noise, SHORT_SEGMENTS)
-        tried.append((polish(few, start, few.free(names), iterations=iterations), few))
-    first, few = min(tried, key=lambda t: t[0].cost)
-    wide = few.free(names)
+        tried.append(polish(few, start, wide, iterations=iterations))
+    first = min(tried, key=lambda p: p.cost)
     brief = residual_noise(few, first)
     longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
-    simulated = sum(t.iterations for t, _ in tried) * (len(names) + 10)
     # In calm flight short segments may lead flexible parameters far astray; then longer ones begin where they did.
     for theta, iterations in [(first.theta, 3), *((start, FROM_START) for start in starts)]:
-        second, more = _on_longer(longer, theta, names, iterations)
+        found = polish(longer.at_most(LONG_SEGMENTS), theta, wide, iterations=iterations)
+        second = _settled(longer, found.theta, names)
         noise = residual_noise(longer, second, len(names))
-        simulated += more
         # Noise does not grow with the length of a segment; what does is the model losing its way.
         if not np.any(noise.variance > GROWS * brief.variance):
-            longest, states, more = _longest(windows, longer.with_noise(noise), second, names)
-            shaped = shaped_noise(longest, second.theta, wide, states)
-            return Flexible(shaped, second.theta, simulated + more)
-    return Flexible(brief, first.theta, simulated)
+            longest, states = _longest(windows, longer.with_noise(noise), second, names)
+            return Flexible(shaped_noise(longest, second.theta, wide, states), second.theta)
+    return Flexible(brief, first.theta)
 
 
-def _on_longer(longer: Shooting, theta: FloatArray, names: Sequence[str], iterations: int) -> tuple[Polished, int]:
-    """Fits the flexible model to some of the longer segments, evenly spread, and settles all; and vectors simulated."""
-    second = polish(longer.at_most(LONG_SEGMENTS), theta, longer.free(names), iterations=iterations)
-    simulated = second.iterations * (len(names) + 10)
-    second, more = _settled(longer, second.theta, names)
-    return second, simulated + more
-
-
-def _settled(shooting: Shooting, theta: FloatArray, names: Sequence[str]) -> tuple[Polished, int]:
-    """Initial states of all segments at `theta`, and vectors simulated: all of them tell the level of the noise.
+def _settled(shooting: Shooting, theta: FloatArray, names: Sequence[str]) -> Polished:
+    """Initial states of all segments at `theta`: all of them tell the level of the noise.
 
     Two parameters move beside the initial states, so that segments are started and filters warmed up as for all.
     """
-    few = shooting.free([n for n in _SETTLING if n in names])
-    out = polish(shooting, theta, few, iterations=3)
-    return out, out.iterations * (len(few.entries) + 10)
+    return polish(shooting, theta, shooting.free([n for n in _SETTLING if n in names]), iterations=3)
 
 
 def _longest(
     windows: Sequence[Window], longer: Shooting, second: Polished, names: Sequence[str]
-) -> tuple[Shooting, InitialStates, int]:
-    """The longest segments that the model of `second` follows as well as `longer`, states there, vectors simulated."""
+) -> tuple[Shooting, InitialStates]:
+    """The longest segments that the model of `second` follows as well as `longer`, and states there."""
     out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
     if out.count < LINE_SEGMENTS:
-        return longer, second.states, 0
-    fitted, simulated = _settled(out, second.theta, names)
+        return longer, second.states
+    fitted = _settled(out, second.theta, names)
     noise = residual_noise(out, fitted, len(names))
     if np.any(noise.variance > STAYS * longer.noise.variance):
-        return longer, second.states, simulated
-    return out.with_noise(noise), fitted.states, simulated
+        return longer, second.states
+    return out.with_noise(noise), fitted.states
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:

@@ -37,10 +37,8 @@ FINEST_ROWS = 100
 """Rows of a segment beyond which neighbours are averaged: they tell nothing of a memory."""
 
 
-def with_memory(
-    windows: Sequence[Window], problem: Shooting, theta: FloatArray, names: Sequence[str]
-) -> tuple[NoiseModel, int]:
-    """Noise of a problem with the memory of the attitude noise, and the parameter vectors simulated for it.
+def with_memory(windows: Sequence[Window], problem: Shooting, theta: FloatArray, names: Sequence[str]) -> NoiseModel:
+    """Noise of a problem with the memory of the attitude noise.
 
     A model that loses its way leaves more the longer it runs, and noise does not: where segments of `MEMORY_SECONDS`
     leave more than short ones, the noise stays as it is.
@@ -55,18 +53,17 @@ def with_memory(
     near = thinned(windows, problem, LINE_SECONDS, noise, round(MEMORY_SEGMENTS * MEMORY_SECONDS / LINE_SECONDS))
     far = thinned(windows, problem, MEMORY_SECONDS, noise, MEMORY_SEGMENTS)
     if not far.count:
-        return noise, 0
+        return noise
     brief, long = (polish(s, theta, free, iterations=ITERATIONS) for s in (near, far))
-    simulated = (brief.iterations + long.iterations) * (len(names) + 10)
     memory = attitude_memory(long.lin.residuals, long.lin.weights, far.dt) if np.isfinite(long.cost) else None
     if memory is None:
-        return noise, simulated
+        return noise
     found, drifted = (residual_noise(*both, slow_time=memory) for both in ((near, brief), (far, long)))
     if np.any((drifted.variance / found.variance).reshape(-1, 3).mean(axis=1) > STAYS):
-        return noise, simulated
+        return noise
     white, slow = noise.white.copy(), noise.slow.copy()
     white[list(ATTITUDE)], slow[list(ATTITUDE)] = found.white[list(ATTITUDE)], found.slow[list(ATTITUDE)]
-    return replace(noise, white=white, slow=slow, slow_time=memory), simulated
+    return replace(noise, white=white, slow=slow, slow_time=memory)
 
 
 def attitude_memory(residuals: FloatArray, weights: FloatArray, dt: float) -> float | None:

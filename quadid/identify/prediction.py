@@ -84,10 +84,8 @@ def horizon_scores(
     if not wanted or min(wanted) < 1 or max(wanted) > LONGEST:
         raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
     longest = max(*wanted, SUM_TO)
-    tallies = [_file_tally(windows, vehicle, theta, longest) for windows in files]
-    pooled = _empty(longest)
-    for tally in tallies:
-        pooled = pooled + tally
+    tallies = [_tally(windows, vehicle, theta, longest) for windows in files]
+    pooled = sum(tallies, _empty(longest))
     if pooled.samples == 0:
         raise NotIdentifiableError(
             f"no run of {longest} samples fits: measured rate, and no gap for {longest} samples after it",
@@ -106,19 +104,12 @@ def _score(tally: _Tally, horizons: tuple[int, ...]) -> HorizonScore:
     return HorizonScore(tally.samples, mean, horizons)
 
 
-def _file_tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
-    tally = _empty(longest)
+def _tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
+    tally, at = _empty(longest), 1 + np.arange(longest)
     for window in windows:
-        if len(window) > longest:
-            tally = tally + _window_tally(window, vehicle, theta, longest)
-    return tally
-
-
-def _window_tally(window: Window, vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
-    loop, at, tally = OpenLoop(window, vehicle, longest), 1 + np.arange(longest), _empty(longest)
-    for rows, misses in loop.parts(theta[None], at):
-        errors = lengths(misses[0])
-        known = ~np.isnan(errors)
-        total = np.where(known, errors, 0.0).sum(axis=0)
-        tally = tally + _Tally(total, known.sum(axis=0).astype(np.float64), len(rows))
+        for rows, misses in OpenLoop(window, vehicle, longest).parts(theta[None], at):
+            errors = lengths(misses[0])
+            known = ~np.isnan(errors)
+            total = np.where(known, errors, 0.0).sum(axis=0)
+            tally = tally + _Tally(total, known.sum(axis=0).astype(np.float64), len(rows))
     return tally

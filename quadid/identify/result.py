@@ -6,16 +6,16 @@ Numbers stay Python floats; NaN and infinities mean "no answer" and become null 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from quadid.identify.fit import Fit
-from quadid.identify.open_loop import QUANTITIES
 from quadid.identify.prediction import HorizonScore
 from quadid.identify.score import SetScore
 from quadid.model.layout import Layout
-from quadid.parameters import NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 
@@ -106,10 +106,10 @@ def _set_entry(s: ScoredSet) -> JsonDict:
 
 def inertia_warnings(parameters: ParameterSet) -> list[str]:
     """Says when identified moments of inertia cannot belong to a rigid body."""
-    values = {p.name: p for p in parameters if p.name in ("J_xx", "J_yy", "J_zz")}
-    if len(values) < 3 or any(p.status in UNKNOWN for p in values.values()):
+    values = {p.name: p for p in parameters if p.name in INERTIAS}
+    if len(values) < len(INERTIAS) or any(p.status in UNKNOWN for p in values.values()):
         return []
-    why = impossible_inertia([values[n].value for n in ("J_xx", "J_yy", "J_zz")], slack=1.3)
+    why = impossible_inertia([values[n].value for n in INERTIAS], slack=1.3)
     if why is None:
         return []
     return [
@@ -126,27 +126,32 @@ def answered(parameters: ParameterSet) -> bool:
 
 
 def fitted_vehicle(fit: Fit) -> Vehicle:
-    """The vehicle with fitted values as initial guess, their standard deviations, fitted effects; bounds are kept."""
-    effects = {name: dict(values) for name, values in fit.vehicle.effects.items()}
-    layout = Layout(fit.vehicle)
-    for p in fit.parameters:
-        if p.name not in NOMINAL_NAMES:
-            effect = p.name.split(".")[0]
-            effects[effect] = {k: _rounded(v) for k, v in layout.read_effect(fit.theta, effect).items()}
-    return with_values(fit.vehicle, fit.parameters).model_copy(update={"effects": effects})
+    """The vehicle with fitted values as initial guess, their standard deviations, fitted effects."""
+    effects = [p.name.split(".")[0] for p in fit.parameters if p.name not in NOMINAL_NAMES]
+    return with_values(fit.vehicle, fit.parameters, effects, fit.theta)
 
 
-def with_values(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
+def with_values(
+    vehicle: Vehicle, parameters: Iterable[Parameter], effects: Iterable[str] = (), theta: FloatArray | None = None
+) -> Vehicle:
     """The vehicle with these nominal values as initial guess; bounds are kept unless a value lies outside.
 
     Only values that this flight or an earlier one measured carry their standard deviation: a guess, or a number of a
     model that misses the flight, never becomes a sharp prior of the next fit.
+
+    Args:
+        vehicle: the vehicle.
+        parameters: fitted ones; others than nominal are passed over.
+        effects: which it has besides, or with other numbers.
+        theta: full parameter vector that holds the numbers of these.
     """
-    priors = dict(vehicle.parameters)
-    for p in parameters:
-        if p.name in NOMINAL_NAMES:
-            priors[p.name] = _prior(priors[p.name], p)
-    return vehicle.model_copy(update={"parameters": priors})
+    priors = {p.name: _prior(vehicle.parameters[p.name], p) for p in parameters if p.name in NOMINAL_NAMES}
+    found = {name: dict(values) for name, values in vehicle.effects.items()}
+    if theta is not None:
+        layout = Layout(vehicle)
+        for name in effects:
+            found[name] = {k: _rounded(v) for k, v in layout.read_effect(theta, name).items() if math.isfinite(v)}
+    return vehicle.model_copy(update={"parameters": {**vehicle.parameters, **priors}, "effects": found})
 
 
 def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
@@ -184,8 +189,3 @@ def _horizon_entry(score: HorizonScore, gaps: int) -> JsonDict:
         "horizons": {str(h): score.at(h) for h in score.horizons},
         "sum": {"to": score.sum_to, **score.sum},
     }
-
-
-def units() -> dict[str, str]:
-    """Units of what ``quadid score`` reports."""
-    return dict(QUANTITIES)

@@ -37,3 +37,18 @@ def eliminated(h_mm: FloatArray, h_mo: FloatArray, h_oo: FloatArray) -> Schur:
     rows = h_mo.reshape(math.prod(h_mo.shape[:-1]), h_mo.shape[-1])
     gain = np.asarray(np.linalg.solve(h_oo, rows.T), dtype=np.float64).T.reshape(h_mo.shape)
     return Schur(h_mm - gain @ np.swapaxes(h_mo, -1, -2), gain)
+
+
+def freed(h_mm: FloatArray, h_mo: FloatArray, h_oo: FloatArray, g_m: FloatArray, g_o: FloatArray) -> FloatArray:
+    """By how much more the cost falls where the parameters m are free beside the others, shape (...).
+
+    Args:
+        h_mm: as in `eliminated`; positive definite together with the next two.
+        h_mo: as there.
+        h_oo: as there.
+        g_m: gradient of the parameters m, shape (..., m).
+        g_o: and of the others, shape (o,).
+    """
+    left = eliminated(h_mm, h_mo, h_oo)
+    g = g_m - left.gain @ g_o
+    return np.asarray(np.sum(g * np.linalg.solve(left.h, g[..., None])[..., 0], axis=-1))

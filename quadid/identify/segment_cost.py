@@ -66,6 +66,11 @@ class Linearised:
         return float(self.rows.sum())
 
     @property
+    def spacing(self) -> float:
+        """Time from one segment to the next [s]; 1 s where there is one only."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
+
+    @property
     def reduced_chi_square(self) -> float:
         """Cost per independent residual; 1 at the noise floor."""
         return self.total_cost / max(self.total_rows, 1.0)

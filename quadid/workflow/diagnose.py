@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from quadid.diagnose import Diagnosis
-    from quadid.diagnose.pipeline import Workings
+    from quadid.diagnose.selection import Search
     from quadid.identify.fit import Fit
     from quadid.identify.noise_model import NoiseModel
     from quadid.identify.result import ScoredSet
@@ -41,7 +41,7 @@ class Diagnosed(Reported):
         noise: estimated sensor noise.
         logs: as loaded, diagnosed ones first.
         nominal: vehicle that was given.
-        workings: everything that led to the result.
+        search: how the causes were selected.
     """
 
     result: dict[str, Any]
@@ -50,7 +50,7 @@ class Diagnosed(Reported):
     noise: NoiseModel
     logs: list[Log]
     nominal: Vehicle
-    workings: Workings
+    search: Search
 
     @property
     def vehicle(self) -> Vehicle:
@@ -149,7 +149,7 @@ class Diagnosed(Reported):
         from quadid.report.residual_maps import residual_map
 
         windows = [w for log in self._train for w in log.windows]
-        model = self.workings.search.model
+        model = self.search.model
         drawn = {
             c.effect: residual_map(windows, self.nominal, model.theta, c.effect, c.names, self.noise)
             for c in model.causes
@@ -174,8 +174,8 @@ def diagnose(
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
     """
+    from quadid.diagnose.attribution import Identified
     from quadid.diagnose.pipeline import diagnose as diagnose_windows
-    from quadid.diagnose.stated_errors import Identified
     from quadid.model.supply import with_reference_voltage
 
     given = settled(logs, validate, vehicle)
@@ -188,11 +188,11 @@ def diagnose(
         lambda _, share: advance("nominal fit", share), unreachable,
     )  # fmt: skip
     nominal = Identified(fit.vehicle, fit.theta, fit.noise)
-    found, workings = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
-    found, model = _within_reach(found, unreachable), workings.search.model
+    found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
+    found, model = _within_reach(found, unreachable), selection.model
     result, (before, after) = found.to_dict(), found.validation.deciding
     result["validation"]["deciding"] = {
-        "seconds": workings.search.shooting.seconds, "mse_nominal": before, "mse_extended": after
+        "seconds": selection.shooting.seconds, "mse_nominal": before, "mse_extended": after
     }  # fmt: skip
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
@@ -203,7 +203,7 @@ def diagnose(
         {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
         for s in sets
     ]
-    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, workings)
+    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection)
 
 
 def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:
@@ -221,11 +221,11 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis
     A rotor signal too slow for inertias is too slow for lags and delays: they are over before its next sample.
     """
     from quadid.effects import EFFECTS
-    from quadid.parameters import INERTIAS, Status
+    from quadid.parameters import INERTIAS, Status, unreliable
 
     trusted = [p.name for p in found.parameters if p.name in unreachable and p.status is not Status.PRIOR_DOMINATED]
     told = [f"{name} is not to be used: {unreachable[name]}" for name in trusted]
-    parameters = tuple(replace(p, status=Status.UNRELIABLE) if p.name in trusted else p for p in found.parameters)
+    parameters = unreliable(found.parameters, trusted)
     late = [f.effect for f in found.findings if EFFECTS[f.effect].family == "late" and set(INERTIAS) & set(unreachable)]
     told += [f"{name} is not named with confidence: {unreachable[INERTIAS[0]]}" for name in dict.fromkeys(late)]
     findings = tuple(replace(f, confident=f.confident and f.effect not in late) for f in found.findings)

@@ -233,10 +233,10 @@ def _own(flown: Protocol, seed: int, advance: Advance) -> tuple[Fit, Diagnosis, 
 
     train, unseen = flown.sets[0], [w for windows in flown.sets[1:] for w in windows]
     found = fit(train, flown.vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance(stage, share))
-    diagnosis, workings = diagnose(train, flown.vehicle, unseen, seed, advance)
+    diagnosis, search = diagnose(train, flown.vehicle, unseen, seed, advance)
     # One noise for all columns: that which the better model leaves.
-    noise = workings.search.shooting.noise
-    return replace(found, noise=noise), diagnosis, workings.search.model.theta, noise
+    noise = search.shooting.noise
+    return replace(found, noise=noise), diagnosis, search.model.theta, noise
 
 
 def _black_boxes(flown: Protocol, noise: NoiseModel, advance: Advance) -> tuple[dict[str, list[float]], dict[str, int]]:

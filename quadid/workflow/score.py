@@ -66,10 +66,10 @@ def score(
         LogError: a log that does not fit the vehicle.
         ParameterError: horizons that are no positive numbers.
     """
-    from quadid.identify.open_loop import no_change
+    from quadid.identify.open_loop import QUANTITIES, no_change
     from quadid.identify.prediction import horizon_scores
     from quadid.identify.prediction_floor import prediction_floor
-    from quadid.identify.result import score_result, units
+    from quadid.identify.result import score_result
     from quadid.model.layout import Layout
     from quadid.report.verdict import score_verdict
     from quadid.workflow.overlap import fitted_before
@@ -84,7 +84,7 @@ def score(
     wanted = [int(h) for h in result["horizons"]]
     result["noise_floor"] = {str(h): prediction_floor(windows, h) for h in wanted}
     result["no_change"] = {str(h): no_change(windows, described, h) for h in wanted}
-    result["units"] = units()
+    result["units"] = dict(QUANTITIES)
     result["verdict"] = score_verdict(result).level
     seen = [
         f"{log.name}: the vehicle file was fitted to this flight, so these errors are no proof"

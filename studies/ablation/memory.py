@@ -16,7 +16,7 @@ from quadid.window import Window
 from studies.ablation.variants import modules
 
 FITS = (
-    "polish", "settle_states", "flexible_fit", "noise_floor", "residual_noise", "with_memory", "mode_power",
+    "polish", "settle_states", "flexible_fit", "residual_noise", "with_memory", "mode_power",
     "learn_prediction", "follows",
 )  # fmt: skip
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""

@@ -12,13 +12,13 @@ from types import ModuleType
 from typing import Any
 
 import quadid.diagnose
+from quadid.diagnose.attribution import stated_errors
 from quadid.diagnose.cross_validation import paired_gain
 from quadid.diagnose.hypotheses import candidates
 from quadid.diagnose.log_evidence import RELEVANT
 from quadid.diagnose.model import Model, fit_model
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
-from quadid.diagnose.stated_errors import stated_errors
 from quadid.identify.noise_estimation import flexible_fit
 from quadid.identify.shooting import Shooting
 from studies.ablation.house import measured
@@ -102,8 +102,8 @@ def _same_noise(windows: object, short: Any, model: object) -> Any:
     return short.noise
 
 
-def _own_noise(windows: object, shooting: Shooting, *_: object) -> tuple[Any, None]:
-    return shooting.noise, None
+def _own_noise(windows: object, shooting: Shooting, *_: object) -> Any:
+    return shooting.noise
 
 
 def _nominal(shooting: Shooting, *_: object) -> Model:
@@ -134,8 +134,8 @@ def _uncontradicted(*given: Any) -> Any:
     return replace(stated_errors(*given), contradicted=False)
 
 
-def _first_guess(*given: Any) -> Any:
-    return flexible_fit(given[0], given[1], given[2][:1], given[3], given[1].noise)
+def _first_guess(*given: Any, **more: Any) -> Any:
+    return flexible_fit(*given[:2], given[2][:1], given[3], given[1].noise, **more)
 
 
 RULES: dict[str, dict[str, Any]] = {
@@ -157,10 +157,9 @@ RULES: dict[str, dict[str, Any]] = {
     "onset refined": {"_refine_time": _as_scanned},
     "a look at the longest segments": {"Stage.longest": _given(None)},
     "longest segments where velocity is found": {"is_long": _given(False)},
-    "clutter in what a cause is worth": {"untidy_names": _given([])},
     "ordinary sizes last": {"ordinary": _given(False)},
     "contradiction by unseen data": {"stated_errors": _uncontradicted},
-    "what the rest follows": {"follows": _given(((), ()))},
+    "what the rest follows": {"follows": _given(())},
 }
 """Rules that are functions, and what stands in their place."""
 OUT: dict[str, Any] = {

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.diagnose import Diagnosis, Workings, diagnose
+from quadid.diagnose import Diagnosis, Search, diagnose
 from quadid.diagnose.attribution import block_deviance
 from quadid.diagnose.hypotheses import Candidate, candidates
-from quadid.diagnose.model import Model, extend, fit_model
+from quadid.diagnose.model import Model, Start, extend, fit_model
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
 from quadid.identify.shooting import Shooting
@@ -59,15 +59,15 @@ def run(case: Case) -> Graded:
         return _failed(case, f"not flown: {error}")
     began = time.perf_counter()
     try:
-        found, workings = diagnose([train], vehicle, [validate], seed=case.seed)
+        found, search = diagnose([train], vehicle, [validate], seed=case.seed)
     except QuadidError as error:
         return _failed(case, f"refused: {error}")
     seconds = time.perf_counter() - began
-    oracle = _oracle(case, workings, validate) if case.group in WITH_ORACLE else None
-    return _graded(case, found, workings, oracle, seconds)
+    oracle = _oracle(case, search, validate) if case.group in WITH_ORACLE else None
+    return _graded(case, found, search, oracle, seconds)
 
 
-def _graded(case: Case, found: Diagnosis, workings: Workings, oracle: float | None, seconds: float) -> Graded:
+def _graded(case: Case, found: Diagnosis, search: Search, oracle: float | None, seconds: float) -> Graded:
     return Graded(
         case,
         found.verdict.value,
@@ -78,7 +78,7 @@ def _graded(case: Case, found: Diagnosis, workings: Workings, oracle: float | No
         {f.effect: {p.name: p.ci95 for p in f.parameters} for f in found.findings},
         *found.validation.deciding,
         oracle,
-        workings.remainder.deviance / workings.search.model.rows,
+        found.remainder.deviance / search.model.rows,
         seconds,
     )
 
@@ -87,15 +87,14 @@ def _failed(case: Case, note: str) -> Graded:
     return Graded(case, "failed", (), (), None, {}, {}, float("nan"), float("nan"), None, 0.0, 0.0, note)
 
 
-def _oracle(case: Case, workings: Workings, validate: Window) -> float:
+def _oracle(case: Case, search: Search, validate: Window) -> float:
     """Error on the second flight of the model with the true causes, each fitted from the truth's neighbourhood."""
-    shooting = workings.search.shooting
+    shooting = search.shooting
     listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
-    model: Model = workings.search.nominal
+    model: Model = search.nominal
     for effect, values in sorted(case.hidden.items(), key=lambda item: item[0] != "rotor_drag"):
-        model = extend(
-            shooting, model, _cause(listed, effect, values), _near_truth(shooting, model, effect, values), 12
-        )
+        start = Start(_near_truth(shooting, model, effect, values), model.states)
+        model = extend(shooting, model, _cause(listed, effect, values), start, 12)
     model = fit_model(shooting, model.theta, model.causes, model.states, 12)
     deviance, rows = block_deviance(shooting.on([validate]), model)
     return float(deviance.sum()) / rows

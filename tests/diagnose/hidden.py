@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose.pipeline import Workings
+from quadid.diagnose import Diagnosis, Search, diagnose
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 from studies.campaign import SINGLES, Case, cases, flown
@@ -34,7 +33,7 @@ def data(case_key: tuple[str, int, float]) -> tuple[Case, Window, Window, Vehicl
     return case, *flown(case)
 
 
-def answer(case: Case) -> tuple[Diagnosis, Workings]:
+def answer(case: Case) -> tuple[Diagnosis, Search]:
     """What the diagnosis says about the case; it gets the flights and the vehicle file alone."""
     _, train, validate, vehicle = data((case.group, case.number, case.seconds))
     return diagnose([train], vehicle, [validate], seed=case.seed)

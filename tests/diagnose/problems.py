@@ -13,7 +13,7 @@ from quadid.diagnose.model import Model, fit_model
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import polish
-from quadid.identify.noise_estimation import noise_floor, reweighted_fit
+from quadid.identify.noise_estimation import flexible_fit, reweighted_fit
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
@@ -55,7 +55,7 @@ def fitted(window: Window, noise: NoiseModel | None = None) -> Problem:
     start = short.layout.initial(vehicle)
     if noise is None:
         short, first = reweighted_fit(short, start, free, iterations=8)
-        short = short.with_noise(noise_floor([window], short, first.theta, free)[0])
+        short = short.with_noise(flexible_fit([window], short, [first.theta], free).noise)
     else:
         first = polish(short, start, free, iterations=8)
     decisive = Shooting.cut([window], vehicle, 1.0, short.noise, short.layout)

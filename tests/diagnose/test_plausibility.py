@@ -8,13 +8,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnose.findings import extended_vehicle
-from quadid.diagnose.model import Model, extend, free_names
+from quadid.diagnose.model import Model, Start, extend, free_names, without
 from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
 from quadid.diagnose.result import Verdict
 from quadid.identify.answer import possible_moments
+from quadid.identify.result import with_values
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle
 from tests.diagnose.hidden import answer, of_class
@@ -26,9 +26,11 @@ def dragged() -> tuple[Problem, Model]:
     """A flight with rotor drag and its moment, and the model that says so."""
     hidden = {"rotor_drag": {"k_x": 0.3, "k_y": 0.25}, "rotor_drag_moment": {"h_x": 0.03, "h_y": 0.03}}
     problem = fitted(window_with(hidden), clean().shooting.noise)
-    start = problem.nominal.theta.copy()
-    start[[problem.shooting.layout.entry(f"rotor_drag.{k}").index for k in ("k_x", "k_y")]] = 0.25
+    theta = problem.nominal.theta.copy()
+    theta[[problem.shooting.layout.entry(f"rotor_drag.{k}").index for k in ("k_x", "k_y")]] = 0.25
+    start = Start(theta, problem.nominal.states)
     model = extend(problem.shooting, problem.nominal, cause(problem, "rotor_drag"), start, iterations=1)
+    start = Start(theta, model.states)
     return problem, extend(problem.shooting, model, cause(problem, "rotor_drag_moment"), start, iterations=20)
 
 
@@ -124,9 +126,9 @@ def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> Non
     parameters, said = possible_moments(nominal)
     assert said is not None
     assert "J_zz: moved" in said
-    written = Vehicle.from_yaml(extended_vehicle(vehicle, layout, far, parameters))
+    written = Vehicle.from_yaml(with_values(vehicle, parameters).to_yaml())
     moved = {p.name: p for p in parameters}["J_zz"]
-    assert written.parameters["J_zz"].initial == moved.value
+    assert written.parameters["J_zz"].initial == pytest.approx(moved.value, rel=1e-6)
     assert written.parameters["J_zz"].sigma is None
     assert moved.status is Status.UNRELIABLE
 
@@ -135,7 +137,8 @@ def test_numbers_beside_a_cause_that_stands_for_something_else_are_not_to_be_use
     """Without the moment of the drag the inertias change, and nobody knows what is in its place; thrust stays."""
     problem, model = dragged()
 
-    def told(*doubted: str) -> tuple[dict[str, Status], str]:
+    def told(*labels: str) -> tuple[dict[str, Status], str]:
+        doubted = {label: without(problem.shooting, model, cause(problem, label)) for label in labels}
         numbers, reasons = _nominal_parameters(
             problem.shooting, problem.shooting, model, Verdict.PARTLY_EXPLAINED, doubted
         )

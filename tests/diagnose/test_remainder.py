@@ -67,8 +67,8 @@ def test_a_tone_is_seen_in_its_channel_at_its_frequency(
 def test_structure_is_counted_once_though_two_looks_see_it() -> None:
     power = Structure("p", 0.1, 500.0, 7.0, ALARM + 1.0)
     quiet = Structure("q", 0.1, 9e9, 7.0, ALARM - 1.0)
-    seen = Follows(SITES[0], Gain(300.0, 10.0, np.ones(12)), "thrust input")
-    doubted = Follows(SITES[3], Gain(300.0, 200.0, np.ones(12)), "p")
+    seen = Follows(SITES[0], Gain(300.0, 10.0, np.ones(12)), {"thrust input": 300.0})
+    doubted = Follows(SITES[3], Gain(300.0, 200.0, np.ones(12)), {"p": 300.0})
     assert Remainder((power, quiet), (seen, doubted), ROWS).deviance == 500.0
     assert Remainder((quiet,), (seen, doubted), ROWS).deviance == 300.0
     assert Remainder((quiet,), (doubted,), ROWS).deviance == 0.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.diagnose.model import Model, extend, fit_model
+from quadid.diagnose.model import Model, Start, extend, fit_model
 from quadid.diagnose.score_test import Everything, Score
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
@@ -21,8 +21,7 @@ SMALL = {
 
 
 def screen(problem: Problem, model: Model | None = None) -> list[Score]:
-    everything = Everything.of(problem.shooting, model or problem.nominal, problem.listed)
-    return everything.scores(problem.listed)
+    return Everything.of(problem.shooting, model or problem.nominal, problem.listed).scores()
 
 
 def score_of(problem: Problem, label: str, model: Model | None = None) -> Score:
@@ -35,7 +34,8 @@ def score_of(problem: Problem, label: str, model: Model | None = None) -> Score:
 def test_the_predicted_drop_is_that_of_a_refit(name: str) -> None:
     problem = fitted(window_with({name: SMALL[name]}), clean().shooting.noise)
     score = score_of(problem, name)
-    refit = extend(problem.shooting, problem.nominal, cause(problem, name), problem.nominal.theta, iterations=12)
+    start = Start(problem.nominal.theta, problem.nominal.states)
+    refit = extend(problem.shooting, problem.nominal, cause(problem, name), start, iterations=12)
     drop = problem.nominal.deviance - refit.deviance
     assert drop > 30.0
     assert score.drop == pytest.approx(drop, rel=0.05)
@@ -67,7 +67,9 @@ def test_the_scan_is_that_of_masked_columns() -> None:
     timed = score.candidate.timed
     assert timed is not None
     theta[timed] = score.time
-    moved = extend(problem.shooting, problem.nominal, score.candidate, theta, iterations=8)
+    moved = extend(
+        problem.shooting, problem.nominal, score.candidate, Start(theta, problem.nominal.states), iterations=8
+    )
     assert score.drop == pytest.approx(problem.nominal.deviance - moved.deviance, rel=0.1)
 
 
@@ -86,7 +88,7 @@ def test_a_direction_the_nominal_parameters_explain_promises_nothing() -> None:
     """A thrust drop before the log begins is a smaller b: nothing is left to gain."""
     problem = clean()
     whole = replace(cause(problem, "thrust_drop"), timed=None)
-    (score,) = Everything.of(problem.shooting, problem.nominal, [whole]).scores([whole])
+    (score,) = Everything.of(problem.shooting, problem.nominal, [whole]).scores()
     assert score.drop < 5.0
     assert np.isfinite(score.drop)
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import pytest
 
 from quadid.diagnose.model import extend
-from quadid.diagnose.segment_schedule import CLEAN_MISFIT, LINEAR_MISFIT, USUAL_SECONDS, Stage, tracks
+from quadid.diagnose.segment_schedule import CLEAN_MISFIT, LINEAR_MISFIT, USUAL_SECONDS, Stage
 from quadid.identify.shooting import Shooting
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
@@ -39,8 +39,7 @@ def test_a_model_that_follows_decides_on_segments_of_usual_length() -> None:
 def test_one_that_does_not_begins_on_shorter_ones_and_the_true_cause_leads_back() -> None:
     stage = begun(late())
     assert stage.shooting.seconds < USUAL_SECONDS
-    usual = schedule(late())[2]
-    assert not tracks(usual, stage.refitted(2)), "the flight is too easy for this test"
+    assert not stage.at(2).follows, "the flight is too easy for this test"
     named = extend(stage.shooting, stage.model, cause(late(), "motor_lag"), iterations=12)
     again = Stage(stage.schedule, stage.rung, named).continued()
     assert again.shooting.seconds == USUAL_SECONDS

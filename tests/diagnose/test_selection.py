@@ -110,6 +110,6 @@ def test_the_score_test_of_a_swap_prefers_the_look_alike_to_anything_else() -> N
     problem = late()
     model = named("command_delay")
     everything = Everything.of(problem.shooting, model, problem.listed)
-    best = everything.scores(problem.listed, cause(problem, "command_delay"))[0]
+    best = everything.scores(cause(problem, "command_delay"))[0]
     assert best.candidate.label in ("motor_lag", "imu_lag", "attitude_delay")
     assert best.drop > -everything.loss(cause(problem, "command_delay"))

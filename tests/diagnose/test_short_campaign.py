@@ -55,9 +55,9 @@ def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
     """Mass dropped in flight while the battery fades: together they look like inflow, or drag across the rotors."""
     case = of_class("look_alike", 15)
     assert set(case.expected) == {"mass_change", "battery_sag"}
-    found, workings = answer(case)
+    found, search = answer(case)
     require_named(case, found)
-    first = workings.search.rounds[0].accepted
+    first = search.rounds[0].accepted
     assert first is not None
     assert first.candidate is not None
     assert first.candidate.effect not in case.expected, "this case no longer asks for a swap"
@@ -66,9 +66,9 @@ def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
 def test_inflow_too_small_for_segments_of_a_second_is_found_on_longer_ones() -> None:
     case = of_class("single", 1083, 120.0)
     assert case.expected == ("axial_inflow",)
-    found, workings = answer(case)
+    found, search = answer(case)
     require_named(case, found)
-    assert workings.search.shooting.seconds > 1.0, "longer segments decide"
+    assert search.shooting.seconds > 1.0, "longer segments decide"
     assert abs(number(found, "axial_inflow", "k_z") - case.hidden["axial_inflow"]["k_z"]) < 0.03
 
 
@@ -81,11 +81,11 @@ def test_of_two_kinds_of_drag_that_fit_alike_the_one_with_fewer_numbers_is_named
 
 
 def test_a_flight_without_effects_is_left_alone() -> None:
-    found, workings = answer(of_class("null", 0))
+    found, search = answer(of_class("null", 0))
     require_nothing(found)
     assert found.validation.extended == found.validation.nominal == pytest.approx(1.0, abs=0.1)
     assert [p["name"] for p in found.to_dict()["parameters"]] == list(NOMINAL_NAMES)
-    assert not workings.remainder.followed
+    assert not found.remainder.followed
 
 
 def test_what_no_entry_explains_is_called_unknown() -> None:

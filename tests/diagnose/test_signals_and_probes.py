@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.diagnose.residual_regressors import SITES, Follows, follows, signals
+from quadid.diagnose.residual_regressors import SITES, Follows, follows, signals, strongest
 from quadid.flight import draw_truth, fly
 from quadid.identify.segment_jacobian import Columns
 from quadid.types import FloatArray
@@ -27,8 +27,8 @@ def thrust_before(problem: Problem) -> FloatArray:
     return out
 
 
-def strongest(problem: Problem) -> Follows:
-    return follows(problem.shooting, problem.nominal)[0][0]
+def found(problem: Problem) -> tuple[Follows, ...]:
+    return strongest(follows(problem.shooting, problem.nominal))
 
 
 def planted(channel: str, axis: int, values: FloatArray) -> Problem:
@@ -39,32 +39,31 @@ def planted(channel: str, axis: int, values: FloatArray) -> Problem:
 
 
 def test_without_effects_no_site_is_structured() -> None:
-    found = follows(clean().shooting, clean().nominal)[0]
-    assert len(found) == len({s.group for s in SITES}) == 6
-    assert not [f for f in found if f.significant]
+    left = found(clean())
+    assert len(left) == len({s.group for s in SITES}) == 6
+    assert not [f for f in left if f.significant]
     # Some fifty signals fitted to noise lose on blocks that they were not fitted to.
-    assert max(f.gain.total for f in found) < 0.0
+    assert max(f.gain.total for f in left) < 0.0
 
 
 @pytest.mark.parametrize("axis", [0, 2])
 def test_a_gyro_error_that_follows_thrust_is_found_on_its_axis(axis: int) -> None:
     problem = planted("gyro", axis, 0.1 * thrust_before(clean()))
-    found = strongest(problem)
-    assert found.significant
-    assert found.site.group == f"rotation {'xyz'[axis]}"
-    assert found.site.name == f"gyro {'xyz'[axis]}"
-    assert "thrust" in found.signal or found.signal.startswith("a_z")
-    others = [f for f in follows(problem.shooting, problem.nominal)[0] if f.significant]
-    assert [f.site.group for f in others] == [found.site.group]
+    first = found(problem)[0]
+    assert first.significant
+    assert first.site.group == f"rotation {'xyz'[axis]}"
+    assert first.site.name == f"gyro {'xyz'[axis]}"
+    assert "thrust" in first.signal or first.signal.startswith("a_z")
+    assert [f.site.group for f in found(problem) if f.significant] == [first.site.group]
 
 
 def test_a_force_that_follows_a_rate_is_found_at_its_site() -> None:
     part = columns(clean())
     p = np.zeros(len(clean().window))
     p[part.rows] = signals(part)["p"]
-    found = strongest(planted("accel", 1, 0.15 * p))
-    assert found.significant
-    assert (found.site.name, found.signal) == ("force y", "p")
+    first = found(planted("accel", 1, 0.15 * p))[0]
+    assert first.significant
+    assert (first.site.name, first.signal) == ("force y", "p")
 
 
 def test_a_moment_that_follows_the_motion_is_found_as_one() -> None:
@@ -72,9 +71,9 @@ def test_a_moment_that_follows_the_motion_is_found_as_one() -> None:
     window = fly(
         PELICAN, draw_truth(PELICAN, SEED), 60.0, SEED, effects={"rate_damping": {"l_p": 2.0, "m_q": 0.0}}
     ).window
-    found = strongest(fitted(window, clean().shooting.noise))
-    assert found.significant
-    assert found.site.name == "moment x"
+    first = found(fitted(window, clean().shooting.noise))[0]
+    assert first.significant
+    assert first.site.name == "moment x"
 
 
 def test_what_happens_once_and_follows_nothing_is_not_said_to_follow() -> None:
@@ -82,7 +81,7 @@ def test_what_happens_once_and_follows_nothing_is_not_said_to_follow() -> None:
     knock = np.zeros(len(clean().window))
     knock[1500:1525] = 0.2
     problem = planted("gyro", 1, knock)
-    assert not [f for f in follows(problem.shooting, problem.nominal)[0] if f.significant]
+    assert not [f for f in found(problem) if f.significant]
 
 
 def test_inputs_are_those_of_the_step_before() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identify.schur_complement import eliminated
+from quadid.identify.schur_complement import eliminated, freed
 
 
 @pytest.mark.parametrize(("stay", "go"), [(1, 4), (3, 2), (3, 0), (0, 2)])
@@ -20,6 +20,14 @@ def test_what_is_left_is_the_cost_at_the_best_of_the_others(stay: int, go: int) 
         best = np.linalg.lstsq(a[:, o], y - a[:, m] @ z, rcond=None)[0]
         cost = np.sum((y - a[:, m] @ z - a[:, o] @ best) ** 2)
         assert cost == pytest.approx(y @ y - own + 2.0 * g_left @ z + z @ left.h @ z)
+
+
+def test_what_freeing_parameters_gains_is_the_fall_of_the_least_cost() -> None:
+    rng = np.random.default_rng(7)
+    a, y = rng.standard_normal((30, 6)), rng.standard_normal(30)
+    h, g, m, o = a.T @ a, -a.T @ y, slice(0, 2), slice(2, None)
+    before, after = (np.linalg.lstsq(b, y, rcond=None)[1][0] for b in (a[:, o], a))
+    assert freed(h[m, m], h[m, o], h[o, o], g[m], g[o]) == pytest.approx(before - after)
 
 
 def test_the_covariance_of_what_is_left_is_that_of_the_whole() -> None:
