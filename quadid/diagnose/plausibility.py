@@ -14,7 +14,6 @@ from quadid.diagnose.attribution import UNTIDY, untidy_sized
 from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
-from quadid.model.layout import Entry
 from quadid.parameters import Parameter, Status, at_bound
 
 LIKELY_SENSOR = 10.0
@@ -61,14 +60,7 @@ def impossible(model: Model, cause: Candidate) -> str:
             return f"{shown} is more than a sensor that works can have ({LIKELY_SENSOR * e.typical:.3g} {e.unit})"
         if e.sign > 0 and size + Z95 * sigma[e.name] < -WRONG_SIGN:
             return f"{shown} cannot be negative"
-        if (bound := _bound(e, value)) is not None:
+        bound = e.lower if value - e.lower <= e.upper - value else e.upper
+        if at_bound(value, e.lower, e.upper) and bound != e.neutral:
             return f"{shown} rests on its bound ({bound:.3g} {e.unit})"
     return ""
-
-
-def _bound(entry: Entry, value: float) -> float | None:
-    """The bound, other than neutral, that a number rests on."""
-    if not at_bound(value, entry.lower, entry.upper):
-        return None
-    bound = min(entry.lower, entry.upper, key=lambda b: abs(value - b))
-    return None if bound == entry.neutral else bound

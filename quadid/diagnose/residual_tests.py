@@ -19,10 +19,10 @@ from quadid.diagnose.model import Model
 from quadid.diagnose.residual_regressors import Follows, follows, strongest
 from quadid.effects import EFFECTS
 from quadid.identify.noise_estimation import SPECTRUM_SECONDS
-from quadid.identify.noise_spectrum import SMOOTH, mode_power
+from quadid.identify.noise_spectrum import LEAST_LEFT, SMOOTH, band_power, mode_power
 from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES
-from quadid.types import BoolArray, FloatArray
+from quadid.types import FloatArray
 
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
@@ -105,28 +105,16 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
 
 def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
     spacing = 0.5 * rate / len(found)
-    frequency = spacing * np.arange(len(found))
-    usable = null > 0.3  # modes the initial state takes away say nothing
     # The noise spectrum came from the data: a line of vibration narrower than it resolves is noise.
     resolved = SMOOTH / (2.0 * SPECTRUM_SECONDS)
-    ratio, z = _band(found, null, usable, segments, 2 * round(0.5 * resolved / spacing) + 1)
+    ratio, modes = band_power(found, null, 2 * round(0.5 * resolved / spacing) + 1)
+    usable = null > LEAST_LEFT
+    z = np.where(usable, (ratio - 1.0) / np.sqrt(2.0 / (segments * np.maximum(modes, 1.0))), 0.0)
     k = int(np.argmax(z))
     excess = np.where(usable & (z > 2.0), null * (ratio - 1.0), 0.0)
     deviance = float(segments * max(np.sum(excess), 0.0))
     share = deviance / max(float(segments * np.sum(found)), 1e-12)
-    return Structure(name, share, deviance, float(frequency[k]), float(z[k]))
-
-
-def _band(
-    found: FloatArray, null: FloatArray, usable: BoolArray, segments: int, width: int
-) -> tuple[FloatArray, FloatArray]:
-    """Power over `width` modes relative to noise, and by how many standard errors it stands above it."""
-    kernel = np.ones(width)
-    weight = np.convolve(usable * null, kernel, mode="same")
-    ratio = np.convolve(usable * found, kernel, mode="same") / np.maximum(weight, 1e-9)
-    modes = np.convolve(usable.astype(float), kernel, mode="same")
-    error = np.sqrt(2.0 / (segments * np.maximum(modes, 1.0)))
-    return ratio, np.where(usable, (ratio - 1.0) / error, 0.0)
+    return Structure(name, share, deviance, k * spacing, float(z[k]))
 
 
 def inconstant_causes(model: Model, left: Remainder) -> dict[str, str]:

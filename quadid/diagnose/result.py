@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -163,8 +163,7 @@ def describe(
 def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool) -> Finding:
     cause = worth.cause
     numbers = _numbers(shooting, search.model, cause, sigma)
-    values = {p.name: p.value for p in numbers}
-    benefit = worth.benefit
+    body, benefit = EFFECTS[cause.effect].told({p.name: p.value for p in numbers}), worth.benefit
     return Finding(
         effect=cause.effect,
         confident=confident,
@@ -172,7 +171,8 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         gain=benefit,
         p_value=min(1.0, survival(search.model.wald(cause), len(cause.names)) * search.tests),
         alternatives=_alternatives(search, cause, benefit.mse_after),
-        evidence=_sentence(cause.effect, values, benefit),
+        evidence=f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "
+        f"{benefit.mse_before:.3g} to {benefit.mse_after:.3g} times the noise.",
         per_log=EFFECTS[cause.effect].per_log,
         ordinary=worth.ordinary,
     )
@@ -189,21 +189,14 @@ def _numbers(shooting: Shooting, model: Model, cause: Candidate, sigma: dict[str
             continue
         base = next((f.value for f in out if f.name == p.beside), None)
         value = float(model.theta[shooting.layout.entry(name).index]) + (base or 0.0)
-        half = Z95 * _sigma(
-            p.name, math.hypot(sigma.get(name, 0.0), 0.0 if base is None else sigma[f"{effect}.{p.beside}{which}"])
-        )
+        steps = STEP_SIGMA if p.name in ("tau", "tau_down", "delay") else 0.0
+        spread = math.hypot(sigma.get(name, 0.0), 0.0 if base is None else sigma[f"{effect}.{p.beside}{which}"], steps)
+        half = Z95 * (TIME_SIGMA if p.name == "time" else spread)
         low, high = value - half, value + half
         if p.name == "cutoff":  # the vector holds its period
             value, low, high = 1.0 / max(value, 1e-9), 1.0 / high, 1.0 / low if low > 0.0 else math.inf
         out.append(FoundParameter(p.name, p.unit, value, (low, high)))
     return tuple(out)
-
-
-def _sigma(name: str, from_data: float) -> float:
-    """Standard deviation of a number: of the scan for a moment, widened by the steps of real loops for a lag."""
-    if name == "time":
-        return TIME_SIGMA
-    return math.hypot(from_data, STEP_SIGMA) if name in ("tau", "tau_down", "delay") else from_data
 
 
 def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[Alternative, ...]:
@@ -222,12 +215,3 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
                 worse = float(t.model.held_out.sum() - mine.held_out.sum()) / mine.rows
                 found[t.candidate.effect] = Alternative(t.candidate.effect, mse_after + worse)
     return tuple(sorted(found.values(), key=lambda a: a.mse_after))
-
-
-def _sentence(effect: str, values: Mapping[str, float], benefit: Benefit) -> str:
-    """Sentence of one finding with `values` in contract units."""
-    body = EFFECTS[effect].told(values)
-    return (
-        f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "
-        f"{benefit.mse_before:.3g} to {benefit.mse_after:.3g} times the noise."
-    )

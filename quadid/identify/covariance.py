@@ -73,9 +73,13 @@ class Uncertainty:
         if not steps:
             return self
         farthest = np.max(np.abs(steps), axis=0)
-        grow = np.hypot(1.0, farthest / np.maximum(self.sigma, 1e-300))
+        return self.widened(farthest, farthest)
+
+    def widened(self, by: FloatArray, spread: FloatArray) -> Uncertainty:
+        """With standard deviations `by` added, and `spread` to what has to stay below its limit, both shape (P,)."""
+        grow = np.hypot(1.0, by / np.maximum(self.sigma, 1e-300))
         grown = grow if self.grown is None else grow * self.grown
-        spread = farthest if self.spread is None else np.hypot(self.spread, farthest)
+        spread = spread if self.spread is None else np.hypot(self.spread, spread)
         return replace(self, covariance=self.covariance * np.outer(grow, grow), grown=grown, spread=spread)
 
 

@@ -1,4 +1,7 @@
-"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance."""
+"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance.
+
+`fit_at` says what the data tell of the parameters where some other search ended.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,10 @@ from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, rewei
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
-from quadid.identify.priors import Prior, default_prior
+from quadid.identify.priors import Prior, default_prior, posterior_covariance
 from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion, with_moments
 from quadid.identify.reliability import reliability
+from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.model.layout import Layout
@@ -245,3 +249,33 @@ def _warnings(found: Fit) -> tuple[str, ...]:
             + "; quadid diagnose names the cause"
         )  # fmt: skip
     return tuple(out)
+
+
+def fit_at(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel, evaluations: int, how: str
+) -> Fit:
+    """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
+
+    Args:
+        windows: training data.
+        vehicle: as given.
+        theta: full parameter vector, shape (size,).
+        noise: sensor noise.
+        evaluations: parameter vectors that the search simulated.
+        how: sentence on how it ended.
+    """
+    shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)
+    free = shooting.free(NOMINAL_NAMES)
+    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
+    prior = default_prior(shooting, free)
+    unc = uncertainty(lin, prior)
+    parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
+    step = posterior_covariance(lin.information, prior) @ lin.gradient
+    warnings = []
+    far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
+    if far:
+        warnings.append(
+            f"the search ended ({how}), but over whole seconds the data would still move {', '.join(far)}; "
+            "optimizer pso_polish goes all the way"
+        )
+    return Fit(vehicle, theta, parameters, noise, unc, Convergence.BUDGET, evaluations, tuple(warnings))

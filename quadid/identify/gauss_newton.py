@@ -61,7 +61,7 @@ class Polished:
     @property
     def simulated(self) -> int:
         """Parameter vectors simulated for it: with one, each direction of the parameters and nine of initial states."""
-        return self.iterations * (self.lin.gram.shape[1] + 10)
+        return self.iterations * (len(self.lin.gradient) + 10)
 
 
 def robust_weights(shooting: Shooting, lin: Linearised) -> FloatArray:

@@ -19,10 +19,6 @@ from quadid.identify.process_noise import AXES, begun_covariance, rate_covarianc
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle_parts import Noise
 
-_Moments = tuple[float, float, float]
-_Numbers = tuple[tuple[float, ...], tuple[float, ...], float, tuple[tuple[int, ...], bytes] | None, _Moments | None]
-"""A noise model as a key: white, slow, slow time, the spectrum's shape and bytes, random moments."""
-
 SLOW_TIME = 0.66
 """Correlation time of the slow attitude error [s] until it is estimated (`quadid.identify.noise_memory`)."""
 ATTITUDE = (3, 4, 5)
@@ -35,9 +31,9 @@ TREND = (1, 2, 0, 1, 2)
 position."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Noise of every residual channel.
+    """Noise of every residual channel; the same only as itself, so that its whiteners are kept with it.
 
     Attributes:
         white: standard deviation of the white part, shape (channels,), channel's unit.
@@ -53,7 +49,7 @@ class NoiseModel:
     slow: FloatArray
     slow_time: float = SLOW_TIME
     shape: FloatArray | None = None
-    moments: _Moments | None = None
+    moments: tuple[float, float, float] | None = None
 
     @classmethod
     def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
@@ -75,27 +71,35 @@ class NoiseModel:
 
         Rows look back only (inverse of a Cholesky factor), so a whitened residual keeps its order in time.  Read-only.
         """
-        return _whitener(self._numbers, length, dt)
+        return _whitener(self, length, dt)
 
     def whitening(self, length: int, dt: float) -> Whitening:
         """What weights and whitens the channels of a segment; see `whitener`."""
-        return _whitening(self._numbers, length, dt)
+        return _whitening(self, length, dt)
 
     def whitened(self, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:
-        """Rows weighted and whitened; channels with masked samples in a segment stay unwhitened there.
+        """Rows weighted and whitened, channel by channel as `channel_whitened`.
 
         Args:
             rows: shape (segments, length, channels, columns).
             weights: 1 where measured, 0 elsewhere, shape (segments, length, channels).
             dt: time between samples [s].
         """
-        whitener = self.whitener(rows.shape[1], dt)
-        out = rows * (weights / self.deviation(rows.shape[1], dt))[..., None]
-        for c in np.flatnonzero(self.coloured):
-            full = np.all(weights[:, :, c] > 0.0, axis=1)
-            scaled = rows[full, :, c] * weights[full, :, c, None]
-            out[full, :, c] = np.matmul(whitener[c], scaled)
+        out = np.empty_like(rows)
+        for c in range(rows.shape[2]):
+            out[:, :, c] = self.channel_whitened(c, rows[:, :, c], weights[:, :, c], dt)
         return out
+
+    def channel_whitened(self, channel: int, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:
+        """Rows of one channel (segments, length, columns), weighted (segments, length) and whitened.
+
+        Segments with masked samples stay unwhitened.
+        """
+        out = rows * (weights / self.deviation(rows.shape[1], dt)[channel])[..., None]
+        if self.coloured[channel]:
+            full = np.all(weights > 0.0, axis=1)
+            out[full] = np.matmul(self.whitener(rows.shape[1], dt)[channel], rows[full] * weights[full, :, None])
+        return np.asarray(out)
 
     def deviation(self, length: int, dt: float) -> FloatArray:
         """Standard deviation of each channel in a segment, random moments included, shape (channels,)."""
@@ -103,11 +107,6 @@ class NoiseModel:
         if self.moments is not None:
             variance[list(AXES)] += np.mean(np.diag(begun_covariance(length, dt)))
         return np.asarray(np.sqrt(variance))
-
-    @property
-    def _numbers(self) -> _Numbers:
-        shape = None if self.shape is None else (self.shape.shape, self.shape.tobytes())
-        return tuple(self.white), tuple(self.slow), self.slow_time, shape, self.moments
 
     @property
     def coloured(self) -> BoolArray:
@@ -118,23 +117,15 @@ class NoiseModel:
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
 
 
-def _model_of(numbers: _Numbers) -> NoiseModel:
-    whites, slows, slow_time, shape, moments = numbers
-    shapes = None if shape is None else np.frombuffer(shape[1]).reshape(shape[0])
-    return NoiseModel(np.array(whites), np.array(slows), slow_time, shapes, moments)
+@lru_cache(maxsize=16)
+def _whitening(noise: NoiseModel, length: int, dt: float) -> Whitening:
+    """`NoiseModel.whitening`."""
+    return Whitening(noise.deviation(length, dt), noise.coloured, _whitener(noise, length, dt))
 
 
 @lru_cache(maxsize=16)
-def _whitening(numbers: _Numbers, length: int, dt: float) -> Whitening:
-    """`NoiseModel.whitening` of these numbers."""
-    noise = _model_of(numbers)
-    return Whitening(noise.deviation(length, dt), noise.coloured, _whitener(numbers, length, dt))
-
-
-@lru_cache(maxsize=16)
-def _whitener(numbers: _Numbers, length: int, dt: float) -> FloatArray:
-    """`NoiseModel.whitener` of these numbers, read-only; the same one is asked for again and again."""
-    noise = _model_of(numbers)
+def _whitener(noise: NoiseModel, length: int, dt: float) -> FloatArray:
+    """`NoiseModel.whitener`, read-only; the same one is asked for again and again."""
     out = np.zeros((len(noise.white), length, length))
     for c, (white, slow) in enumerate(zip(noise.white, noise.slow, strict=True)):
         if not noise.coloured[c]:

@@ -24,6 +24,8 @@ BAND = 1.5
 DRAWS = 4
 SMOOTH = 3
 LEAST_SEGMENTS = 20
+LEAST_LEFT = 0.3
+"""Share of its power that the elimination must leave a mode of noise for it to tell anything."""
 
 
 def mode_power(
@@ -87,7 +89,9 @@ def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: Init
     for c in range(channels):
         if 3 <= c < 6 or counts[c] < LEAST_SEGMENTS or not np.isfinite(found[c]).all():
             continue
-        level = _smooth_ratio(found[c], null[c])
+        level, modes = band_power(found[c], null[c], SMOOTH)
+        known = np.flatnonzero(modes > 0.0)
+        level = np.interp(np.arange(length), known, level[known])
         band = (frequency >= LOWEST) & (frequency < LOWEST + BAND)
         level = np.where(frequency < LOWEST, np.mean(level[band]), level)
         level = np.maximum(level, 1e-3 * np.max(level))
@@ -97,11 +101,16 @@ def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: Init
     return replace(noise, white=white, shape=shape)
 
 
-def _smooth_ratio(found: FloatArray, null: FloatArray) -> FloatArray:
-    kernel = np.ones(SMOOTH)
-    weight = np.where(null > 0.3, null, 0.0)
-    power = np.where(null > 0.3, found, 0.0)
-    total = np.convolve(weight, kernel, mode="same")
-    ratio = np.convolve(power, kernel, mode="same") / np.maximum(total, 1e-9)
-    known = total > 0.0
-    return np.asarray(np.interp(np.arange(len(found)), np.flatnonzero(known), ratio[known]))
+def band_power(found: FloatArray, null: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """Power over `width` modes around each relative to that of noise, and how many of them tell it.
+
+    Modes that the initial state takes away tell nothing.
+
+    Args:
+        found: power of each mode, shape (length,).
+        null: what noise leaves there, likewise.
+        width: odd number of modes.
+    """
+    kernel, usable = np.ones(width), null > LEAST_LEFT
+    power, noise, modes = (np.convolve(usable * a, kernel, mode="same") for a in (found, null, np.ones_like(null)))
+    return np.asarray(power / np.maximum(noise, 1e-9)), np.asarray(modes)

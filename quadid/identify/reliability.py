@@ -9,7 +9,7 @@ Controlled Clinical Trials 7 (1986) 177), and beyond `SPREAD_LIMIT` the number i
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,8 +66,7 @@ class Reliability:
 
     def widened(self, unc: Uncertainty) -> Uncertainty:
         """Intervals that hold what the estimates differ by."""
-        grow = np.sqrt(1.0 + (self.widening / np.maximum(unc.sigma, 1e-300)) ** 2)
-        return replace(unc, covariance=unc.covariance * np.outer(grow, grow), grown=grow, spread=self._counted(unc))
+        return unc.widened(self.widening, self._counted(unc))
 
     def _counted(self, unc: Uncertainty) -> FloatArray:
         """What has to stay below `SPREAD_LIMIT`, shape (P,)."""

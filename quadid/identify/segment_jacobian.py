@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
+from quadid.identify.noise_model import NoiseModel
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid.window import Window
 
@@ -24,9 +23,7 @@ class Columns:
         parameters: whitened directions of the free parameters, shape (segments, length * channels, P).
         base: residual predicted - measured in channel units, shape (segments, length, channels).
         weights: 1 where measured, 0 elsewhere, same shape.
-        sigma: standard deviation of each channel, shape (channels,).
-        coloured: channels to whiten, shape (channels,).
-        whitener: shape (channels, length, length).
+        noise: what whitens.
     """
 
     window: Window
@@ -37,9 +34,7 @@ class Columns:
     parameters: FloatArray
     base: FloatArray
     weights: FloatArray
-    sigma: FloatArray
-    coloured: BoolArray
-    whitener: FloatArray
+    noise: NoiseModel
 
     @property
     def projected(self) -> FloatArray:
@@ -49,9 +44,4 @@ class Columns:
 
     def whiten(self, rows: FloatArray, channel: int) -> FloatArray:
         """Weights and whitens changes of one channel, shape (segments, length, columns)."""
-        weight = self.weights[:, :, channel, None]
-        if not self.coloured[channel]:
-            return np.asarray(rows * weight / self.sigma[channel])
-        full = self.complete[:, channel, None, None]
-        scaled = rows * weight
-        return np.asarray(np.where(full, np.matmul(self.whitener[channel], scaled), scaled / self.sigma[channel]))
+        return self.noise.channel_whitened(channel, rows, self.weights[:, :, channel], self.window.dt)

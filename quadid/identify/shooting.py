@@ -264,7 +264,6 @@ class Shooting:
         """
         n_pre, k = self.start_of(theta, free)
         free = free if parameters else self.free([])
-        whitener = self.noise.whitener(self.length, self.dt)
         for i, x0 in enumerate(self.starts(n_pre, states).x0):
             out, steps = self.roll_directions(i, theta, free, x0.copy(), n_pre, k)
             weights = self.measured_weights(i)
@@ -281,7 +280,7 @@ class Shooting:
             yield Columns(
                 self.rollouts[i].window, self.segments[i].starts[:, None] + np.arange(self.length), basis,
                 white[..., -1], np.all(weights > 0.0, axis=1), flat[..., k:-1], base[..., 0], weights,
-                self.noise.deviation(self.length, self.dt), self.noise.coloured, whitener,
+                self.noise,
             )  # fmt: skip
 
 

@@ -37,13 +37,12 @@ def search(
     the parameters are where that search ended, not where the standard fit ends.  Parameters `out_of_reach` of the
     channels, with the reason, keep the file's value.
     """
-    from quadid.identify.fit import FitOptions, fit
+    from quadid.identify.fit import FitOptions, fit, fit_at
 
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
     from quadid.baselines.optimisers import minimise
     from quadid.identify.answer import final_answer
-    from quadid.identify.evaluate_at import fit_at
     from quadid.identify.shooting_objective import BoxProblem
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
