@@ -29,7 +29,7 @@ from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, resid
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.reliability import reliability
-from quadid.identify.residual_prediction import POOR, Prediction, learn_prediction
+from quadid.identify.residual_prediction import POOR, learn_prediction
 from quadid.identify.result import with_values
 from quadid.identify.shooting import Shooting
 from quadid.model.supply import with_reference_voltage
@@ -111,26 +111,18 @@ def diagnose(
     prediction = None
     if model.reduced_chi_square > POOR:
         report("prediction", 0.0)
-        prediction = _prediction(windows, physical, validation, warnings)
+        try:
+            prediction = learn_prediction(windows, physical, validation)
+        except NotIdentifiableError as error:
+            warnings.append(f"no residual terms could be learnt: {error}")
+    if prediction is not None:
+        warnings.append(prediction.sentence)
     result = Diagnosis(
         verdict, findings, outcome, left, parameters, physical.to_yaml(),
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
     )  # fmt: skip
     report("done", 1.0)
     return result, search
-
-
-def _prediction(
-    windows: Sequence[Window], physical: Vehicle, validation: Sequence[Window], warnings: list[str]
-) -> Prediction | None:
-    """Residual terms beside unchanged physics, where they predict better; says so in `warnings`."""
-    try:
-        out = learn_prediction(windows, physical, validation)
-    except NotIdentifiableError as error:
-        warnings.append(f"no residual terms could be learnt: {error}")
-        return None
-    warnings += [] if out is None else [out.sentence]
-    return out
 
 
 def _nominal_parameters(
