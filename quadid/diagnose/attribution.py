@@ -112,7 +112,7 @@ def worths(
         The errors without and with all causes, and the worth of each: what is larger than on any vehicle first, then by
         gain.
     """
-    models = {_NONE: nominal, _ALL: model} | without
+    models = {_NONE: nominal, _ALL: model, **without}
     left_out = {key: (m.held_out, m.rows) for key, m in models.items()}
     unseen = left_out
     if logs:
