@@ -15,7 +15,7 @@ _HOW: dict[str, dict[str, str]] = {
         "ulog": "set SDLOG_PROFILE to 17 (default + high rate), or list actuator_motors and esc_status in "
         "etc/logging/logger_topics.txt",
         "dataflash": "ArduCopter writes RCOU at 10 Hz: log rotor speeds of the ESCs (bidirectional DShot, ESC), "
-        "or record SERVO_OUTPUT_RAW at 50 Hz as telemetry (.tlog)",
+        "or record SERVO_OUTPUT_RAW at 80 Hz as telemetry (.tlog)",
         "tlog": "ask for SERVO_OUTPUT_RAW and ESC_STATUS at 50 Hz with SET_MESSAGE_INTERVAL, or use the on-board log",
         "mcap": "record rotor_speeds (sensor_msgs/JointState) or motor_command; PX4's bridge needs actuator_motors and "
         "esc_status added to dds_topics.yaml; mavros: rc/out and esc_status/status",

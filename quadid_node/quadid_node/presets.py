@@ -73,9 +73,14 @@ _TYPES = {
     },
 }
 _PREFIX = {"mavros": "mavros/"}
+_VERSIONED = {
+    f"fmu/out/{name}"
+    for name in ("vehicle_attitude", "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status")
+}
+"""Topics to which newer PX4 appends the version of their messages: `_v1` is listened to as well."""
 _HINTS = {
     "canonical": "publish rotor_speeds (sensor_msgs/JointState, rad/s) or motor_command (quadid_msgs/MotorCommand)",
-    "mavros": "mavros/rc/out carries the motor outputs: ask the autopilot for SERVO_OUTPUT_RAW at 50 Hz "
+    "mavros": "mavros/rc/out carries the motor outputs: ask the autopilot for SERVO_OUTPUT_RAW at 80 Hz "
     "(ros2 service call /mavros/set_message_interval, id 36), or for ESC telemetry",
     "px4": "the default bridge exports no motor signal: add actuator_motors (or esc_status) to the publications in "
     "dds_topics.yaml of the PX4 firmware and rebuild, or use quadid serve on MAVLink",
@@ -95,5 +100,6 @@ def source(name: str) -> Source:
     inputs = []
     for topic, kind in _TYPES[name].items():
         ranks = [(channel, names.index(topic)) for channel, names in PRESETS[name].items() if topic in names]
-        inputs.append(Input(_PREFIX.get(name, "") + topic, kind, tuple(ranks)))
+        for version in ("", "_v1") if topic in _VERSIONED else ("",):
+            inputs.append(Input(_PREFIX.get(name, "") + topic + version, kind, tuple(ranks)))
     return Source(tuple(inputs), _HINTS[name])

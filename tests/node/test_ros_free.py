@@ -89,6 +89,12 @@ def test_every_preset_topic_has_a_type_that_can_be_read_and_feeds_something(name
     assert preset.motor_hint
 
 
+def test_px4_is_heard_with_and_without_the_version_of_its_messages() -> None:
+    fed = {entry.topic: entry.channels for entry in source("px4").inputs}
+    for name in ("vehicle_attitude", "vehicle_local_position", "battery_status", "vehicle_attitude_setpoint"):
+        assert fed[f"fmu/out/{name}_v1"] == fed[f"fmu/out/{name}"]
+
+
 def test_an_unknown_preset_names_the_nearest() -> None:
     with pytest.raises(QuadidError, match="did you mean 'mavros'"):
         source("mavross")
