@@ -13,6 +13,8 @@ import yaml
 from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
 from quadid_node.node_parameters import PARAMETERS
 
+from tests.node.launch_stand_in import GroupAction, Node, launched
+
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = ROOT / "quadid_node" / "launch"
 
@@ -59,6 +61,37 @@ def test_a_truth_value_that_is_none_is_refused() -> None:
     assert truth("respawn", "True")
     with pytest.raises(ValueError, match="respawn:=yes: true or false"):
         truth("respawn", "yes")
+
+
+def test_the_launch_file_of_one_node_overrides_what_is_given_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = LAUNCH / "identify.launch.py"
+    (plain,) = launched(file, {}, monkeypatch)
+    assert isinstance(plain, Node)
+    _, overrides = plain.named["parameters"]
+    assert overrides == {}, "approval: manual of the configuration file stays"
+    assert (plain.named["package"], plain.named["executable"]) == ("quadid_node", "identify")
+    assert (plain.named["ros_arguments"], plain.named["respawn"]) == ([], False)
+    given = {"vehicle": "x.yaml", "approval": "manual", "observer": "true", "log_level": "debug", "respawn": "true"}
+    (told,) = launched(file, given, monkeypatch)
+    assert told.named["parameters"][1] == {"vehicle": "x.yaml", "approval": "manual", "observer": True}
+    assert (told.named["ros_arguments"], told.named["respawn"]) == (["--log-level", "debug"], True)
+
+
+def test_the_launch_file_of_a_fleet_gives_each_vehicle_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"namespaces": "quad1,quad2", "vehicle": "a.yaml,b.yaml", "approval": "manual"}
+    groups = launched(LAUNCH / "fleet.launch.py", given, monkeypatch)
+    told = []
+    for group in groups:
+        assert isinstance(group, GroupAction)
+        assert group.named["forwarding"] is False
+        (one,) = group.arguments[0]
+        told.append(dict(one.named["launch_arguments"]))
+    assert told == [
+        {"namespace": "quad1", "vehicle": "a.yaml", "approval": "manual"},
+        {"namespace": "quad2", "vehicle": "b.yaml", "approval": "manual"},
+    ]
+    with pytest.raises(AssertionError, match="required: namespaces"):
+        launched(LAUNCH / "fleet.launch.py", {}, monkeypatch)
 
 
 @pytest.mark.ros
