@@ -51,10 +51,10 @@ def judge(windows: Sequence[Window], vehicle: Vehicle, thrust: ThrustModel, know
     """
     # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
     for window in windows:
-        grounded = _unloaded(_weight_share(window, vehicle, thrust), window.dt, known)
-        if grounded:
-            return Quality(grounded=grounded)
-        fault = _broken(window) or _units(window)
+        lift = _lift(_weight_share(window, vehicle, thrust), window.dt, known)
+        if lift != Quality():
+            return lift
+        fault = _broken(window) or wrong_unit(window)
         if fault:
             return Quality(fault=fault)
     return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, thrust))), ""))
@@ -79,8 +79,8 @@ def _longest_repeat(rows: FloatArray) -> int:
     return int(np.max(end - first, initial=0))
 
 
-def _units(window: Window) -> str:
-    """Names a wrong unit or frame that would otherwise be fitted into the parameters."""
+def wrong_unit(window: Window) -> str:
+    """Names a wrong unit or frame that would otherwise be fitted into the parameters; empty where there is none."""
     recording, spans = _as_recording(window), ((window.t0, window.t0 + window.dt * len(window)),)
     for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
         if check.verdict is Verdict.ERROR:
@@ -105,19 +105,19 @@ def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> Floa
     return np.asarray(thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY))
 
 
-def _unloaded(share: FloatArray, dt: float, known: bool) -> str:
-    """Says that the rotors do not carry the vehicle; judged second by second, back from the end."""
+def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
+    """Whether the rotors carry the vehicle; judged second by second, back from the end."""
     low, high = THRUST_KNOWN if known else THRUST_GUESSED
     second = max(round(1.0 / dt), 1)
     first = len(share) % second or second
     means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
     if not min(means) > low:
-        return f"rotors carry {min(means):.0%} of the weight: on the ground"
+        return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground")
     if not max(means) < high and low < float(np.mean(means)) / RPM_SQUARED < high:
-        return "rotor speeds look like rpm, wanted rad/s"
+        return Quality(fault="rotor speeds look like rpm, wanted rad/s")
     if not max(means) < high:
-        return f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying"
-    return ""
+        return Quality(grounded=f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying")
+    return Quality()
 
 
 def _not_flying(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> str:

@@ -229,7 +229,10 @@ class Session:
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
         self._consistency.add(self._store.span(tick - self._tick - _EPS, tick - _EPS))
-        if not self._supervisor.sensors_agree(tick):
+        if self._consistency.fault:
+            yield
+            # A unit or a frame that is wrong has a name; which two channels it sets apart is less of a help.
+            self._supervisor.distrust(tick, self._windows.wrong_unit(tick) or self._consistency.fault)
             self._change_supervisor.restart()
             return
         yield

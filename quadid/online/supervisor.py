@@ -43,15 +43,12 @@ class Supervisor:
         """The stream begins anew at `t` [s]."""
         self.learn_from, self._disagrees_since = max(self.learn_from, t), None
 
-    def sensors_agree(self, t: float) -> bool:
-        """Whether the sensors agree at `t` [s]; while they do not, nothing is learned, and what was is forgotten."""
-        why = self._consistency.fault
-        if why:
-            if self._estimator.learned:
-                self.relearn(t, "sensors disagree")
-            self.interrupted(t)
-            self._outbox.note(t, Phase.BLOCKED, why)
-        return not why
+    def distrust(self, t: float, why: str) -> None:
+        """The sensors disagree at `t` [s]: nothing is learned until they do not, and what was learned is forgotten."""
+        if self._estimator.learned:
+            self.relearn(t, "sensors disagree")
+        self.interrupted(t)
+        self._outbox.note(t, Phase.BLOCKED, why)
 
     def relearn(self, start: float, why: str) -> None:
         """Forgets what was learned; learns from `start` [s] on."""

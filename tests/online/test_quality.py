@@ -97,7 +97,7 @@ def test_a_saturated_gyro_is_named(happened: Happened) -> None:
 
 def test_rotor_speeds_in_rpm_are_named() -> None:
     window = flight(30.0, 3).window.slice(0, 500)
-    assert "rpm" in verdict(changed(window, "rotor_speed", window.rotor_speed * 30.0 / np.pi)).grounded
+    assert "rpm" in verdict(changed(window, "rotor_speed", window.rotor_speed * 30.0 / np.pi)).fault
 
 
 @pytest.mark.parametrize(
