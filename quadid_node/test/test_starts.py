@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,8 @@ def test_it_starts_offers_its_topics_and_ends(tmp_path: Path, monkeypatch: pytes
     listener = rclpy.create_node("listener", context=context)
     with (tmp_path / "said.txt").open("w") as said, subprocess.Popen(command, stdout=said, stderr=said) as node:
         try:
-            deadline, offered = time.monotonic() + SECONDS, {}
+            offered: dict[str, Any] = {}
+            deadline = time.monotonic() + SECONDS
             while set(offered) < set(LATCHED) and node.poll() is None and time.monotonic() < deadline:
                 time.sleep(0.2)
                 offers = {topic: listener.get_publishers_info_by_topic(topic) for topic in LATCHED}
