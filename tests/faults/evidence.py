@@ -63,13 +63,14 @@ class Collector:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Takes a test's sentences once it has passed; with xdist this runs where the reports come together."""
+        test = _alone(report.nodeid)
         if report.failed:
-            self.failed.append(report.nodeid)
+            self.failed.append(test)
         elif report.skipped:
-            self.skipped.append(report.nodeid)
+            self.skipped.append(test)
         elif report.when == "call":
             self.evidence += [
-                Evidence(value[0], value[1], report.nodeid, f"{datetime.now(UTC):%Y-%m-%d}")
+                Evidence(value[0], value[1], test, f"{datetime.now(UTC):%Y-%m-%d}")
                 for key, value in report.user_properties
                 if key == _KEY and isinstance(value, (list, tuple))
             ]
@@ -79,9 +80,8 @@ class Collector:
         if not self.writes:
             return
         account = self.page.with_suffix(".json")
-        known = (
-            [Evidence(*entry) for entry in json.loads(account.read_text(encoding="utf-8"))] if account.exists() else []
-        )
+        kept = json.loads(account.read_text(encoding="utf-8")) if account.exists() else []
+        known = [Evidence(row, text, _alone(test), *day) for row, text, test, *day in kept]
         ran = {e.test for e in self.evidence} | set(self.failed)
         told = sorted(
             [*(e for e in known if e.test not in ran and _stands(e.test)), *self.evidence],
@@ -91,6 +91,12 @@ class Collector:
         account.write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         text = page(told, self.failed, self.skipped, self.command) + judged(self.page)
         self.page.write_text(text, encoding="utf-8")
+
+
+def _alone(test: str) -> str:
+    """The name of a test without the group that xdist ran it in."""
+    name, at, group = test.rpartition("@")
+    return name if at and not group.endswith("]") else test
 
 
 def _stands(test: str) -> bool:

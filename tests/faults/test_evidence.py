@@ -34,6 +34,8 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     (tmp_path / "test_x.py").write_text(TESTS)
     (tmp_path / "conftest.py").write_text(CONFTEST)
     known = [[4, "renamed since", "test_x.py::test_before[1]"], [5, "not run now", "test_x.py::test_silent[1]"]]
+    known += [[6, "in a group", "test_x.py::test_silent@test_x.py"], [6, "an @", "test_x.py::test_silent[a@b]"]]
+    known += [[1, "of an earlier run", "test_x.py::test_green@test_x.py", "2026-01-01"]]
     (tmp_path / "page.json").write_text(json.dumps(known))
     command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-c", str(tmp_path / "none.ini"), str(tmp_path)]
     (tmp_path / "none.ini").write_text("[pytest]\n" + f"pythonpath = {repository}\n")
@@ -45,7 +47,11 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     assert "never seen" not in text
     assert "renamed since" not in text
     assert "not run now" in text
-    assert f"2 of {len(FAULTS)} rows have evidence" in text
+    assert "of an earlier run" not in (tmp_path / "page.json").read_text()
+    assert {t for _, _, t, _ in json.loads((tmp_path / "page.json").read_text())} == {
+        f"test_x.py::test_{name}" for name in ("green", "silent", "silent[1]", "silent[a@b]")
+    }
+    assert f"3 of {len(FAULTS)} rows have evidence, from 4 tests" in text
     assert "Failed: `test_x.py::test_red`" in text
     assert "Skipped: `test_x.py::test_absent`" in text
 

@@ -56,4 +56,5 @@ def test_a_key_is_in_nothing_that_a_service_sends_says_or_writes(tmp_path: Path,
     found = [form for form in forms(SECRET) for place in (sent, said, written) if form in place]
     assert found == []
     assert any(form in key.read_bytes() for form in forms(SECRET)), "the forms are those of the key"
-    happened(14, f"the key is in none of {len(sent)} bytes sent, {len(said)} said and {len(written)} written")
+    count = f"{len(sent)} bytes sent, {len(said)} said and {len(written)} written"
+    happened(14, f"a service asked for all it has by a vehicle that has the key: the key is in none of {count}")

@@ -35,7 +35,8 @@ def test_two_senders_are_two_though_one_speaks_seldom(often: int, lost: float, h
     number = number[rng.random(len(number)) >= lost] % 256
     seen = windows(number)
     assert np.mean(seen) > 0.85
-    happened(27, f"two senders, {often} frames to one, {lost:.0%} lost: seen in {np.mean(seen):.0%} of {FRAMES} frames")
+    found = f"seen in {np.mean(seen):.0%} of the stretches of {FRAMES} frames"
+    happened(27, f"two senders merged into one stream, {often} to 1, {lost:.0%} of the frames lost: {found}")
 
 
 def test_two_numbers_or_none_are_no_rows() -> None:
