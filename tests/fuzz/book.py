@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from studies.judged import judged
 from tests.fuzz.formats import FORMATS
 
 GOAL = 1_000_000
@@ -37,10 +38,11 @@ def note(runs: list[Run], run: Run) -> None:
 
 
 def save(path: Path, book: Mapping[str, Sequence[Run]]) -> None:
-    """Writes the account, and beside it the page that shows it."""
+    """Writes the account, and beside it the page that shows it, with what people wrote at its end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(book, indent=1) + "\n", encoding="utf-8")
-    path.with_suffix(".md").write_text(page(book), encoding="utf-8")
+    shown = path.with_suffix(".md")
+    shown.write_text(page(book) + judged(shown), encoding="utf-8")
 
 
 def page(book: Mapping[str, Sequence[Run]]) -> str:

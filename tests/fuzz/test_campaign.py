@@ -117,6 +117,9 @@ def test_the_account_goes_on_where_it_stopped(tmp_path: Path) -> None:
         runs = account.setdefault("mcap", [])
         assert book.next_input(runs) == start
         book.note(runs, {**entry, "start": start, "stop": start + 10, "date": f"2026-01-0{1 + start // 20}"})
+    path.with_suffix(".md").write_text("old\n\n## Judged by hand\n\n* run again\n", encoding="utf-8")
     book.save(path, account)
     assert [run["stop"] for run in book.load(path)["mcap"]] == [20, 30]
-    assert "| mcap | 30 |" in path.with_suffix(".md").read_text(encoding="utf-8")
+    page = path.with_suffix(".md").read_text(encoding="utf-8")
+    assert "| mcap | 30 |" in page
+    assert page.endswith("\n## Judged by hand\n\n* run again\n")
