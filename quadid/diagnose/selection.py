@@ -82,21 +82,17 @@ def select(
     seen = {_key(stage.shooting, stage.model)}
     while len(rounds) < MOST_ROUNDS:
         report("search", len(rounds) / (len(rounds) + 2.0))
-        rounds.append(_round(stage.shooting, stage.model, listed, seen))
-        if rounds[-1].accepted is None:
-            # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
-            far = None if stage.model.causes else stage.longest()
-            airborne = [] if far is None else [c for c in listed if far.shooting.finds_velocity(c.names)]
-            if far is None or not airborne:
-                break
-            rounds.append(_round(far.shooting, far.model, airborne, seen))
-            if rounds[-1].accepted is None:
-                break
-            stage = far
-        accepted = rounds[-1].accepted
-        assert accepted is not None
-        seen.add(_key(stage.shooting, accepted.model))
-        stage = replace(stage, model=accepted.model).continued()
+        where = stage
+        rounds.append(_round(where, listed, seen))
+        # Each short segment finds a velocity of its own, which makes up for most of what a small drag does.
+        far = None if rounds[-1].accepted or stage.model.causes else stage.longest()
+        if far and (airborne := [c for c in listed if far.shooting.finds_velocity(c.names)]):
+            where = far
+            rounds.append(_round(where, airborne, seen))
+        if (accepted := rounds[-1].accepted) is None:
+            break
+        seen.add(_key(where.shooting, accepted.model))
+        stage = replace(where, model=accepted.model).continued()
         seen.add(_key(stage.shooting, stage.model))
     nominal = fit_model(stage.shooting, theta, ()) if stage.model.causes else stage.model
     return Search(stage.shooting, nominal, stage.model, tuple(rounds), len(listed))
@@ -115,11 +111,9 @@ def from_everything(shooting: Shooting, theta: FloatArray, listed: Sequence[Cand
     """
     allowed = set(flexible_names(shooting.layout, shooting))
     kept = tuple(c for c in listed if c.timed is None and not c.split and set(c.names) <= allowed)
-    model, before = fit_model(shooting, _only(shooting, theta, kept), kept, iterations=8), -1
-    while len(model.causes) != before:
-        before, kept = len(model.causes), missed(model, worth_a_refit(len(listed), model.rows))
-        if len(kept) < before:
-            model = fit_model(shooting, _only(shooting, model.theta, kept), kept, model.states, iterations=8)
+    model = fit_model(shooting, _only(shooting, theta, kept), kept, iterations=8)
+    while (kept := missed(model, worth_a_refit(len(listed), model.rows))) != model.causes:
+        model = fit_model(shooting, _only(shooting, model.theta, kept), kept, model.states, iterations=8)
     return replace(model, tried={c.label: float(len(listed)) for c in kept})
 
 
@@ -133,18 +127,14 @@ def _only(shooting: Shooting, theta: FloatArray, causes: Sequence[Candidate]) ->
 
 def pruned(shooting: Shooting, model: Model) -> Model:
     """`model` without the causes that make it no better."""
-    while True:
-        trials = [Trial(None, c, without(shooting, model, c)) for c in _removable(model)]
-        best = _best(model, trials)
-        if best is None:
-            return model
+    while best := _best(model, [Trial(None, c, without(shooting, model, c)) for c in _removable(model)]):
         model = best.model
+    return model
 
 
-def _round(
-    shooting: Shooting, model: Model, listed: Sequence[Candidate], seen: Collection[tuple[int, frozenset[str]]]
-) -> Round:
+def _round(stage: Stage, listed: Sequence[Candidate], seen: Collection[tuple[int, frozenset[str]]]) -> Round:
     """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
+    shooting, model = stage.shooting, stage.model
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
     trials: list[Trial] = []
