@@ -19,7 +19,6 @@ import numba
 import numpy as np
 
 from quadid.errors import ParameterError, nearest
-from quadid.rotation import write_rotation
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -33,6 +32,14 @@ def _kernel(function: F) -> F:
         return cast(F, numba.njit(cache=True, **options)(function))
     except RuntimeError:
         return cast(F, numba.njit(**options)(function))
+
+
+@numba.njit(cache=True, inline="always")
+def write_rotation(w: float, x: float, y: float, z: float, out: FloatArray) -> None:
+    """Writes the rotation matrix of a unit quaternion into `out`, shape (3, 3)."""
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    out[1, 0], out[1, 1], out[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    out[2, 0], out[2, 1], out[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
 GAIN_UNITS: dict[str, str] = {

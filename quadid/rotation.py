@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from quadid.types import FloatArray
-
-
-@nb.njit(cache=True, inline="always")
-def write_rotation(w: float, x: float, y: float, z: float, out: FloatArray) -> None:
-    """Writes the rotation matrix of a unit quaternion into `out`, shape (3, 3)."""
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
-    out[1, 0], out[1, 1], out[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
-    out[2, 0], out[2, 1], out[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
 def continuous_sign(q: FloatArray) -> FloatArray:

@@ -28,9 +28,8 @@ from quadid.model.rows import (
 from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
 
 # isort: on
-from quadid.attitude_controller import rotation_of, steer
+from quadid.attitude_controller import rotation_of, steer, write_rotation
 from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, jit
-from quadid.rotation import write_rotation
 
 OUTPUTS = 10
 """Rates 3, quaternion 4, mean specific force 3, as the sensors would read them."""
