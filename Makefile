@@ -131,9 +131,10 @@ bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (h
 
 # --- check
 
+# Three workers for two cores: tests of the service wait for processes and clocks.
 .PHONY: test test-browser test-slow lint typecheck format
 test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and the browser's
-	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser and not slow"
+	$(BIN)/pytest -n 3 --dist loadgroup -m "not browser and not slow"
 
 test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
 	$(BIN)/pytest -m browser tests/browser

@@ -40,12 +40,12 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One process runs a file from beginning to end: what its tests share is flown, fitted or compiled once.
 
-    All files of `tests/node` are one group: they measure time, and two at once would disturb each other.
+    Files that start ROS nodes are one group, because a process has one DDS domain, and nodes find each other by clocks.
     """
     for item in items:
         place = item.path.relative_to(REPOSITORY)
-        node = place.is_relative_to("tests/node")
-        item.add_marker(pytest.mark.xdist_group("node" if node else str(place)))
+        nodes = place.stem.startswith("test_ros")
+        item.add_marker(pytest.mark.xdist_group("ros" if nodes else str(place)))
 
 
 def in_ci() -> bool:

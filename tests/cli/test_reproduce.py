@@ -14,7 +14,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.report.paper_tables import PAPER_GAIN, PAPER_MSE
 from quadid.workflow.reproduction import Plan, reproduce
 
-pytestmark = [pytest.mark.xdist_group("reproduce"), pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from quadid.diagnose import Diagnosis
 from quadid.flight import OUTSIDE
 from quadid.parameters import NOMINAL_NAMES
 from tests.diagnose.hidden import SECONDS, answer, confident, number, of_class, require_named, require_nothing, single
@@ -44,11 +45,16 @@ def test_every_other_effect_too(name: str) -> None:
     found_and_measured(name, 120.0)
 
 
-def test_both_effects_of_a_pair_are_named() -> None:
+@pytest.fixture(scope="module")
+def pair() -> Diagnosis:
+    """Of a flight with motor lag and rotor drag."""
+    return answer(of_class("pair", 0))[0]
+
+
+def test_both_effects_of_a_pair_are_named(pair: Diagnosis) -> None:
     case = of_class("pair", 0)
     assert set(case.expected) == {"motor_lag", "rotor_drag"}
-    found, _ = answer(case)
-    require_named(case, found)
+    require_named(case, pair)
 
 
 def test_two_effects_that_look_most_like_a_third_are_both_named() -> None:
@@ -109,12 +115,10 @@ def test_amid_clutter_the_large_effect_comes_first_and_no_absent_one_is_named(nu
     assert set(confident(found)) <= set(case.hidden)
 
 
-def test_findings_are_ordered_by_their_gain_and_say_what_they_are() -> None:
-    case = of_class("pair", 0)
-    found, _ = answer(case)
-    gains = [f.gain.mse_before - f.gain.mse_after for f in found.findings]
+def test_findings_are_ordered_by_their_gain_and_say_what_they_are(pair: Diagnosis) -> None:
+    gains = [f.gain.mse_before - f.gain.mse_after for f in pair.findings]
     assert gains == sorted(gains, reverse=True)
-    for f in found.findings:
+    for f in pair.findings:
         assert f.gain.ci95[0] < f.gain.mse_before - f.gain.mse_after < f.gain.ci95[1]
         assert f.p_value < 0.05
         assert all(p.ci95[0] <= p.value <= p.ci95[1] for p in f.parameters)

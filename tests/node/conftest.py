@@ -1,4 +1,4 @@
-"""Tests of the service: processes, files, links and topics are real; they run one after the other in one worker."""
+"""Tests of the service: processes, files, links and topics are real; those that start ROS nodes share a worker."""
 
 from __future__ import annotations
 

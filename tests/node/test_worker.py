@@ -22,7 +22,7 @@ PELICAN = Vehicle.shipped("pelican")
 QUICK = SessionSettings(window=5.0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def requests() -> list[FitRequest]:
     """Two fit requests of a real session."""
     session, out = Session(PELICAN, QUICK), []

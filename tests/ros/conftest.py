@@ -1,4 +1,4 @@
-"""ROS tests: wheels and messages present, a DDS domain of their own, one worker after the other."""
+"""ROS tests: wheels and messages present, a DDS domain of their own."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ HERE = Path(__file__).resolve().parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark every test of this folder and keep them in one xdist worker: timing tests disturb each other."""
+    """Marks every test of this folder."""
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.ros)
-            item.add_marker(pytest.mark.xdist_group("ros"))
 
 
 @pytest.fixture(scope="session", autouse=True)
