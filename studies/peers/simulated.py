@@ -140,7 +140,7 @@ def section(records: Sequence[Record]) -> list[str]:
     """The part of the page."""
     return [
         "## mujoco.sysid and output error on simulated flights", "",
-        f"`python -m studies.peers simulated`: {SECONDS:g} s of a simulated Pelican at 50 Hz, seeds from 1, the guess off "
+        f"`python -m studies.peers simulated`: {SECONDS:g} s of a simulated Pelican at 50 Hz, the guess off "
         "by up to 35 %; rate errors on unseen flights, relative to no change. `mujoco.sysid` (MJCF, chunks of 1 s from "
         "the measured state) and output error (`nlgreyest`'s method on scipy) receive the true sensor noise; quadid "
         "estimates it. The six parameters of a flight count as independent.",

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,79 +22,31 @@ from quadid.online import SessionSettings, SetState
 from quadid.online.records import Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
+from tests.node.killed_services import Services
 from tests.online.test_gate import TRUE, online_set
 
 ROOT = Path(__file__).resolve().parents[2]
 PELICAN = Vehicle.shipped("pelican")
 SETTINGS = SessionSettings(window=5.0, diagnose=0.0)
-SERVICE = """
-import os, signal, sys, time
-from pathlib import Path
-from quadid.online import SessionSettings
-from quadid.online.records import Publish
-from quadid.vehicle import Vehicle
-from quadid_node import history_writer
-from quadid_node.service import Service
-from quadid_node.store import Store
-from quadid_node.worker import InlineWorker
-from tests.online.test_gate import TRUE, online_set
-
-path, die, after = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-store = Store(path, "pelican")
-service = Service(Vehicle.shipped("pelican"), SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
-commit, commits = history_writer.HistoryWriter._commit, [0]
-
-def dying(self, batch):
-    commits[0] += 1
-    if die == "before" and commits[0] == after:
-        os.kill(os.getpid(), signal.SIGKILL)
-    out = commit(self, batch)
-    if die == "between" and commits[0] == after:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return out
-
-history_writer.HistoryWriter._commit = dying
-published = 0
-print("going", flush=True)
-for k in range(10**6):
-    service.session._outbox.act(*service.session.active_set.accept(online_set(TRUE), "auto", float(k), float(k)))
-    time.sleep(0.003)
-    for output in service.step():
-        if isinstance(output, Publish) and output.topic == "parameters":
-            print(output.item.sequence, flush=True)
-            published += 1
-            if die == "wire" and published == after:
-                os.kill(os.getpid(), signal.SIGKILL)
-"""
 
 
 def numbers_of(path: Path) -> list[int]:
     return [s["sequence"] for s in read_history(path, "pelican")["sets"]]
 
 
-def killed(path: Path, die: str, after: int) -> list[int]:
-    """Runs a service that accepts set after set and is killed with -9; returns the numbers that it published."""
-    command = [sys.executable, "-c", SERVICE, str(path), die, str(after)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "going\n"
-        if die == "outside":
-            published = [int(child.stdout.readline()) for _ in range(after)]
-            child.send_signal(signal.SIGKILL)
-        else:
-            published = []
-        published += [int(line) for line in child.stdout if line.endswith("\n")]
-        assert child.wait() == -signal.SIGKILL
-    return published
+@pytest.fixture(scope="module")
+def services() -> Iterator[Services]:
+    with Services() as made:
+        yield made
 
 
 @pytest.mark.parametrize("die", ["before", "between", "wire", "outside"])
 def test_a_set_that_was_published_has_its_row_and_its_number_is_never_given_again(
-    tmp_path: Path, die: str, happened: Happened
+    services: Services, tmp_path: Path, die: str, happened: Happened
 ) -> None:
     path, given, kills = tmp_path / "h.sqlite", list[int](), 3
     for k in range(kills):
-        published = killed(path, die, 2 + 3 * k)
+        published = services.killed(path, die, 2 + 3 * k)
         rows = numbers_of(path) if path.is_file() else []
         assert set(published) <= set(rows), "on the wire, and not on the disk"
         assert not set(published) & set(given), "a number twice"
