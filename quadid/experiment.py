@@ -182,7 +182,7 @@ def propose(simulator: Simulator, known: FloatArray, limits: Limits, seconds: fl
     if not candidates:
         raise NotIdentifiableError(
             "no movement stays within the limits", "a tilt of 5 degrees or more, a rate of 30 deg/s or more",
-            "give wider --tilt and --rate-limit",
+            "use wider --tilt and --rate-limit",
         )  # fmt: skip
     blocks = max(round(seconds / (BLOCK + PAUSE)), 1)
     chosen = d_optimal(np.array([m.information for m in candidates]), known, blocks)

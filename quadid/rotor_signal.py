@@ -98,7 +98,7 @@ def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | Non
         return f"are not what '{vehicle.name}' describes; its pulse widths ({command.source}) used"
     period = sample_period(speed.t)
     if period > 2.0 * sample_period(command.t) or period > 1.0 / SLOWEST_RATE:
-        return f"come too slowly; motor commands ({command.source}) used"
+        return f"are too slow; motor commands ({command.source}) used"
     return ""
 
 

@@ -94,7 +94,7 @@ class Vehicle(Strict):
                 raise ValueError(f"unknown parameter '{key}'; {nearest(str(key), NOMINAL_NAMES)}")
         missing = [name for name in NOMINAL_NAMES if name not in value]
         if missing:
-            raise ValueError(f"parameters lack {', '.join(missing)}; give an initial guess for each")
+            raise ValueError(f"parameters lack {', '.join(missing)}; add an initial guess for each")
         return {k: v if isinstance(v, dict | ParameterPrior) else {"initial": v} for k, v in value.items()}
 
     @field_validator("effects", mode="before")
@@ -126,7 +126,7 @@ class Vehicle(Strict):
             return value
         arm = dict(zip("xyz", place, strict=True))
         if effects.get("imu_lever_arm", arm) != arm:
-            raise ValueError("mounting.position and effects.imu_lever_arm differ; give one of them")
+            raise ValueError("mounting.position and effects.imu_lever_arm differ; keep one of them")
         return {**value, "effects": {**effects, "imu_lever_arm": arm}}
 
     @model_validator(mode="after")
@@ -147,11 +147,11 @@ class Vehicle(Strict):
             low, high = self.parameters["b"].limits
             if not low < self.stand_thrust[0] < high:
                 raise ValueError(
-                    f"thrust_stand gives b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
+                    f"thrust_stand yields b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
                     "check rad/s and N, one rotor a reading"
                 )
         if isinstance(self.mixer, str) and self.mixer not in MIXERS:
-            raise ValueError(f"no mixer '{self.mixer}'; {nearest(self.mixer, MIXERS)}, or give its matrix")
+            raise ValueError(f"no mixer '{self.mixer}'; {nearest(self.mixer, MIXERS)}, or write its matrix")
         if self.mixer is not None and self.mixing.shape[0] != len(self.rotors):
             raise ValueError(f"mixer with {self.mixing.shape[0]} rows for {len(self.rotors)} rotors; one row a rotor")
         arms = np.array([r.position for r in self.rotors])[:, :2]
@@ -161,7 +161,7 @@ class Vehicle(Strict):
                 "all rotors lie on one line: roll and pitch cannot both be controlled; check positions [m]"
             )
         if len({r.spin for r in self.rotors}) == 1:
-            raise ValueError("all rotors spin the same way: yaw cannot be balanced; give both +1 and -1")
+            raise ValueError("all rotors spin the same way: yaw cannot be balanced; use both +1 and -1")
         return self
 
     @property

@@ -38,7 +38,7 @@ def impossible_size(mass: float, arm: float) -> str:
         if _fits(*scaled):
             value, si = (scaled[0], "kg") if what == "mass" else (scaled[1], "m")
             return f"{found}: {where} in {unit}? {value:.4g} {si} would fit"
-    return f"{found}: no such vehicle flies; give mass in kg and positions in m"
+    return f"{found}: such a vehicle cannot fly; write mass in kg and positions in m"
 
 
 def _fits(mass: float, arm: float) -> bool:

@@ -16,7 +16,8 @@ def put_section(path: Path, title: str, name: str, text: str) -> None:
         name: of the part; kept in a comment that a reader of the page does not see.
         text: Markdown of the part.
     """
-    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    mark = name.replace(" ", "-")
+    begin, end = f"<!--{mark}-->", f"<!--/{mark}-->"
     block = f"{begin}\n{text}\n\nMeasured {datetime.now(UTC):%Y-%m-%d}.\n{end}"
     page = path.read_text(encoding="utf-8") if path.exists() else f"# {title}\n"
     pattern = re.compile(re.escape(begin) + r".*?" + re.escape(end), re.DOTALL)

@@ -18,12 +18,12 @@ def at_peak(results: Result, gains: list[float]) -> str:
         return NOTHING
     share = results["kernel"]["share_of_peak"]
     most = [f"{gain / share:.0f}" for gain in (min(gains), max(gains))]
-    return f"{' to '.join(dict.fromkeys(most))} times (arithmetic peak)"
+    return f"{' to '.join(dict.fromkeys(most))} times"
 
 
 def busy(times: Result, cores: int) -> str:
     """Its own processor time spread over all cores."""
-    return f"{times['processor'] / cores:.2g} s ({cores} cores busy)"
+    return f"{times['processor'] / cores:.2g} s"
 
 
 def started(results: Result, megabytes: float = 0.0) -> str:
@@ -32,7 +32,7 @@ def started(results: Result, megabytes: float = 0.0) -> str:
     if found is None:
         return NOTHING
     log = 1e6 * megabytes / found["disk_read"]
-    return f"{found['python_start']:.2f} s (start of Python)" + (f" + {log:.2g} s (disk)" if megabytes else "")
+    return f"{found['python_start']:.2f} s" + (f" + {log:.2g} s (disk)" if megabytes else "")
 
 
 def held(results: Result, rows: float) -> str:

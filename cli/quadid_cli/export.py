@@ -52,7 +52,7 @@ def export(
         listed(json)
         return
     if vehicle is None:
-        raise typer.BadParameter("whose parameters? give --vehicle, or --list", param_hint="--vehicle")
+        raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
     described, source = load_vehicle(vehicle), Path(vehicle).name
     if history is not None:
         described, source = _accepted(described, history, name or described.name)

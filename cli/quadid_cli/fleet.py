@@ -43,7 +43,7 @@ def fleet(
         bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
     ] = False,
     again: Annotated[
-        bool, typer.Option("--again", help="Identify all logs anew, also those that an earlier run has done.")
+        bool, typer.Option("--again", help="Identify all logs again, including those already done.")
     ] = False,
     rate: Rate = GRID,
     seed: Seed = 1,

@@ -197,7 +197,7 @@ def _next_of(ended: SimpleQueue[Any], client: Any) -> Any:
 def _no_worker(how: str) -> ClusterError:
     return ClusterError(
         f"no worker can start: {how}", "at least one worker with memory for one log",
-        "give more memory with --memory, or fewer --workers; what is done is kept",
+        "use more --memory, or fewer --workers; finished logs are kept",
     )  # fmt: skip
 
 

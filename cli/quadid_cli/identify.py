@@ -68,7 +68,7 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
 
     path = folder / f"{file_name(vehicle.name)}.fitted.yaml"
     if path.exists() and Path(given).exists() and path.samefile(given):
-        raise OutputError(f"the result would overwrite {given}", "another folder", "give --out, or rename the vehicle")
+        raise OutputError(f"the result would overwrite {given}", "another folder", "use --out, or rename the vehicle")
     return path
 
 
@@ -85,5 +85,5 @@ def conclude(done: Identified, target: Path, report: Path | None, series: Sequen
         done.result["series"] = [str(path) for path in done.save_series(target.parent, series)]
     output.write_json(done.result, json)
     console = terminal.console(quiet=json == "-")
-    console.print(f"{done.vehicle.name}: {known(done.vehicle)}, by its file. Every value rests on these.")
+    console.print(f"{done.vehicle.name}: {known(done.vehicle)}, from its file. All values depend on these.")
     tables.print_outcome(console, done)

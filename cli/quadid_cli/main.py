@@ -26,7 +26,7 @@ COMMANDS: dict[str, str] = {
     "identify": "Identify the parameters of a vehicle from its flight logs.",
     "score": "Open-loop prediction error of a vehicle file on logs.",
     "compare": "All optimisers and subspace methods on the same data.",
-    "diagnose": "What the simulation gets wrong, why, and what mending it gains.",
+    "diagnose": "What the simulation gets wrong, why, and the gain of correcting it.",
     "health": "What changed in the vehicle since the baseline flights.",
     "excite": "Which manoeuvre to fly next, and what it would gain.",
     "reproduce": "The paper's tables and figures.",

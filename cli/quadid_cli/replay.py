@@ -52,8 +52,8 @@ def replay(
         bool,
         typer.Option(
             "--as-recorded",
-            help="LOG was recorded by the node (record:=F.mcap): its settings, its start, its order of arrival; "
-            "gives the numbers of that run bit for bit.",
+            help="LOG was recorded by the node (record:=F.mcap): use its settings, start and order; repeats that "
+            "run bit for bit.",
         ),
     ] = False,
     candidates: Annotated[

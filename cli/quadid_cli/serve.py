@@ -132,7 +132,9 @@ class _Console:
         if traffic.refused:
             rates += f" | {traffic.refused} frames refused"
         if traffic.behind:
-            rates += f" | signed with our key, but {traffic.behind:.0f} s behind this clock: give the vehicle the time"
+            rates += (
+                f" | signed with our key, but {traffic.behind:.0f} s behind this clock: set the time of the vehicle"
+            )
         rates += "".join(f" | {problem}" for problem in traffic.problems)
         status = health.status
         self._console.print(

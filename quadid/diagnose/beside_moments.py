@@ -59,8 +59,8 @@ class Held:
     def sentence(self) -> str:
         """Why they are."""
         return (
-            f"moments that the model lacks turn the vehicle, so {', '.join(self.parameters)} come from its quick "
-            f"motion alone, which does not show {', '.join(YAW)}"
+            f"unmodelled moments turn the vehicle, so {', '.join(self.parameters)} are estimated from fast motion "
+            f"alone, which does not reveal {', '.join(YAW)}"
         )
 
 

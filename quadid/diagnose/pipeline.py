@@ -103,7 +103,7 @@ def diagnose(
     findings = describe(decisive, search, worth, [] if verdict is Verdict.UNKNOWN else believed)
     warnings = [
         *(f.text for f in faults),
-        *(f"{reason}: it stands for something else, and is not named with confidence" for reason in doubts.values()),
+        *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
         *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
         *reasons, *([] if moved is None else [moved]),
     ]  # fmt: skip

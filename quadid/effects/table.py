@@ -35,7 +35,7 @@ TABLE: tuple[Effect, ...] = (
         ),
         summary="The rotors follow their command with a lag.",
         sentence="the rotors need {tau:.0f} ms to follow a command (first-order lag), seen as late rotation and thrust",
-        advice="Usual for real motors; a controller that knows it can lead it.",
+        advice="Usual for real motors; a controller can compensate it.",
         family="late", shows=(*_TURNS, "a_z: thrust_rate"),
     ),
     Effect(
@@ -97,8 +97,8 @@ TABLE: tuple[Effect, ...] = (
         "rate_damping", "body",
         (*_axes("l_p m_q", "1/s", 30.0, 1.0, sign=1), *_axes("n_r", "1/s", 30.0, 1.0, sign=1, flexible=False)),
         summary="Rotation is damped, by more than the air at each hub.",
-        sentence="roll, pitch and yaw rotation is damped by {l_p:.2f}, {m_q:.2f} and {n_r:.2f} 1/s beyond what the "
-        "rotors give",
+        sentence="roll, pitch and yaw rotation is damped by {l_p:.2f}, {m_q:.2f} and {n_r:.2f} 1/s beyond the "
+        "damping of the rotors",
         advice="Usual for a large frame; beyond that look for an unmodelled lag.",
         shows=("p': p", "q': q", "r': r"),
     ),
@@ -124,8 +124,8 @@ TABLE: tuple[Effect, ...] = (
             P("loss", "", 0.0, -0.6, 0.6, 0.05, factor=1e2),
             P("drag_loss", "", 0.0, -1.0, 1.0, 0.1, optional=True, entry="extra", beside="loss", factor=1e2),
         ),
-        summary="One rotor gives less thrust than the others.",
-        sentence="rotor {rotor:.0f} gives {loss:.1f} % less thrust and drag torque than the others",
+        summary="One rotor produces less thrust than the others.",
+        sentence="rotor {rotor:.0f} produces {loss:.1f} % less thrust and drag torque than the others",
         advice="Check that rotor: propeller, motor, speed controller, arm.",
         family="corner", flexible="never", shows=_CORNER,
     ),
@@ -133,7 +133,7 @@ TABLE: tuple[Effect, ...] = (
         "cg_offset", "body", _axes("x y", "m", 0.1, 0.005, scale="arm", factor=1e3),
         summary="The centre of gravity is off centre.",
         sentence="the centre of gravity lies {x:.1f} mm forward and {y:.1f} mm to the right of the geometric centre",
-        advice="Move the battery or the payload, or tell the controller.",
+        advice="Move the battery or the payload, or update the controller.",
         family="corner", shows=_CORNER,
     ),
     Effect(
@@ -189,14 +189,14 @@ TABLE: tuple[Effect, ...] = (
         "drag_torque_curve", "rotor", (P("growth", "", 0.0, -2.0, 3.0, 0.5),),
         summary="The rotors' drag torque is not purely quadratic.",
         sentence="the rotors' drag torque grows with speed to the power of {growth:.2f} beyond the square, about hover",
-        advice="Measure torque against speed on a stand; some simulators take it in proportion to thrust and command.",
+        advice="Measure torque against speed on a stand; in some simulators it is proportional to thrust and command.",
         flexible="never", shows=("r': rotor_speed", "r': thrust"),
     ),
     Effect(
         "no_gyroscopic_coupling", "body", (P("share", "", 0.0, -0.5, 1.5, 0.3, factor=1e2),),
         summary="Rotation about one axis does not couple into the others.",
         sentence="{share:.0f} % of the gyroscopic coupling of the body's rotation is missing",
-        advice="No vehicle does this: the data come from a simulator that leaves the term out.",
+        advice="No real vehicle does this: the data are from a simulator that omits the term.",
         flexible="never", shows=("p': q", "q': r", "r': p"), ties=("d", "J_zz"),
     ),
     Effect(
@@ -247,7 +247,7 @@ TABLE: tuple[Effect, ...] = (
         "imu_lever_arm", "sensor", _axes("x y z", "m", 0.5, 0.04, scale="arm", factor=1e3),
         summary="The IMU sits away from the centre.",
         sentence="the accelerometer sits {x:.0f}, {y:.0f}, {z:.0f} mm from the geometric centre",
-        advice="Tell the estimator where the IMU sits.",
+        advice="Set the IMU position in the estimator.",
         shows=tuple(f"{c}: {s}" for c in ("a_x", "a_y", "a_z") for s in ("p_dot", "q_dot", "r_dot")),
     ),
     Effect(

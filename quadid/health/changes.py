@@ -212,7 +212,7 @@ def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple
     loss, loss_ci = _interval(one, 2 * k)
     drag, drag_ci = _interval(one, 2 * k + 1)
     sentence = (
-        f"For the same command rotor {rotor} gives {_less(loss)} thrust and {_less(drag)} drag torque than in the "
+        f"For the same command rotor {rotor} produces {_less(loss)} thrust and {_less(drag)} drag torque than in the "
         "baseline."
     )
     parameters = (

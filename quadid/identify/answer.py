@@ -63,7 +63,7 @@ def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
                         status=Status.PRIOR_DOMINATED)  # fmt: skip
         rows.append(p)
     why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
-    told = [f"{who}: the vehicle file's values stand, because {reason}" for reason, who in why.items() if who]
+    told = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
     kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
     return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*told, *kept))
 

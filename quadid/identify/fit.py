@@ -41,8 +41,8 @@ noise and the rest is made by random moments."""
 YAW = ("d", "J_zz", "J_r")
 """What quick motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
 _QUICK = (
-    "moments that the model lacks turn the vehicle, so parameters come from its quick motion alone, "
-    f"which does not show {', '.join(YAW)}; quadid diagnose looks for the cause"
+    "unmodelled moments turn the vehicle, so parameters are estimated from fast motion alone, which does not reveal "
+    f"{', '.join(YAW)}; quadid diagnose looks for the cause"
 )
 
 

@@ -137,7 +137,7 @@ def attitude_check(recording: Recording) -> Check:
         return rates
     return Check(
         rates.name, Verdict.ERROR, f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): "
-        "its world has z up", "give attitude, velocity and position in NED; ROS' world is east, north, up (ENU)",
+        "its world has z up", "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
     )  # fmt: skip
 
 
@@ -193,7 +193,7 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     if reading != "as given":
         message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
         return Check(
-            "gyro_attitude", Verdict.ERROR, message, "give wxyz quaternions, body to world, FRD to NED", numbers
+            "gyro_attitude", Verdict.ERROR, message, "write wxyz quaternions, body to world, FRD to NED", numbers
         )
     if not fit.straight:
         message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"

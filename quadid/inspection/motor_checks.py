@@ -53,7 +53,7 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         if low <= needed / factor**2 <= high:
             return Check(
                 "hover", Verdict.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
-                f"multiply rotor speeds by {factor:.6g}, or give this log's own vehicle file", numbers,
+                f"multiply rotor speeds by {factor:.6g}, or use the vehicle file of this log", numbers,
             )  # fmt: skip
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
@@ -140,7 +140,7 @@ def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
         return Check(
             "motor_order", Verdict.ERROR,
             f"{text}; much better ({np.mean(scores[best]):.2f} on average) with the log's columns in the order {order}",
-            f"order the rotors of the vehicle file so that they take columns {order}", numbers,
+            f"reorder the rotors of the vehicle file to take columns {order}", numbers,
         )  # fmt: skip
     if own[2] < -_CLEAR:
         return Check(

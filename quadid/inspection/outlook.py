@@ -51,7 +51,7 @@ def missing_signals(log_format: str, facts: tuple[ChannelFacts, ...]) -> tuple[M
         how = _HOW["accel"].get(log_format) or _HOW["gyro"].get(log_format, "log the IMU")
         out.append(Missing("accel", "the thrust coefficient shows in the accelerometer", how))
     if "attitude" not in rates:
-        why = "attitude holds the fit together over longer stretches and reveals wrong units"
+        why = "attitude constrains the fit over longer segments and reveals wrong units"
         out.append(Missing("attitude", why, _HOW["attitude"].get(log_format, "log the attitude")))
     return tuple(out)
 

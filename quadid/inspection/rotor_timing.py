@@ -80,7 +80,7 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
     if high - low > _WANDER:
         return Check(name, Verdict.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
     if lag < -_LATE:
-        return Check(name, Verdict.ERROR, f"{message}: the rotor signal comes after its effect", fix, numbers)
+        return Check(name, Verdict.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
     if lag > _EARLY:
         return Check(name, Verdict.ERROR, f"{message}: no motor answers that late", fix, numbers)
     return Check(name, Verdict.OK, message, numbers=numbers)

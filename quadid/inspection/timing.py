@@ -77,7 +77,9 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         rows = (f.count - 1) / max(f.last - f.first, 1e-9)
         if not f.gaps and rows > FILLED * f.rate:
             message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
-            checks.append(Check("timing", Verdict.WARNING, message, "log it at this rate, or give the samples alone"))
+            checks.append(
+                Check("timing", Verdict.WARNING, message, "log it at this rate, or without the interpolated rows")
+            )
     gaps = {f.name: f for f in facts if f.gaps}
     if gaps:
         worst = max(gaps.values(), key=lambda f: f.longest_gap)

@@ -164,7 +164,7 @@ def _bounds(case: Case, settings: GateSettings) -> str | None:
     if why:
         return why
     if not 0.8 < case.thrust_ratio < 1.25:
-        return f"b would give {case.thrust_ratio:.2f} times the thrust that the accelerometer felt"
+        return f"b would give {case.thrust_ratio:.2f} times the thrust measured by the accelerometer"
     return None
 
 
@@ -205,7 +205,7 @@ def _held_out(case: Case, settings: GateSettings) -> str | None:
         return f"predicts unseen data worse than the set in force: deviance {-total:.1f} more in {n} windows"
     if fresh or (n and total > settings.gain * n) or _is_sharper(case, settings):
         return None
-    return "no news: the set in force predicts as well and its intervals are about as narrow"
+    return "no improvement over the set in force: it predicts as well with about as narrow intervals"
 
 
 def _is_sharper(case: Case, settings: GateSettings) -> bool:

@@ -55,7 +55,7 @@ class Supervisor:
         self._estimator.forget()
         self.interrupted(start)
         self._active_set.drop_pending()
-        self._outbox.state(Phase.COLLECTING, f"{why}: learning anew")
+        self._outbox.state(Phase.COLLECTING, f"{why}: learning restarts")
 
     def changed(self, request: ChangeRequest, reply: ChangeReply) -> None:
         """Publishes what a sudden change was."""
@@ -111,7 +111,7 @@ class Supervisor:
             return
         start, stop = self._outbox.stamp(self._disagrees_since), self._outbox.stamp(request.stop)
         self._outbox.act(Diagnosed(stop, start, stop, (), "unknown"))
-        text = "windows disagree with what was known, for as long as a window: learning anew"
+        text = "windows disagree with the earlier estimate for the length of a window: learning restarts"
         self._outbox.say(request.stop, "warning", "change", text)
         self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start, "the vehicle has changed")
@@ -139,7 +139,7 @@ class Supervisor:
         scale = self._diagnosis.wrong_scale
         case = replace(
             self._estimator.case(parameters, request, reply, active_set, self._gate.windows),
-            unexplained=f"the diagnosis stands: {scale}" if scale else "", unproven=self._consistency.unproven,
+            unexplained=f"the diagnosis is in force: {scale}" if scale else "", unproven=self._consistency.unproven,
         )  # fmt: skip
         decision = decide(case, self._gate)
         mse, unseen = self._estimator.scores()

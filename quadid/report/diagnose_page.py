@@ -48,8 +48,8 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
     steps = _next_steps(result)
     if v.get("on") == HELD_OUT:
         level = "fair" if level == "good" else level
-        details = (*details, "Not proven: no flight was given that the diagnosis has not seen.")
-        steps = ("To prove it, give another flight with --validate.", *steps)
+        details = (*details, "Not validated: no unseen flight was given.")
+        steps = ("To validate it, add another flight with --validate.", *steps)
     return Verdict(level, headline, details, steps)
 
 
@@ -138,7 +138,7 @@ def diagnosis_part(
 
 _REMARKS = {
     "per_log": "It belongs to this flight, not to the vehicle: another flight has its own.",
-    "ordinary": "It is no larger than on most vehicles, and so comes after what is, whatever it costs.",
+    "ordinary": "It is no larger than on most vehicles and is therefore listed after larger causes.",
 }
 
 

@@ -29,8 +29,8 @@ def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
     sharp = all(b <= SHARP for b in found.bound.tolist())
     intro = (
         f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method, were the model right "
-        "(Cramér–Rao bound): with all parameters unknown, and with all others known. Far apart, the flight only moves "
-        "them together."
+        "(Cramér–Rao bound): with all parameters unknown, and with all others known. If they differ much, the flight "
+        "couples parameters."
     )
     return {"intro": intro, "rows": rows, "done": "Nothing more needs to be flown for these." if sharp else ""}
 

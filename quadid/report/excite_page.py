@@ -51,7 +51,7 @@ def excite_html(result: JsonDict, window: Window) -> str:
             ),
             section(
                 "envelope", "Where it may be flown",
-                "Scripts begin only inside the envelope, and end when they leave it.",
+                "Scripts start only inside the envelope and stop outside it.",
                 tables=[rows_of(("", "needed in simulation", "envelope"), _limits(result))],
             ),
         ],

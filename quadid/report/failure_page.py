@@ -36,7 +36,7 @@ def failure_page(
     """
     steps = [text for text in (fix[:1].upper() + fix[1:], *_missing(logs)) if text]
     details = (f"Needed: {allowed}.",) if allowed else ()
-    verdict = Verdict("poor", f"No answer: {why}.", details, tuple(steps or ["`quadid inspect LOG` says more."]))
+    verdict = Verdict("poor", f"No answer: {why}.", details, tuple(steps or ["`quadid inspect LOG` shows more."]))
     sections: list[dict[str, Any]] = []
     for i, (recording, inspection) in enumerate(logs):
         sections.append(_data(recording, i))

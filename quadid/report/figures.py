@@ -56,7 +56,7 @@ def channel_figures(
         here = [c for c in channels if c < series.measured.shape[1] and np.isfinite(series.measured[:, c]).any()]
         if here:
             views = [
-                {"label": "Liveliest part, every sample", **_stack(scored, detail, here, labels)},
+                {"label": "Most excited part, every sample", **_stack(scored, detail, here, labels)},
                 {"label": "Whole log", **_stack(scored, whole, here, labels)},
             ]
             shown = views if len(whole) > len(detail) else views[1:]

@@ -79,11 +79,11 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
         steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
     if summary["outliers"]:
         log = summary["outliers"][0]["log"]
-        steps.append(f"Look at the flight that stands out most: `quadid diagnose {log}`.")
+        steps.append(f"Look at the largest outlier: `quadid diagnose {log}`.")
     if counts.get("refused") or counts.get("unreadable"):
-        steps.append("`quadid inspect LOG` says what an unusable log lacks and how to log it.")
+        steps.append("`quadid inspect LOG` names what an unusable log lacks and how to log it.")
     if counts.get("failed"):
-        steps.append("Failures of this program are worth a bug report: the last table names the logs.")
+        steps.append("Please report failures of this program; the last table names the logs.")
     if not steps:
         steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
     return Verdict(level, headline, tuple(details), tuple(steps))
@@ -138,8 +138,8 @@ def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any
     count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
     most = "up to " * (len(set(count.values())) > 1) + str(max(count.values()))
     intro = (
-        f"Each flight against the first {most} of its vehicle, which are taken "
-        f"for healthy. 99 of 100 healthy flights stay below {HEALTHY_SCORE:.1f}, the line."
+        f"Each flight against the first {most} of its vehicle, which are assumed healthy. 99 of 100 healthy flights "
+        f"are below {HEALTHY_SCORE:.1f}, the line."
         f"{_counted(time)}"
     )
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
@@ -231,7 +231,7 @@ def _outliers(summary: JsonDict) -> Any:
         for o in summary["outliers"]
     ]  # fmt: skip
     head = ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations")
-    return _section("outliers", "Flights that stand out", head, rows, "In robust standard deviations of the vehicle.")
+    return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
 
 
 def _common(summary: JsonDict) -> Any:

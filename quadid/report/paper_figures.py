@@ -52,8 +52,8 @@ class PaperFigure:
     @property
     def title(self) -> str:
         """What the figure shows."""
-        role = "the training set" if self.sets == (1,) else "sets that the fit has not seen"
-        return f"Figure {self.number}: {GROUPS[self.group][0]} in closed loop on {role}"
+        role = "training set" if self.sets == (1,) else "validation sets"
+        return f"Figure {self.number}: {GROUPS[self.group][0]} in closed loop, {role}"
 
 
 FIGURES = (

@@ -93,7 +93,7 @@ def horizon_table(result: JsonDict) -> TextTable:
         total = entry["sum"]
         rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in QUANTITIES)))
     last = list(result["horizons"])[-1]
-    for label, key in (("noise floor", "noise_floor"), ("if nothing changed", "no_change")):
+    for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
         rows.append((label, last, *(number(result[key][last][n]) for n in QUANTITIES)))
     title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
     return TextTable(title, columns, tuple(rows))

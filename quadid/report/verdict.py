@@ -23,7 +23,7 @@ LEAST_SECONDS = 10.0
 _TOGETHER = (
     "To let the flights decide, fit them together, `quadid identify FLIGHT FLIGHT …`, from a file without sigma."
 )
-_DIAGNOSE = "`quadid diagnose` names what the simulation gets wrong and measures what the better model gains."
+_DIAGNOSE = "`quadid diagnose` names missing effects and measures what the extended model gains."
 MOTION = {
     "b": "climbs and descents",
     "d": "yaw turns",
@@ -81,11 +81,11 @@ def identify_verdict(result: JsonDict) -> Verdict:
     headline = f"{_count(len(known), len(parameters))} identified; {match}."
     if before and not known and len(before) == len(parameters):
         headline = f"All {len(before)} parameters known from earlier flights; {match}."
-    rest = f"Decided by the sigmas of the vehicle file rather than by this flight: {', '.join(before)}."
+    rest = f"Determined by the sigmas of the vehicle file, not by this flight: {', '.join(before)}."
     details = (*([rest] if before else []), *lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
-        found = "The parameters absorb what the model lacks: values and intervals are wrong, however narrow these are."
+        found = "The parameters absorb missing effects: values and intervals are wrong, however narrow."
         details = (found, *_details(known, judged)[1:]) if known else details
     steps = _next_steps(result, open_ones, stuck, ratio)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
@@ -97,11 +97,11 @@ def _lacking(sets: Sequence[JsonDict]) -> tuple[str, ...]:
         [_number(s.get("seconds", LEAST_SECONDS)) for s in sets if s["role"] == role] for role in ("validate", "train")
     )
     if not unseen:
-        return ("Not proven: no flight was given that the fit has not seen.",)
+        return ("Not validated: no unseen flight was given.",)
     out = []
     for which, seconds in (("fitted", sum(seen)), ("unseen", sum(unseen))):
         if seconds < LEAST_SECONDS:
-            out.append(f"Not proven: only {seconds:.1f} s of {which} flight, {LEAST_SECONDS:g} s are needed.")
+            out.append(f"Not validated: only {seconds:.1f} s of {which} flight, {LEAST_SECONDS:g} s are needed.")
     return tuple(out)
 
 
@@ -119,16 +119,14 @@ def score_verdict(result: JsonDict) -> Verdict:
     share = {n: _number(errors[n]) / _number(still[n]) for n in known}
     if runaway or not known or max(share.values()) >= 1.0:
         worse = [n for n in known if share[n] >= 1.0]
-        what = f"worse than predicting no change: {', '.join(worse)}" if worse else "the simulation runs away"
+        what = f"worse than predicting no change: {', '.join(worse)}" if worse else "the simulation diverges"
         return Verdict("poor", f"Not to be used: after {last} samples {what}.", (), (_DIAGNOSE,))
     mean = ", ".join(f"{n} {percent(s)}" for n, s in share.items())
-    detail = f"Error after {last} samples as a share of that of predicting no change: {mean}."
+    detail = f"Error after {last} samples relative to predicting no change: {mean}."
     worst = max(above, key=lambda n: above[n], default=None)
     if worst is None or above[worst] <= NEAR_FLOOR:
-        return Verdict(
-            "good", f"After {last} samples the errors are near what sensor noise alone makes.", (detail,), ()
-        )
-    headline = f"After {last} samples the {worst} error is {above[worst]:.3g} times what sensor noise alone makes."
+        return Verdict("good", f"After {last} samples the errors are at the noise floor.", (detail,), ())
+    headline = f"After {last} samples the {worst} error is {above[worst]:.3g} times the noise floor."
     return Verdict("fair", headline, (detail,), (_DIAGNOSE,))
 
 
@@ -142,7 +140,7 @@ def _match(ratio: float, where: str) -> tuple[Level, str]:
         )
     if math.isfinite(ratio):
         return "poor", f"the simulation misses much of {where} (error {ratio:.3g} times the noise variance)"
-    return "poor", f"the simulation does not hold together on {where}"
+    return "poor", f"the simulation diverges on {where}"
 
 
 def _count(known: int, total: int) -> str:
@@ -155,15 +153,13 @@ def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str
     out = []
     if known:
         widest = max(known, key=relative_halfwidth)
-        out.append(
-            f"The least certain of them is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval)."
-        )
+        out.append(f"The least certain is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval).")
     fits = [
         max(v, -999.0) for s in judged for n, v in s["fit_percent"].items() if n in ("p", "q", "r") and v is not None
     ]
     if fits:
         out.append(
-            f"Over one second without correction the simulated rates fit the measured ones by {min(fits):.0f} to "
+            f"Over one second of simulation, rates fit the measured ones by {min(fits):.0f} to "
             f"{max(fits):.0f} % (100 % is perfect, 0 % is no better than the mean)."
         )
     return tuple(out)
@@ -181,7 +177,7 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
     if rough:
         out.append(_DIAGNOSE)
     if _lacking(result["sets"]):
-        out.append(f"To prove it, give another flight of {LEAST_SECONDS:g} s or more with --validate.")
+        out.append(f"To validate it, add another flight of {LEAST_SECONDS:g} s or more with --validate.")
     if stuck:
         out.append(
             f"Check rotor positions and order, command scale and bounds in the vehicle file: {', '.join(stuck)} "
@@ -191,9 +187,9 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
     hidden = [] if rough else [p for p in open_ones if p["name"] not in stuck]
     for p in hidden:
         if p["status"] == "prior_dominated":
-            out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} does not show in these data.")
+            out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} is not observable in these data.")
     if hidden:
-        out.append("`quadid excite` proposes a manoeuvre and says what it would gain.")
+        out.append("`quadid excite` proposes a manoeuvre and predicts its gain.")
     if ratio > NOISE_LEVEL:
         out.append(_DIAGNOSE)
     if not out:
@@ -207,16 +203,16 @@ def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
     """Says in one sentence what the data say about a parameter; `stuck` as of `at_bounds`."""
     name, status = parameter["name"], parameter["status"]
     if name in stuck:
-        return "Rests on a bound of the vehicle file: the data want a value outside, or the model lacks something."
+        return "At a bound of the vehicle file: the estimate lies outside, or an effect is missing."
     if decided_before(parameter):
-        return f"{percent(_number(parameter['prior_share']))} of what is known comes from the vehicle file's sigma."
+        return f"{percent(_number(parameter['prior_share']))} of the information is from the vehicle file's sigma."
     if status == "prior_dominated":
         needs = MOTION.get(name)
-        return "With this model the data do not show it; the value is the guess." + (
+        return "Not observable with this model and flight; the guess is kept." + (
             f" It needs {needs}." if needs else ""
         )
     if status == "unreliable":
-        return "Not to be used: the model misses this flight, or parts of it give different values."
+        return "Not to be used: the model misses this flight, or parts of it yield different values."
     if status == "ratio_only":
         return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan

@@ -124,7 +124,7 @@ def html(shown: Shown, seed: int, command: str = LIBRARY) -> str:
         ),
         diagnosis_part(
             shown.hidden.result, shown.hidden.sets[-1:], "hidden", HIDDEN_SECTION,
-            f"This vehicle flew with {effects_words(HIDDEN)}, which the model does not know of.",
+            f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.",
             shown.hidden.maps(),
         ),
     ]  # fmt: skip

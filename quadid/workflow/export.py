@@ -68,7 +68,7 @@ def export(
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
     warnings = [f"not from data but the guess of the vehicle file: {', '.join(guessed)}"] if guessed else []
     if form in ("px4", "ardupilot") and described.command.max_speed is None:
-        warnings.append("no hover thrust: give command.max_speed, the rotor speed at full command, in the vehicle file")
+        warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
     result = {
         "schema": "quadid.export/1", "vehicle": described.name, "format": form, "files": [], "warnings": warnings,
     }  # fmt: skip

@@ -131,7 +131,7 @@ def health(
     if len(trims[1]) < 3:
         warnings.append(
             f"{len(trims[1])} baseline flight{'s' * (len(trims[1]) > 1)}: the spread of healthy flights is mostly "
-            "assumed; give five or more, with other batteries"
+            "assumed; use five or more, with several batteries"
         )
     result = found.to_dict()
     result["vehicle"] = described.name
@@ -145,8 +145,8 @@ def _check_flown(trim: FlightTrim, healthy: Sequence[FlightTrim]) -> None:
     share = math.exp(trim.mean[-1] - sum(one.mean[-1] for one in healthy) / len(healthy))
     if share < LEAST_THRUST:
         raise NotIdentifiableError(
-            f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: it did not fly",
-            "flights", "give a flight, a hover will do",
+            f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: not a flight",
+            "flights", "use a flight; a hover is enough",
         )  # fmt: skip
 
 

@@ -131,7 +131,7 @@ class UnansweredError(NotIdentifiableError):
     def __init__(self, outcome: Identified) -> None:
         self.outcome = outcome
         super().__init__(
-            "the data say nothing about any parameter",
+            "the data reveal no parameter",
             "a flight that moves in roll, pitch, yaw and height",
             "fly what `quadid excite` proposes; results were written, but they are the initial guess",
         )
@@ -152,7 +152,7 @@ def identify(
         advance: told how far the fit is.
 
     Raises:
-        UnansweredError: the data say nothing about any parameter.
+        UnansweredError: the data reveal no parameter.
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
         ParameterError: an unknown search.

@@ -101,7 +101,7 @@ def load_vehicle(name: str) -> Vehicle:
     try:
         return Vehicle.from_yaml(data.decode("utf-8"), path.name)
     except UnicodeDecodeError as error:
-        raise VehicleError(f"{name}: not text", "a YAML file", "is this the log? give it as LOG") from error
+        raise VehicleError(f"{name}: not text", "a YAML file", "if this is the log, pass it as LOG") from error
 
 
 def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:

@@ -42,17 +42,17 @@ def check_unseen(train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle | N
             seconds = max(common_rows(other, log), same_flight(other, log))
             if seconds > 0.0:
                 raise LogError(
-                    f"{log.name} proves nothing: {seconds:.1f} s of it are in {other.name}, which is fitted",
+                    f"{log.name} cannot validate: {seconds:.1f} s of it are in {other.name}, which is fitted",
                     "a flight, or a part of one, that is not fitted",
-                    "give another flight to --validate, or parts that do not overlap: LOG@0:60 --validate LOG@60:120",
+                    "use another flight for --validate, or parts that do not overlap: LOG@0:60 --validate LOG@60:120",
                 )
 
     for log in held:
         for flight in () if vehicle is None else fitted_before(vehicle, log):
             raise LogError(
-                f"{log.name} proves nothing: {flight.log}, to which this vehicle file was fitted, is the same flight",
+                f"{log.name} cannot validate: {flight.log}, to which this vehicle file was fitted, is the same flight",
                 "a flight that the file was not fitted to",
-                "give another flight to --validate, or the vehicle file from before that fit",
+                "use another flight for --validate, or the vehicle file from before that fit",
             )
 
 
@@ -67,7 +67,7 @@ def without_own_priors(vehicle: Vehicle, train: Sequence[Log]) -> tuple[Vehicle,
     guesses = {n: p.model_copy(update={"sigma": None}) for n, p in vehicle.parameters.items()}
     told = ", ".join(name if name == flight.log else f"{name} ({flight.log})" for name, flight in known.items())
     return vehicle.model_copy(update={"parameters": guesses}), [
-        f"the vehicle file was fitted to {told} already: its values are where the fit starts, but its sigmas are not "
+        f"the vehicle file was fitted to {told} already: its values start the fit, but its sigmas are not "
         "used, so that no flight counts twice"
     ]
 

@@ -96,7 +96,7 @@ def names_of(cut: Cut, parts: Spans) -> list[str]:
 def left_on_ground(names: Sequence[str]) -> str:
     """What is used of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
     whole = names[0].rpartition("@")[0]
-    return f"time on the ground is left out: fits use {' '.join(names)}; for all of it give {whole}@0:"
+    return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
 
 
 def first_imu_time(recording: Recording) -> float:

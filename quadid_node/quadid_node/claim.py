@@ -16,7 +16,7 @@ YOUNG = 10.0
 PAUSES = (0.5, 4.0)
 """Least and most of such a pause [s]."""
 OBSERVES = "another service publishes parameter sets here: this one observes until that one is gone"
-BESIDE = "another service publishes parameter sets beside this one: one of the two gives way in a moment"
+BESIDE = "another service publishes parameter sets too: one of the two stops in a moment"
 STRANGER = "someone else publishes parameter sets on our topic: check sequence and log_hash"
 
 

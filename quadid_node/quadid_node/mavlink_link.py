@@ -235,9 +235,9 @@ class MavlinkLink:
         wire = self._wire
         problems = [self._source.problem, self._decoder.order.problem, wire.memory_problem]
         if not self._key and wire.signed:
-            problems.append("the frames are signed, but no key is given to check them: give --key")
+            problems.append("the frames are signed, but there is no key to check them: use --key")
         if self._key and wire.refused and not self.vehicle_system and not wire.signed:
-            problems.append("a key is given, but the frames are not signed: give the vehicle the key (SETUP_SIGNING)")
+            problems.append("a key is set, but the frames are not signed: send the key to the vehicle (SETUP_SIGNING)")
         said = tuple(p for p in problems if p)
         return Traffic(dict(self._rates), self._requests.denied, wire.refused, wire.dropped, wire.mav.behind, said)
 

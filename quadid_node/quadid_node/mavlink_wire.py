@@ -150,7 +150,7 @@ def _check_port(device: str) -> None:
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise LinkError(
-                    f"another program listens on UDP port {port}", "one service a port", "stop it, or give another port"
+                    f"another program listens on UDP port {port}", "one service a port", "stop it, or use another port"
                 ) from error
 
 

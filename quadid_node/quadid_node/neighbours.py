@@ -57,9 +57,9 @@ class Neighbours:
             return
         if self._unbroken(topic) < ALONE:
             self.paused = True
-            self.note(topic, f"{publishers} publishers on one topic: paused until one is heard alone")
+            self.note(topic, f"{publishers} publishers on one topic: paused until only one publishes")
         else:
-            self.note(topic, f"{publishers} publishers on one topic, one of them is heard")
+            self.note(topic, f"{publishers} publishers on one topic, only one publishes")
 
     def look(self, deaf: Mapping[str, bool]) -> None:
         """Looks at every topic, once a second.

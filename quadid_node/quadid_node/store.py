@@ -287,7 +287,7 @@ class Store:
                 self.close()
                 raise StoreError(
                     f"another program holds the history {self.path} ({error})",
-                    "a history that can be written", "end that program, or give another history",
+                    "a history that can be written", "end that program, or use another history",
                 ) from error  # fmt: skip
             else:
                 self._problem = f"{self.path} cannot be written ({error})"

@@ -62,7 +62,7 @@ def read_history(
         StoreError: no such file, or not a history.
     """
     if not path.is_file():
-        raise StoreError(f"no history {path}", "a history that a service has written", "give --history")
+        raise StoreError(f"no history {path}", "a history that a service has written", "use --history")
     try:
         with contextlib.closing(connect(path, read_only=True)) as db:
             check_tables(db)
@@ -74,7 +74,7 @@ def read_history(
             }
     except (sqlite3.Error, *UNREADABLE) as error:
         raise StoreError(
-            f"{path} cannot be read ({error})", "a history that a service has written", "give --history"
+            f"{path} cannot be read ({error})", "a history that a service has written", "use --history"
         ) from error
 
 

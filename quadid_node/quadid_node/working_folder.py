@@ -16,4 +16,4 @@ def refusal() -> str | None:
     if not NUMBA_SETTINGS.exists():
         return None
     what = f"{NUMBA_SETTINGS} in this folder would change what is computed, and run code from where it says"
-    return f"{what}; fix: stand in another folder, or remove it"
+    return f"{what}; fix: change to another folder, or remove it"

@@ -102,7 +102,7 @@ def _damage(index: DataflashIndex) -> list[str]:
         notes.append(f"damaged message descriptions: {', '.join(sorted(set(index.damaged))[:8])}")
     if index.redefined:
         names = ", ".join(sorted(set(index.redefined))[:8])
-        notes.append(f"{names} described anew within the log: what follows the change is not used")
+        notes.append(f"{names} redefined within the log: data after the change are not used")
     if index.cut:
         notes.append("the file ends inside a record: it was cut; everything before is used")
     return notes

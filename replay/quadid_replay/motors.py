@@ -121,8 +121,8 @@ def changed_within(names: Sequence[str], values: Sequence[float]) -> str:
     """Says of a log, for people, which `changed_functions` it has."""
     changed = changed_functions(names, values)
     return changed and (
-        f"the motor order changes within the log: {changed}; outputs are taken as the last values say, so those from "
-        "before the change are of other motors"
+        f"the motor order changes within the log: {changed}; outputs follow the last values, so earlier data "
+        "belong to other motors"
     )
 
 

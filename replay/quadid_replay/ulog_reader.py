@@ -80,7 +80,7 @@ def _notes(records: UlogRecords, size: int) -> list[str]:
     if records.skipped:
         notes.append(f"{records.skipped} of {size} bytes are damaged and were skipped")
     if records.described_anew:
-        notes.append(f"{records.described_anew} described anew within the log: what follows the change is not used")
+        notes.append(f"{records.described_anew} redefined within the log: data after the change are not used")
     if records.cut:
         notes.append("the file ends inside a record: it was cut; everything before is used")
     return notes

@@ -92,14 +92,13 @@ def _sizes(errors: Sequence[float]) -> str:
 
 
 def _oracle(groups: dict[str, list[Graded]]) -> str:
-    rows = ["| class | cases | median | worst | share at 95 % or more |", "|---|---|---|---|---|"]
+    parts = []
     for name, graded in groups.items():
         ratios = summary.oracle_ratios(graded)
         if ratios:
-            high = summary.Share(sum(r >= 0.95 for r in ratios), len(ratios))
-            rows.append(f"| {name} | {len(ratios)} | {np.median(ratios):.3f} | {min(ratios):.3f} | {high} |")
+            parts.append(f"{name} {np.median(ratios):.3f} ({min(ratios):.3f}), {len(ratios)} cases")
     head = "## Gain on an unseen flight, relative to the true structure\n\n"
-    return head + "\n".join(rows) + "\n"
+    return f"{head}Median (worst): {'; '.join(parts)}.\n"
 
 
 def _misses(graded: Sequence[Graded]) -> str:

@@ -24,18 +24,18 @@ def page(
         "* Wrong publications (b, J_xx or J_yy more than 5 % off, not in the history, or under another set's number): "
         f"**{len(wrong)}** of {sets} sets", "",
         "Recovery: from the end of the fault to the next estimate; a window takes 5 s.", "",
-        "| row | fault | times | recovery [s]: median, longest |",
-        "|---|---|---|---|",
+        "| fault (times) | recovery [s]: median, longest |",
+        "|---|---|",
     ]  # fmt: skip
-    for name, (row, _) in FAULTS.items():
+    for name in FAULTS:
         found = [e for e in entries if e["name"] == name]
         times = [e["recovered"] for e in found if e["recovered"] is not None]
         if not found:
-            lines.append(f"| {row} | {name} | 0 | – |")
+            lines.append(f"| {name} (0) | – |")
         elif times:
-            lines.append(f"| {row} | {name} | {len(found)} | {np.median(times):.1f}, {max(times):.1f} |")
+            lines.append(f"| {name} ({len(found)}) | {np.median(times):.1f}, {max(times):.1f} |")
         else:
-            lines.append(f"| {row} | {name} | {len(found)} | **none**: {found[-1]['did']} |")
+            lines.append(f"| {name} ({len(found)}) | **none**: {found[-1]['did']} |")
     for title, items in (("Crashes", crashes), ("Wrong", wrong)):
         if items:
             lines += ["", f"{title}:", *(f"* {item}" for item in items)]

@@ -89,9 +89,9 @@ def _beside(data: str, parameters: Iterable[Parameter], truth: Mapping[str, floa
 
 
 def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")) -> str:
-    """Markdown: the share of identified numbers that hold their truth, then each of them.
+    """Markdown: the share of identified numbers that hold their truth, by group, and those that do not.
 
-    Of data whose name begins with one of `short` only those that do not.
+    Data whose name begins with one of `short` are counted by it, all others as recorded vehicles.
     """
     named = [n for n in numbers if n.identified]
     if not named:
@@ -99,20 +99,29 @@ def table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "RotorPy")
     held = sum(n.inside for n in named)
     lines = [
         f"Of {len(named)} identified values with known truth, {held} have it inside the 95 % interval "
-        f"({held / len(named):.0%}; wanted 90 %). Other statuses: `foreign.json`.",
+        f"({held / len(named):.0%}; wanted 90 %): "
+        + ", ".join(f"{group} {sum(n.inside for n in mine)} of {len(mine)}" for group, mine in _groups(named, short))
+        + ". All values: `foreign.json`.",
         "",
-    ]
-    for group in short:
-        mine = [n for n in named if n.data.startswith(group)]
-        if mine:
-            lines += [f"{group}: {sum(n.inside for n in mine)} of {len(mine)} inside.", ""]
-    lines += ["| data | parameter | estimate [95 %] | truth |", "|---|---|---|---|"]
+        "| outside | parameter | estimate [95 %] | truth |", "|---|---|---|---|",
+    ]  # fmt: skip
     for n in named:
-        if n.data.startswith(tuple(short)) and n.inside:
+        if n.inside:
             continue
         low, high = n.truth
         truth = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        mark = "" if n.inside else f", **{n.value / min(max(n.value, low), high) - 1.0:+.2%}**"
+        off = n.value / min(max(n.value, low), high) - 1.0
         interval = f"{n.value:.3g} [{n.interval[0]:.3g}, {n.interval[1]:.3g}]"
-        lines.append(f"| {n.data}, {n.by} | {n.name} | {interval} | {truth}{mark} |")
+        lines.append(f"| {n.data}, {n.by} | {n.name} | {interval} | {truth}, **{off:+.2%}** |")
     return "\n".join(lines)
+
+
+def _groups(named: Sequence[Number], short: Sequence[str]) -> Iterator[tuple[str, list[Number]]]:
+    """Numbers of the recorded vehicles, and those of each of `short`; empty groups are left out."""
+    recorded = [n for n in named if not n.data.startswith(tuple(short))]
+    for group, mine in (
+        ("recorded vehicles", recorded),
+        *((g, [n for n in named if n.data.startswith(g)]) for g in short),
+    ):
+        if mine:
+            yield group, mine

@@ -42,12 +42,13 @@ def main() -> None:
 
 def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
     recorded.curve(judged, picture)
+    print(recorded.confusion(judged))
     healthy = [j.flown.airframe for j in judged if j.flown.condition == "healthy"]
     each = " and ".join(f"{healthy.count(name)} of {name}" for name in sorted(set(healthy)))
     return (
         f"## Recorded flights\n`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy "
         f"flights of its airframe ({each}). Brackets: exact binomial 95 % intervals.\n\n"
-        f"{recorded.table(judged)}\n\n{recorded.confusion(judged)}\n\n"
+        f"{recorded.table(judged)}\n\n"
         f"![Score against millimetres cut]({picture.name})"
     )
 

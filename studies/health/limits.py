@@ -114,11 +114,11 @@ def text(judged: Sequence[Judged], draws: int = 50) -> str:
         mine = [j for j in single if chosen(j)]
         got = f"{sum(right(j) for j in mine)} of {len(mine)}"
         lines.append(f"| {what} | {wanted} | {_expected(mine, powers, column)} | {got} |")
-    lines += ["\n| spread of roll, pitch, yaw, effort in % | of healthy flights | of two flights of one propeller |",
-              "|---|---|---|"]  # fmt: skip
-    for airframe in AIRFRAMES:
-        spread = healthy_spread(_baseline(judged, airframe)).deviation
-        lines.append(f"| {airframe} | {_shown(spread)} | {_shown(_again(judged, airframe))} |")
+    spreads = [
+        f"{airframe} {_shown(healthy_spread(_baseline(judged, airframe)).deviation)} (same propeller "
+        f"{_shown(_again(judged, airframe))})" for airframe in AIRFRAMES
+    ]  # fmt: skip
+    lines += ["", f"Spread of roll, pitch, yaw and effort of healthy flights [%]: {'; '.join(spreads)}."]
     return "\n".join([*lines, "", _look_alikes(judged, draws), "", _doubles(judged), "", _outside(judged)])
 
 

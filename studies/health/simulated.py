@@ -129,12 +129,12 @@ def table(each: int = 6) -> str:
         for name, simulate in SIMULATORS.items():
             rows = done.setdefault(case.group, {}).setdefault(name, [])
             rows.append(judged(case, k, simulate))
-    heads = [f"{name}: changed, right" for name in SIMULATORS] + ["closed loop: error of loss, of drag loss"]
-    lines = ["| hidden | of | " + " | ".join(heads) + " |", "|---" * (2 + len(heads)) + "|"]
+    head = "; ".join(SIMULATORS)
+    lines = [f"| hidden | of | changed, right: {head} | error of loss, of drag loss |", "|---|---|---|---|"]
     for group, by in done.items():
         cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(rows).T)[:2]) for rows in by.values()]
         errors = np.array(by["closed loop"]).T[2:]
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
         cells.append(f"{', '.join(sizes)} %" if sizes else "–")
-        lines.append(f"| {group} | {len(errors.T)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {group} | {len(errors.T)} | {'; '.join(cells[:-1])} | {cells[-1]} |")
     return "\n".join(lines)

@@ -95,13 +95,13 @@ def rounded(values: FloatArray) -> list[float]:
 
 
 def table(records: Sequence[Record]) -> list[str]:
-    """Markdown: one row a case and program."""
+    """Markdown: one row a case and program; white noise, which differs little, is in the records only."""
     rows = [
         "| flights | program | seeds | median error b, d, J_xx, J_yy, J_zz, J_r [%] | 95 % intervals contain the truth "
         "(exact binomial interval) | of b, d, J_xx, J_yy, J_zz, J_r [%] | rate error after 0.5 s | processor [s] |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for case, program in product(CASES, PROGRAMS):
+    for case, program in product(list(CASES)[1:], PROGRAMS):
         mine = [r for r in records if (r["case"], r["program"]) == (case, program)]
         if not mine:
             continue
@@ -130,9 +130,8 @@ def said(records: Sequence[Record]) -> str:
     widths = ", ".join(f"{100.0 * v:.3g}" for v in np.median([r["half"] for r in mine], axis=0))
     return (
         "The motor lag is missing from all models. Only `quadid identify` reports it, by statuses: "
-        f"{counts}; {missed} identified values lie outside their interval. It fits quick motion with a lag of its own; "
-        f"its intervals, of half-widths {widths} %, reach as far as the answer without one: much wider than its "
-        "errors. `quadid diagnose` names the lag."
+        f"{counts}; {missed} identified values lie outside their interval. It fits fast motion with a lag of its own; "
+        f"its intervals (half-widths {widths} %) extend to the answer without one. `quadid diagnose` names the lag."
     )
 
 

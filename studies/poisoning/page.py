@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import re
 import time
-from collections import Counter
 from typing import Any
 
 GOAL = 0.05
@@ -25,8 +23,8 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
         f"* Cases with no published error of b, J_xx or J_yy above {GOAL:.0%}: **{held} of {len(done)}** flown "
         f"({len(cells)} in all); largest error: **{max(worst, default=0.0):.1%}**.",
         f"* Without poison: {len(healthy)} sets in the first 60 s, the first after {first[0]:.0f} s of flight.", "",
-        "The tables show the largest error [%] of b, J_xx and J_yy among sets accepted after the poison began; `–`: "
-        "none was accepted. Rows in which nothing was accepted are left out; every case is in `poisoning.json`.", "",
+        "Largest error [%] of b, J_xx and J_yy among sets accepted after the poison began, over all factors; `–`: none "
+        "was accepted. Channels without an accepted set are left out; `poisoning.json` has every case.", "",
     ]  # fmt: skip
     titles = {
         "in flight": "Poison after 60 s, with a set in force; the vehicle file has bare guesses",
@@ -34,35 +32,25 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
     }
     for when, title in titles.items():
         lines += [f"## {title}", "", *_table([c for c in cells if c["when"] == when], done), ""]
-    said = Counter(re.sub(r"\d+", "…", d["says"].split(":")[0]) for d in done)
-    lines += [
-        "## State of the sessions at the end",
-        "",
-        ", ".join(f"{name} {count}" for name, count in said.most_common()),
-    ]
     return "\n".join(lines) + "\n"
 
 
 def _table(cells: list[Cell], done: list[Cell]) -> list[str]:
-    factors = sorted({c["factor"] for c in cells})
-    found = {(d["when"], d["channel"], d["factor"], d["ramp"]): d for d in done}
-    lines = [
-        "| channel | ramp s | " + " | ".join(f"× {f:g}" for f in factors) + " |",
-        "|---|---|" + "---|" * len(factors),
-    ]
-    rows = dict.fromkeys((c["channel"], c["ramp"]) for c in sorted(cells, key=lambda c: c["channel"]))
-    for channel, ramp in rows:
-        entries = [_entry(found.get((cells[0]["when"], channel, f, ramp))) for f in factors]
-        if any(entry not in ("", "–") for entry in entries):
-            lines.append(f"| {channel} | {ramp:g} | " + " | ".join(entries) + " |")
+    ramps = sorted({c["ramp"] for c in cells})
+    lines = ["| channel | " + " | ".join(f"{r:g} s" if r else "at once" for r in ramps) + " |"]
+    lines += ["|---|" + "---|" * len(ramps)]
+    for channel in sorted({c["channel"] for c in cells}):
+        key = (cells[0]["when"], channel)
+        found = [[d for d in done if (d["when"], d["channel"]) == key and d["ramp"] == r] for r in ramps]
+        entries = [_entry(part) for part in found]
+        if set(entries) - {"", "–"}:
+            lines.append(f"| {channel} | " + " | ".join(entries) + " |")
     return lines
 
 
-def _entry(cell: Cell | None) -> str:
-    if cell is None:
-        return ""
-    values = list(cell["worst"].values())
-    if None in values:
-        return "–"
-    worst = max(map(abs, values))
-    return f"**{100.0 * worst:.1f}**" if worst > GOAL else f"{100.0 * worst:.1f}"
+def _entry(flown: list[Cell]) -> str:
+    """Largest error of the cases of one channel and ramp."""
+    errors = [abs(v) for d in flown for v in d["worst"].values() if v is not None]
+    if not errors:
+        return "–" if flown else ""
+    return f"**{100.0 * max(errors):.1f}**" if max(errors) > GOAL else f"{100.0 * max(errors):.1f}"

@@ -22,6 +22,8 @@ import quadid
 from quadid.vehicle import Vehicle
 
 Rows = np.ndarray
+SHOWN = 8
+"""Words of a finding or fix that the page shows."""
 Table = tuple[list[str], Rows]
 
 
@@ -191,12 +193,12 @@ MISTAKES = (
     Mistake("a second of flight", fit(lambda p: f"{p.log}@3:4.8"), "2 s", 3),
     Mistake("never off the ground", fit(lambda p: p.still()), "did it fly", 3),
     Mistake(
-        "the fitted log as validation", lambda p: (*fit(lambda p: p.log)(p), "--validate", p.log), "proves nothing"
+        "the fitted log as validation", lambda p: (*fit(lambda p: p.log)(p), "--validate", p.log), "cannot validate"
     ),
     Mistake(
         "the same flight in another format",
         lambda p: (*fit(lambda p: p.log)(p), "--validate", p.mcap),
-        "proves nothing",
+        "cannot validate",
     ),
     Mistake("mass in grams", of(lambda p: p.vehicle(mass=1300.0)), "gram|mass"),
     Mistake("mass half as much again", of(lambda p: p.vehicle(mass=1.95)), "mass 1.95 kg", 0),
@@ -205,7 +207,7 @@ MISTAKES = (
     Mistake("arms in centimetres", of(lambda p: p.arms(100.0)), "centimetres"),
     Mistake("no mass", of(lambda p: p.vehicle(mass=None)), "no 'mass'"),
     Mistake("tabs in a vehicle file", of(lambda p: p.bytes("vehicle.yaml", b"name: x\n\tmass: 1\n")), "line 2"),
-    Mistake("a vehicle file of another size", of(lambda p: "crazyflie"), "own vehicle file"),
+    Mistake("a vehicle file of another size", of(lambda p: "crazyflie"), "vehicle file of this log"),
     Mistake("a key misspelt", of(lambda p: p.vehicle(mass=None, mas=1.3)), "did you mean 'mass'"),
     Mistake("a vehicle name misspelt", of(lambda p: "pelicn"), "pelican"),
     Mistake("a vehicle file that is not there", of(lambda p: p.folder / "none.yaml"), "no vehicle file"),
@@ -229,7 +231,7 @@ MISTAKES = (
     Mistake(
         "health of a flight that did not fly",
         lambda p: ("health", p.still(), "--baseline", p.log, "--vehicle", "pelican"),
-        "did not fly",
+        "not a flight",
         3,
     ),
     Mistake("no vehicle given", lambda p: ("identify", p.log), "--vehicle"),
@@ -275,24 +277,34 @@ def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
     return code, re.sub(r"/\S*/(?=[^/\s]*)", "", lines[0])
 
 
-def shown(line: str) -> str:
-    """What the line finds and the fix: without program, log, long lists of what is allowed, and the way to insist."""
-    short = re.sub(r"^quadid: (log\.\w+: )?|; allowed: [^;]{30,}(?=; fix)|, or insist with --unchecked", "", line)
-    return short.replace("|", "/").replace("`", "")
+def shown(line: str, names: str) -> str:
+    """What the line finds and the fix, without program, log and what is allowed; long ones around `names`."""
+    short = re.sub(r"^quadid: (log\.\w+: )?|; allowed: [^;]{26,}(?=; fix)|, or insist with --unchecked", "", line)
+    return "; fix: ".join(_around(part, names) for part in short.split("; fix: ")).replace("|", "/").replace("`", "")
+
+
+def _around(text: str, names: str) -> str:
+    """`SHOWN` words of a text: its first ones, or those up to what `names` finds behind them."""
+    words = text.split()
+    if len(words) <= SHOWN + 2:
+        return text
+    found = re.search(names, text)
+    last = max(SHOWN, len(text[: found.end()].split())) if found else SHOWN
+    return "… " * (last > SHOWN) + " ".join(words[last - SHOWN : last]) + " …" * (last < len(words))
 
 
 def page() -> str:
     """The table of docs/mistakes.md."""
     head = [
-        "# Mistakes, and the first line that each gives", "",
-        "`python -m tests.cli.mistakes > docs/mistakes.md`; a test makes every mistake and compares. Each line begins "
-        "with `quadid:` and the log; long lists of what is allowed are left out here. Checks of units, frames and "
-        "motors can be overruled with `--unchecked`. *: the line does not name the cause yet.", "",
+        "# Mistakes and their first line", "",
+        "Written by `python -m tests.cli.mistakes`; a test makes each mistake. Lines begin with `quadid:` and the log; "
+        "… marks shortened ones. `--unchecked` overrules checks of units, frames and motors. *: does not name the "
+        "cause yet.", "",
         "| mistake | first line |", "|---|---|",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         place = prepare(Path(folder, "flights"))
-        rows = [f"| {m.what}{' *' * m.vague} | `{shown(first_line(m, place)[1])}` |" for m in MISTAKES]
+        rows = [f"| {m.what}{' *' * m.vague} | `{shown(first_line(m, place)[1], m.names)}` |" for m in MISTAKES]
     return "\n".join([*head, *rows]) + "\n"
 
 

@@ -35,7 +35,13 @@ def test_the_tutorial_runs_as_written(
     assert "Not to be used yet" in red
     assert "All 6 parameters identified; the simulation matches a flight it has not seen" in green
     assert "Not to be used" in poor
-    assert "near what sensor noise alone makes" in good
+    assert "at the noise floor" in good
+    page = (repository / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    printed = [" ".join(out.split()) for out in said]
+    quoted = re.findall(r"^> (.+)$", page, re.MULTILINE)
+    assert len(quoted) == 4
+    for sentence in quoted:
+        assert any(sentence in out for out in printed), sentence
     for file in ("report.html", "diagnosis.html", "pelican+weak_rotor+rotor_drag.yaml"):
         assert (tmp_path / file).is_file()
 

@@ -131,7 +131,7 @@ def test_nothing_but_the_guess_is_exit_3_and_still_written(inside: Cli, tmp_path
     log = write_table(tmp_path / "still.csv", names, rows)
     run = inside("identify", log, "--vehicle", "pelican", "--out", tmp_path, "--json", tmp_path / "r.json")
     assert run.code == 3
-    assert "say nothing about any parameter" in run.err
+    assert "reveal no parameter" in run.err
     assert "Traceback" not in run.err
     result = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
     assert {p["status"] for p in result["parameters"]} == {"prior_dominated"}
@@ -177,7 +177,7 @@ def test_a_rotor_signal_too_slow_for_inertias_tells_thrust_alone(inside: Cli, da
     for p in run.data["parameters"][1:]:
         assert p["value"] == p["initial"]
         assert p["ci95"][0] < 0.5 * p["value"]
-    assert any("d, J_xx, J_yy, J_zz, J_r: the vehicle file's values stand" in w for w in run.data["warnings"])
+    assert any("d, J_xx, J_yy, J_zz, J_r: the vehicle file's values are kept" in w for w in run.data["warnings"])
     assert "rotor signal at 10 Hz is too slow, 30 Hz needed" in run.err
 
 

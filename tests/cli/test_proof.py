@@ -50,7 +50,7 @@ def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
     assert not proven.vehicle.proof.lacking
     found = quadid.diagnose(one)
     assert found.verdict.level == "fair"
-    assert any("has not seen" in line for line in found.verdict.details)
+    assert any("no unseen flight" in line for line in found.verdict.details)
 
 
 @pytest.fixture(scope="module")

@@ -72,7 +72,7 @@ def test_a_vehicle_that_runs_away_is_called_that_and_warns_of_nothing_else(
         warnings.simplefilter("error")
         run = inside("score", data_dir / "nanodrone" / "square_run1.csv", "--vehicle", file, "--horizons", "1,1500")
     assert run.code == 0
-    assert "after 1500 samples the simulation runs away" in run.out
+    assert "after 1500 samples the simulation diverges" in run.out
     assert run.out.count("ran away") >= 4
 
 

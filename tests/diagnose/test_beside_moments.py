@@ -50,7 +50,7 @@ def test_turbulence_does_not_pass_for_inertia() -> None:
         assert parameters[name].ci95[0] < truth[name] < parameters[name].ci95[1]
         assert parameters[name].status not in UNKNOWN
     assert all(parameters[name].status in UNKNOWN for name in ("d", "J_zz", "J_r"))
-    assert any("quick motion" in w for w in found.warnings)
+    assert any("fast motion" in w for w in found.warnings)
     written = Vehicle.from_yaml(found.vehicle_yaml).parameters
     assert all(written[n].initial == pytest.approx(parameters[n].value, rel=1e-6) for n in SHOWN)
 

@@ -20,9 +20,10 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
     assert set(explained) == set(EFFECTS)
     assert len(parts) == len(EFFECTS)
     for name, part in explained.items():
-        for word in ("**What:**", "**Equation:**", "**Size:**", "**Signature:**", "**Confused with:**", "**Advice:**"):
+        for word in ("**What:**", "**Equation:**", "**Size:**", "**Signature:**", "**Look-alikes:**"):
             assert word in part, (name, word)
-        assert "**Separated by:**" in part, name
+        assert "**Separation:**" in part, name
+        assert EFFECTS[name].advice.endswith("."), f"{name}: what to do is said with the finding"
         assert ("(of the flight)" in part.splitlines()[0]) == EFFECTS[name].per_log, name
 
 

@@ -71,7 +71,7 @@ def test_lift_that_grows_with_airspeed_is_not_called_drag() -> None:
     assert found.verdict.value == "unknown"
     assert not [f for f in found.findings if f.confident]
     pushing = [p for f in found.findings for p in f.parameters if p.name in ("k_x", "k_y", "k_z") and p.ci95[1] < 0.0]
-    assert not pushing or any("it stands for something else" in w for w in found.warnings)
+    assert not pushing or any("it replaces another cause" in w for w in found.warnings)
     assert found.unexplained or found.unexplained_follows, "an unknown must say where it sits"
 
 

@@ -12,15 +12,16 @@ from quadid.parameters import NOMINAL_UNITS
 from quadid.vehicle import Vehicle
 
 
-def test_the_dictionary_of_symbols_has_every_parameter_with_its_unit(repository: Path) -> None:
+def test_symbols_and_effects_have_every_parameter_with_its_unit(repository: Path) -> None:
     text = (repository / "docs" / "symbols.md").read_text(encoding="utf-8")
     plain = text.replace("²", "^2")
     for name, unit in NOMINAL_UNITS.items():
         row = next(line for line in plain.splitlines() if line.startswith(f"| {name} | `{name}` |"))
         assert unit in row
+    page = (repository / "docs" / "effects.md").read_text(encoding="utf-8")
+    parts = dict(re.findall(r"^### (\w+)[^\n]*\n(.*?)\. \*\*What:", page, flags=re.MULTILINE | re.DOTALL))
     for effect in EFFECTS.values():
-        row = next(line for line in plain.splitlines() if line.startswith(f"| `{effect.name}` |"))
-        groups = [group.strip(" ]").split(" [") for group in row.split("|")[2].split(";")]
+        groups = [group.strip(" ]").split(" [") for group in parts[effect.name].replace("²", "^2").split(";")]
         stated = [(name.strip(" `"), unit) for names, unit in groups for name in names.split(",")]
         assert stated == [(p.name, p.unit or "1") for p in effect.parameters]
 

@@ -42,13 +42,12 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert "1 failed, 1 passed, 1 skipped" in done.stdout, done.stdout
     text = (tmp_path / "page.md").read_text()
-    assert "cut at \\| 300 places of &lt;b>" in text
-    assert "never true" not in text
-    assert "never seen" not in text
-    assert "renamed since" not in text
-    assert "not run now" in text
+    account = json.loads((tmp_path / "page.json").read_text())
+    said = {text for _, text, _, _ in account}
+    assert {"cut at | 300 places of <b>", "not run now"} <= said
+    assert not said & {"never true", "never seen", "renamed since"}
     assert "of an earlier run" not in (tmp_path / "page.json").read_text()
-    assert {t for _, _, t, _ in json.loads((tmp_path / "page.json").read_text())} == {
+    assert {t for _, _, t, _ in account} == {
         f"test_x.py::test_{name}" for name in ("green", "silent", "silent[1]", "silent[a@b]")
     }
     assert f"3 of {len(FAULTS)} rows have evidence, from 4 tests" in text
@@ -59,9 +58,6 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
 def test_every_row_is_listed_once_with_its_number() -> None:
     said = [Evidence(7, "second", "b::x"), Evidence(7, "once more", "a::z"), Evidence(7, "first", "a::y")]
     text = page(said, [], [], "make faults")
-    assert sum(line.startswith("| 7 |") for line in text.splitlines()) == 1
-    assert "| first |" in text
-    assert "once more" not in text
-    assert "; second" not in text
+    assert [line.endswith("| 3 |") for line in text.splitlines() if line.startswith("| 7 |")] == [True]
     assert text.count("no test of this row passed") == len(FAULTS) - 1
     assert list(FAULTS) == list(range(1, len(FAULTS) + 1))

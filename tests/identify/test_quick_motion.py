@@ -74,7 +74,7 @@ def test_turbulence_does_not_pass_for_inertia(change: str) -> None:
         assert p.value == pytest.approx(truth[name], rel=0.04)
         assert p.ci95[0] < truth[name] < p.ci95[1]
     assert all(found.parameters[name].status not in SURE for name in ("d", "J_zz", "J_r"))
-    assert any("quick motion" in w for w in found.warnings)
+    assert any("fast motion" in w for w in found.warnings)
     assert len(found.parameters) == 6, "what is late was fitted along, and is not told"
 
 
@@ -87,7 +87,7 @@ def test_without_random_moments_it_does(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_calm_flight_is_fitted_whole() -> None:
     window = fly(PELICAN, draw_truth(PELICAN, SEED), 60.0, SEED).window
-    assert not any("quick motion" in w for w in fitted(window).warnings)
+    assert not any("fast motion" in w for w in fitted(window).warnings)
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])

@@ -34,7 +34,7 @@ def topic() -> Topic:
 @pytest.mark.parametrize(
     ("offers", "told"),
     [
-        ([GOOD, GOOD], "2 publishers on one topic: paused until one is heard alone"),
+        ([GOOD, GOOD], "2 publishers on one topic: paused until only one publishes"),
         ([Offer(IMU, False)], "its publisher's QoS does not match"),
         ([GOOD, Offer(JOINTS, True)], f"a publisher of another type ({JOINTS} for {IMU}), which is not listened to"),
     ],
@@ -64,7 +64,7 @@ def test_a_publisher_that_is_listed_but_not_heard_does_not_pause(topic: Topic) -
     topic.neighbours.count("/imu", 2)
     assert topic.neighbours.paused
     topic.unbroken = 1.1
-    assert topic.look(GOOD, GOOD) == {"/imu": "2 publishers on one topic, one of them is heard"}
+    assert topic.look(GOOD, GOOD) == {"/imu": "2 publishers on one topic, only one publishes"}
     assert not topic.neighbours.paused
     topic.unbroken = 0.02
     topic.neighbours.count("/imu", 2)

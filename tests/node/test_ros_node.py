@@ -342,7 +342,7 @@ def test_a_second_publisher_that_speaks_pauses_it_and_a_killed_one_does_not(
             assert ear.until(lambda: level(health, "inputs") == b"\x00", 20.0), identify.text
         # The player was killed: it stays listed until its lease ends.
         with player(log, 1.0):
-            assert ear.until(lambda: "one of them is heard" in message(health, "inputs") and rate() > 20.0, 15.0), (
+            assert ear.until(lambda: "only one publishes" in message(health, "inputs") and rate() > 20.0, 15.0), (
                 message(health, "inputs")
             )
 

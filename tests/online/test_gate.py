@@ -84,7 +84,7 @@ def test_a_good_estimate_is_accepted_or_waits_for_a_person() -> None:
         ({"held_out": ()}, "held_out_gain", "no window"),
         ({"held_out": (-100.0,)}, "held_out_gain", "worse"),
         ({"held_out": (math.nan,)}, "held_out_gain", "scored"),
-        ({"in_force": online_set(TRUE), "held_out": (1.0,)}, "held_out_gain", "no news"),
+        ({"in_force": online_set(TRUE), "held_out": (1.0,)}, "held_out_gain", "no improvement"),
         ({"in_force": online_set(scaled(b=1.3)), "baseline": None}, "step_limit", "b would change"),
         ({"baseline": online_set(scaled(J_yy=1.7))}, "step_limit", "baseline"),
     ],

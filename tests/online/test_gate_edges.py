@@ -45,7 +45,7 @@ def led_by(item: OnlineSet | ParameterSet, value: float, sigma: float = 0.01) ->
         ({"held_out": (-100.0,)}, "held_out_gain",
          "predicts unseen data worse than the set in force: deviance 100.0 more in 1 windows"),
         ({"held_out": (1.0,), "in_force": online_set(TRUE)}, "held_out_gain",
-         "no news: the set in force predicts as well and its intervals are about as narrow"),
+         "no improvement over the set in force: it predicts as well with about as narrow intervals"),
         ({"in_force": online_set(scaled(b=2.0))}, "step_limit", "b would change by -50% from the set in force, all"),
         ({"baseline": online_set(scaled(b=2.0))}, "step_limit", "b would change by -50% from the approved baseline"),
         ({"parameters": parameter_set(scaled(b=1.2, J_xx=0.84)), "baseline": online_set(TRUE)}, "reference",

@@ -183,7 +183,7 @@ def test_while_a_diagnosis_calls_a_sensor_wrong_nothing_is_published(scale: floa
     session.deliver(DiagnosisReply(study.number, "", (gyro,), "explained"))
     last = published(works(session, between(LONG, 63.7, 95.7), tells()), "candidate")[-1]
     assert last.check == check
-    assert ("the diagnosis stands: gyro x reads too much" in last.reason) == (check == "model")
+    assert ("the diagnosis is in force: gyro x reads too much" in last.reason) == (check == "model")
 
 
 @pytest.mark.parametrize("worker", ["failing", "blind", "off"])

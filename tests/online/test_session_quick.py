@@ -74,7 +74,7 @@ def test_two_windows_that_agree_give_a_set_and_a_third_gives_no_news() -> None:
     assert [c.stop - EPOCH for c in candidates] == [4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0]
     assert [c.state for c in candidates[:4]] == [SetState.REJECTED] * 4
     assert "keep flying" in candidates[0].reason
-    assert "no news" in candidates[-1].reason
+    assert "no improvement" in candidates[-1].reason
 
 
 def test_the_status_tells_what_was_done() -> None:

@@ -194,7 +194,7 @@ def test_a_description_that_changes_within_a_log_ends_its_column(tmp_path: Path,
     path.write_bytes(bytes(log.data))
     recording = open_log(path)
     np.testing.assert_allclose(recording.channels["gyro"].values, np.tile([0.1, 0.2, 0.3], (50, 1)), rtol=1e-6)
-    assert any("IMU described anew" in w for w in recording.warnings)
+    assert any("IMU redefined" in w for w in recording.warnings)
     happened(31, "IMU described anew with gyro and accelerometer swapped: read up to there, and said")
 
 

@@ -212,7 +212,7 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
     for expected in (
         "Found: motor lag",
         "0.05",
-        "a controller that knows it",
+        "a controller can compensate it",
         "Validation error with and without it",
         "2 %",
         "95 % interval 1.9 to 2.2",

@@ -58,7 +58,7 @@ def test_no_validation_asks_for_one() -> None:
     verdict = identify_verdict(_result(role="train"))
     assert "--validate" in verdict.next_steps[0]
     assert verdict.level == "fair"
-    assert any("has not seen" in line for line in verdict.details)
+    assert any("no unseen flight" in line for line in verdict.details)
 
 
 def test_seconds_of_data_prove_nothing() -> None:

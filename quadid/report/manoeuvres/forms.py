@@ -39,9 +39,9 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
     if form == "ardupilot-sid":
         if not plan.sweeps:
             raise ParameterError(
-                f"no room for sweeps of one axis after the other in {plan.seconds:g} s",
+                f"too short for sweeps of one axis after the other: {plan.seconds:g} s",
                 "36 s or more",
-                "give --seconds 60",
+                "use --seconds 60",
             )
         return system_id(plan, hover_throttle)
     if form == "px4":

@@ -43,8 +43,8 @@ class Plan:
             f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the "
             f"start, tilt {e['abort_tilt_deg']:.0f} deg, {e['battery_percent']:g} % of the battery left.",
             f"Promised 95 % intervals: {', '.join(f'{n} {half_width(v)}' for n, v in promise.items())}.",
-            "They come from a simulated flight with the values believed so far; what a real log obtained, "
-            "`quadid identify` says.",
+            "They are predicted by a simulated flight with the current values; `quadid identify` states what "
+            "a real log obtained.",
         ]
 
 

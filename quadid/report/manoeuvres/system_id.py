@@ -45,7 +45,7 @@ def _file(plan: Plan, i: int, sweep: Mapping[str, Any], hover_throttle: float) -
     }  # fmt: skip
     head = [
         *plan.header(plan.promise_sweeps, f"{_WHAT}, {i + 1} of {len(plan.sweeps)} ({axis})"),
-        "The intervals hold for all files flown one after the other; moving all axes at once tells more.",
+        "The intervals hold for all files flown one after the other; moving all axes at once reveals more.",
         f"Use: load, set a flight mode to {MODE} (SystemID), hover, switch to it, keep the place with the sticks; it "
         f"sweeps for {sweep['duration']:g} s.",
         f"BATT_LOW_MAH: set it to {e['battery_percent']:g} % of BATT_CAPACITY. ArduCopter 4.7: ATC_ANGLE_MAX "

@@ -36,7 +36,7 @@ def drone_models(facts: Facts) -> str:
     lines = [f"# {line}" for line in facts.header(CARRIED)]
     lines += [
         "#   Drag acts at the CG: what it damps of turning is left out.",
-        f"#   J_r = {facts.value('J_r'):.6g} kg m^2 is left out: version 0.1 gives gyroscopic torque a wrong sign",
+        f"#   J_r = {facts.value('J_r'):.6g} kg m^2 is left out: version 0.1 has a wrong sign of the gyroscopic torque",
         "", f"[{_bare(facts.vehicle.name)}]", f"gravity_vec = [0.0, 0.0, {-GRAVITY}]  # m/s^2",
         f"mass = {m:.8g}  # kg", f"L = {facts.vehicle.arm:.8g}  # m",
         f"J = {matrix(facts.inertia_flu)}  # kg m^2",

@@ -169,7 +169,7 @@ class Facts:
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
         lines += [
             f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",
-            "Where the values come from:",
+            "Sources of the values:",
         ]
         lines += [f"  {n} = {self.value(n):.6g} {unit}: {self.origin(n)}" for n, unit in NOMINAL_UNITS.items()]
         lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
