@@ -24,7 +24,7 @@ from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
-from quadid.model.simd import LANES, aligned, jit, lane_kernel
+from quadid.model.simd import LANES, aligned, lane_kernel, whole
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -204,7 +204,7 @@ def peak_case() -> Case:
     """Fused multiply-adds of float64 on one core: independent chains that stay in registers."""
     scope: dict[str, object] = {"lane_kernel": lane_kernel}
     exec(_peak_source(), scope)  # written out, because there are no loops over registers
-    peak = nb.njit(**jit)(scope["peak"])
+    peak = nb.njit(**whole)(scope["peak"])
     x = aligned((8 * PEAK_CHAINS,))
     x[:] = 0.0
     return Case("peak", PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8, lambda: peak(PEAK_ROUNDS, 0.5, x))

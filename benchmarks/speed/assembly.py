@@ -13,6 +13,7 @@ import numba as nb
 
 from quadid.model.body_kernel import step_air, step_full, step_solid
 from quadid.model.kernel import step_core
+from quadid.model.simd import whole
 
 WIDEST = ("zmm", "ymm", "xmm")
 _ARITHMETIC = re.compile(r"v(fn?m(add|sub)|add|sub|mul|min|max|rcp|rsqrt)")
@@ -24,7 +25,8 @@ def instructions() -> dict[str, Any]:
     return {"steps": {name: _counted(step) for name, step in steps.items()}}
 
 
-def _counted(step: Any) -> dict[str, Any]:
+def _counted(piece: Any) -> dict[str, Any]:
+    step = nb.njit(**whole)(piece.py_func)
     step.compile((nb.float64, nb.float64[::1]))
     lines = [line.strip() for line in step.inspect_asm(step.signatures[0]).splitlines() if line.startswith("\t")]
     body = [line for line in lines if not line.startswith(".")]

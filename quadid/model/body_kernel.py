@@ -30,115 +30,113 @@ from quadid.model.simd import LANES, inlined, jit, lane_kernel, variant
 
 
 @nb.njit(**inlined)
-def _at(row, wa, wb, lane, s):  # type: ignore[no-untyped-def]
+def _at(place, wa, wb, s):  # type: ignore[no-untyped-def]
     """A moment at one stage of a step, linear in time through its means over both halves."""
-    return wa * s[row + lane] + wb * s[row + HALF + lane]
+    return wa * s[place] + wb * s[place + HALF]
 
 
-def _body_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
-    """Right-hand side of `_step_of`: angular acceleration, specific force at the IMU, acceleration in NED."""
-
-    @nb.njit(**inlined)
-    @variant(f"{air:d}{hub:d}{solid:d}{rare:d}")
-    def body(qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, o1, do, g, im, lift, wa, wb, lane, s):  # type: ignore[no-untyped-def]
-        b = s[C_B + lane]
+@nb.njit(**inlined)
+def _body(  # type: ignore[no-untyped-def]
+    air, hub, solid, rare, qw, qx, qy, qz, p, q, r, vn, ve, vd, s2, x2, y2, z2, o1, do, g, im, lift, wa, wb, lane, s
+):
+    """Right-hand side of `_step`: angular acceleration, specific force at the IMU, acceleration in NED."""
+    b = s[C_B + lane]
+    if solid:
+        b *= g
+    if rare:
+        b *= lift
+    # Specific force of the unloaded mass; im scales all of it when mass is taken up.
+    thrust = b * s2
+    sx, sy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0
+    fx, fy, fz, mx, my, mz, cx, cy, cz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if air:
+        # Velocity relative to the air, in body axes.  This form of the rotation matrix keeps the heading of the
+        # world's axes out of the motion even at the inner stages, where the quaternion is not of unit length.
+        rn, re, rd = vn - s[C_WN + lane], ve - s[C_WE + lane], vd
+        ww, xx, yy, zz = qw * qw, qx * qx, qy * qy, qz * qz
+        r00, r01, r02 = ww + xx - yy - zz, 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
+        r10, r11, r12 = 2.0 * (qx * qy + qw * qz), ww - xx + yy - zz, 2.0 * (qy * qz - qw * qx)
+        r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), ww - xx - yy + zz
+        u = r00 * rn + r10 * re + r20 * rd
+        v = r01 * rn + r11 * re + r21 * rd
+        w = r02 * rn + r12 * re + r22 * rd
+    if hub:
+        # Air at each hub, v + nu x r_i: sums over rotors of omega_i times products of their places, about the
+        # middle of the hubs at (cx, cy, cz) from the CG.  Arms of drag and inflow are shorter by `central`.
+        cz, hd, hf = s[C_HUB + lane], 1.0, 1.0
         if solid:
-            b *= g
-        if rare:
-            b *= lift
-        # Specific force of the unloaded mass; im scales all of it when mass is taken up.
-        thrust = b * s2
-        sx, sy, an, ae, ad = 0.0, 0.0, 0.0, 0.0, 0.0
-        fx, fy, fz, mx, my, mz, cx, cy, cz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        if air:
-            # Velocity relative to the air, in body axes.  This form of the rotation matrix keeps the heading of the
-            # world's axes out of the motion even at the inner stages, where the quaternion is not of unit length.
-            rn, re, rd = vn - s[C_WN + lane], ve - s[C_WE + lane], vd
-            ww, xx, yy, zz = qw * qw, qx * qx, qy * qy, qz * qz
-            r00, r01, r02 = ww + xx - yy - zz, 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)
-            r10, r11, r12 = 2.0 * (qx * qy + qw * qz), ww - xx + yy - zz, 2.0 * (qy * qz - qw * qx)
-            r20, r21, r22 = 2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), ww - xx - yy + zz
-            u = r00 * rn + r10 * re + r20 * rd
-            v = r01 * rn + r11 * re + r21 * rd
-            w = r02 * rn + r12 * re + r22 * rd
-        if hub:
-            # Air at each hub, v + nu x r_i: sums over rotors of omega_i times products of their places, about the
-            # middle of the hubs at (cx, cy, cz) from the CG.  Arms of drag and inflow are shorter by `central`.
-            cz, hd, hf = s[C_HUB + lane], 1.0, 1.0
-            if solid:
-                cx, cy = -s[C_CGX + lane], -s[C_CGY + lane]
-                hd, hf = s[C_DRAG_ARM + lane], s[C_FLOW_ARM + lane]
-            u1, v1 = u + hd * (q * cz - r * cy), v + hd * (r * cx - p * cz)
-            w1 = w + hf * (p * cy - q * cx)
-            kx, ky, kz = s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane]
-            o, ox = _at(A_S1, wa, wb, lane, s), _at(A_X1, wa, wb, lane, s)
-            oy, oz = _at(A_Y1, wa, wb, lane, s), _at(A_Z1, wa, wb, lane, s)
-            xx, yy, zz = _at(A_XX, wa, wb, lane, s), _at(A_YY, wa, wb, lane, s), _at(A_ZZ, wa, wb, lane, s)
-            xy, xz, yz = _at(A_XY, wa, wb, lane, s), _at(A_XZ, wa, wb, lane, s), _at(A_YZ, wa, wb, lane, s)
-            fx, fy = -kx * (u1 * o + hd * (q * oz - r * oy)), -ky * (v1 * o + hd * (r * ox - p * oz))
-            fz = -kz * (w1 * o + hf * (p * oy - q * ox))
-            mx = hd * (ky * (v1 * oz + hd * (r * xz - p * zz)) - cz * fy)
-            my = hd * (cz * fx - kx * (u1 * oz + hd * (q * zz - r * yz)))
-            mx -= hf * (kz * (w1 * oy + hf * (p * yy - q * xy)) - cy * fz)
-            my += hf * (kz * (w1 * ox + hf * (p * xy - q * xx)) - cx * fz)
-            mz = kx * (u1 * oy + hd * (q * yz - r * yy)) - ky * (v1 * ox + hd * (r * xx - p * xz))
-            mz = hd * (mz + cx * fy - cy * fx)
-            sx, sy = fx * s[C_INVM + lane], fy * s[C_INVM + lane]
-        sz = (fz - thrust) * s[C_INVM + lane]
-        if rare:
-            speed = math.sqrt(u * u + v * v + w * w)
-            flat, tall = s[C_CPAR + lane] * speed, s[C_CPAR_Z + lane] * speed
-            sx, sy = sx - flat * u + s[L_FX + lane], sy - flat * v + s[L_FY + lane]
-            sz += s[L_FZ + lane] - tall * w
-            # Lift of each hub's own sideways speed, u1 - r y and v1 + r x: means over the hubs of its products.
-            u1, v1 = u + q * cz - r * cy, v + r * cx - p * cz
-            gx, gy, gxx = s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane]
-            gyy, gxy, k, square = s[C_GYY + lane], s[C_GXY + lane], s[C_LIFT + lane], u1 * u1 + v1 * v1
-            up = k * (square + 2.0 * r * (v1 * gx - u1 * gy) + r * r * (gxx + gyy))
-            mx -= k * (square * gy + 2.0 * r * (v1 * gxy - u1 * gyy)) + cy * up
-            my += k * (square * gx + 2.0 * r * (v1 * gxx - u1 * gxy)) + cx * up
-            sz -= up * s[C_INVM + lane]
-        if solid:
-            sx, sy, sz = sx * im, sy * im, sz * im
-        if air:
-            an = r00 * sx + r01 * sy + r02 * sz
-            ae = r10 * sx + r11 * sy + r12 * sz
-            ad = r20 * sx + r21 * sy + r22 * sz + GRAVITY
-        jr, d = s[C_JR + lane] * o1, s[C_D + lane]
-        jxx, jyy, jzz = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane]
-        if not solid:
-            ap = s[C_IXX + lane] * (jr * q - b * y2 + mx - (jzz - jyy) * q * r)
-            aq = s[C_IYY + lane] * (b * x2 + my - jr * p - (jxx - jzz) * p * r)
-            ar = s[C_IZZ + lane] * (d * z2 + mz - (jyy - jxx) * p * q)
-            return ap, aq, ar, an, ae, ad, sx, sy, sz
-        tx = -b * y2 + s[C_CGY + lane] * thrust + mx + s[C_HY + lane] * fy + jr * q
-        ty = b * x2 - s[C_CGX + lane] * thrust + my - s[C_HX + lane] * fx - jr * p
-        tz = d * g * z2 + mz + s[C_JSPIN + lane] * do
-        if rare:
-            tx, ty, tz = tx + s[L_MX + lane], ty + s[L_MY + lane], tz + s[L_MZ + lane]
-        jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
-        lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
-        turning = s[C_TURNING + lane]
-        tx -= turning * (q * lz - r * ly)
-        ty -= turning * (r * lx - p * lz)
-        tz -= turning * (p * ly - q * lx)
-        ap = s[C_IXX + lane] * tx + s[C_IXY + lane] * ty + s[C_IXZ + lane] * tz - s[C_LP + lane] * p
-        aq = s[C_IXY + lane] * tx + s[C_IYY + lane] * ty + s[C_IYZ + lane] * tz - s[C_MQ + lane] * q
-        ar = s[C_IXZ + lane] * tx + s[C_IYZ + lane] * ty + s[C_IZZ + lane] * tz - s[C_NR + lane] * r
-        # Specific force where the IMU sits: rigid-body acceleration of a point at (rx, ry, rz) from the CG.
-        rx, ry, rz = s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane]
-        dot = p * rx + q * ry + r * rz
-        sq = p * p + q * q + r * r
-        sx += aq * rz - ar * ry + p * dot - rx * sq
-        sy += ar * rx - ap * rz + q * dot - ry * sq
-        sz += ap * ry - aq * rx + r * dot - rz * sq
+            cx, cy = -s[C_CGX + lane], -s[C_CGY + lane]
+            hd, hf = s[C_DRAG_ARM + lane], s[C_FLOW_ARM + lane]
+        u1, v1 = u + hd * (q * cz - r * cy), v + hd * (r * cx - p * cz)
+        w1 = w + hf * (p * cy - q * cx)
+        kx, ky, kz = s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane]
+        o, ox = _at(A_S1 + lane, wa, wb, s), _at(A_X1 + lane, wa, wb, s)
+        oy, oz = _at(A_Y1 + lane, wa, wb, s), _at(A_Z1 + lane, wa, wb, s)
+        xx, yy, zz = _at(A_XX + lane, wa, wb, s), _at(A_YY + lane, wa, wb, s), _at(A_ZZ + lane, wa, wb, s)
+        xy, xz, yz = _at(A_XY + lane, wa, wb, s), _at(A_XZ + lane, wa, wb, s), _at(A_YZ + lane, wa, wb, s)
+        fx, fy = -kx * (u1 * o + hd * (q * oz - r * oy)), -ky * (v1 * o + hd * (r * ox - p * oz))
+        fz = -kz * (w1 * o + hf * (p * oy - q * ox))
+        mx = hd * (ky * (v1 * oz + hd * (r * xz - p * zz)) - cz * fy)
+        my = hd * (cz * fx - kx * (u1 * oz + hd * (q * zz - r * yz)))
+        mx -= hf * (kz * (w1 * oy + hf * (p * yy - q * xy)) - cy * fz)
+        my += hf * (kz * (w1 * ox + hf * (p * xy - q * xx)) - cx * fz)
+        mz = kx * (u1 * oy + hd * (q * yz - r * yy)) - ky * (v1 * ox + hd * (r * xx - p * xz))
+        mz = hd * (mz + cx * fy - cy * fx)
+        sx, sy = fx * s[C_INVM + lane], fy * s[C_INVM + lane]
+    sz = (fz - thrust) * s[C_INVM + lane]
+    if rare:
+        speed = math.sqrt(u * u + v * v + w * w)
+        flat, tall = s[C_CPAR + lane] * speed, s[C_CPAR_Z + lane] * speed
+        sx, sy = sx - flat * u + s[L_FX + lane], sy - flat * v + s[L_FY + lane]
+        sz += s[L_FZ + lane] - tall * w
+        # Lift of each hub's own sideways speed, u1 - r y and v1 + r x: means over the hubs of its products.
+        u1, v1 = u + q * cz - r * cy, v + r * cx - p * cz
+        gx, gy, gxx = s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane]
+        gyy, gxy, k, square = s[C_GYY + lane], s[C_GXY + lane], s[C_LIFT + lane], u1 * u1 + v1 * v1
+        up = k * (square + 2.0 * r * (v1 * gx - u1 * gy) + r * r * (gxx + gyy))
+        mx -= k * (square * gy + 2.0 * r * (v1 * gxy - u1 * gyy)) + cy * up
+        my += k * (square * gx + 2.0 * r * (v1 * gxx - u1 * gxy)) + cx * up
+        sz -= up * s[C_INVM + lane]
+    if solid:
+        sx, sy, sz = sx * im, sy * im, sz * im
+    if air:
+        an = r00 * sx + r01 * sy + r02 * sz
+        ae = r10 * sx + r11 * sy + r12 * sz
+        ad = r20 * sx + r21 * sy + r22 * sz + GRAVITY
+    jr, d = s[C_JR + lane] * o1, s[C_D + lane]
+    jxx, jyy, jzz = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane]
+    if not solid:
+        ap = s[C_IXX + lane] * (jr * q - b * y2 + mx - (jzz - jyy) * q * r)
+        aq = s[C_IYY + lane] * (b * x2 + my - jr * p - (jxx - jzz) * p * r)
+        ar = s[C_IZZ + lane] * (d * z2 + mz - (jyy - jxx) * p * q)
         return ap, aq, ar, an, ae, ad, sx, sy, sz
+    tx = -b * y2 + s[C_CGY + lane] * thrust + mx + s[C_HY + lane] * fy + jr * q
+    ty = b * x2 - s[C_CGX + lane] * thrust + my - s[C_HX + lane] * fx - jr * p
+    tz = d * g * z2 + mz + s[C_JSPIN + lane] * do
+    if rare:
+        tx, ty, tz = tx + s[L_MX + lane], ty + s[L_MY + lane], tz + s[L_MZ + lane]
+    jxy, jxz, jyz = s[C_JXY + lane], s[C_JXZ + lane], s[C_JYZ + lane]
+    lx, ly, lz = jxx * p + jxy * q + jxz * r, jxy * p + jyy * q + jyz * r, jxz * p + jyz * q + jzz * r
+    turning = s[C_TURNING + lane]
+    tx -= turning * (q * lz - r * ly)
+    ty -= turning * (r * lx - p * lz)
+    tz -= turning * (p * ly - q * lx)
+    ap = s[C_IXX + lane] * tx + s[C_IXY + lane] * ty + s[C_IXZ + lane] * tz - s[C_LP + lane] * p
+    aq = s[C_IXY + lane] * tx + s[C_IYY + lane] * ty + s[C_IYZ + lane] * tz - s[C_MQ + lane] * q
+    ar = s[C_IXZ + lane] * tx + s[C_IYZ + lane] * ty + s[C_IZZ + lane] * tz - s[C_NR + lane] * r
+    # Specific force where the IMU sits: rigid-body acceleration of a point at (rx, ry, rz) from the CG.
+    rx, ry, rz = s[C_RX + lane], s[C_RY + lane], s[C_RZ + lane]
+    dot = p * rx + q * ry + r * rz
+    sq = p * p + q * q + r * r
+    sx += aq * rz - ar * ry + p * dot - rx * sq
+    sy += ar * rx - ap * rz + q * dot - ry * sq
+    sz += ap * ry - aq * rx + r * dot - rz * sq
+    return ap, aq, ar, an, ae, ad, sx, sy, sz
 
-    return body
 
-
-def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
-    """Compiles a step for a group of effects: a branch on these constants leaves nothing behind.
+@nb.njit(**inlined)
+def _step(air, hub, solid, rare, dt, s):  # type: ignore[no-untyped-def]
+    """One step with a group of effects, known where this is inlined: the others leave nothing behind.
 
     Args:
         air: velocity and position.
@@ -146,97 +144,104 @@ def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
         solid: products of inertia, centre of gravity, lever arm, damping, spin-up, moment of drag, thrust and mass that
             change in flight.
         rare: parasitic drag and ground effect, for their roots and divisions; needs `air`.
+        dt: step [s].
+        s: rows; as in `quadid.model.kernel.step_core`.
     """
-    body = _body_of(air, hub, solid, rare)
+    h = 0.5 * dt
+    for lane in range(LANES):
+        s2a, s2b = s[A_S2 + lane], s[A_S2 + HALF + lane]
+        x2a, x2b = s[A_X2 + lane], s[A_X2 + HALF + lane]
+        y2a, y2b = s[A_Y2 + lane], s[A_Y2 + HALF + lane]
+        z2a, z2b = s[A_Z2 + lane], s[A_Z2 + HALF + lane]
+        o1a, o1b = s[A_O1 + lane], s[A_O1 + HALF + lane]
+        doa, dob = s[A_DO + lane], s[A_DO + HALF + lane]
+        ga, gb = s[A_G + lane], s[A_G + HALF + lane]
+        ma, mb = s[A_M + lane], s[A_M + HALF + lane]
+        qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
+        p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
+        s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
+        s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
+        vn, ve, vd = s[X_VN + lane], s[X_VE + lane], s[X_VD + lane]
+        # Ground effect at the middle of the step; a tiny number keeps 0 / 0 away where there is none.
+        lift = 1.0
+        if rare:
+            height = max(-s[X_D + lane] - h * vd, s[C_LOWEST + lane]) + 1e-12
+            lift = height * height / (height * height - s[C_GROUND + lane])
+        # stage 1
+        a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = _body(
+            air, hub, solid, rare, qw, qx, qy, qz, p, q, r, vn, ve, vd,
+            1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b, 1.5 * z2a - 0.5 * z2b,
+            1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, 1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift,
+            1.5, -0.5, lane, s,
+        )  # fmt: skip
+        k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
+        # stage 2
+        s2, x2, y2, z2 = 0.5 * (s2a + s2b), 0.5 * (x2a + x2b), 0.5 * (y2a + y2b), 0.5 * (z2a + z2b)
+        o1, do = 0.5 * (o1a + o1b), 0.5 * (doa + dob)
+        g, im = 0.5 * (ga + gb), 0.5 * (ma + mb)
+        p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
+        a, b, c, d = qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z
+        a2x, a2y, a2z, n2, e2, d2, f2x, f2y, f2z = _body(
+            air, hub, solid, rare, a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1,
+            s2, x2, y2, z2, o1, do, g, im, lift, 0.5, 0.5, lane, s,
+        )  # fmt: skip
+        k2w, k2x, k2y, k2z = rotation_rate(a, b, c, d, p2, q2, r2)
+        # stage 3
+        p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
+        a, b, c, d = qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z
+        a3x, a3y, a3z, n3, e3, d3, f3x, f3y, f3z = _body(
+            air, hub, solid, rare, a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2,
+            s2, x2, y2, z2, o1, do, g, im, lift, 0.5, 0.5, lane, s,
+        )  # fmt: skip
+        k3w, k3x, k3y, k3z = rotation_rate(a, b, c, d, p3, q3, r3)
+        # stage 4
+        p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
+        a, b, c, d = qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z
+        a4x, a4y, a4z, n4, e4, d4, f4x, f4y, f4z = _body(
+            air, hub, solid, rare, a, b, c, d, p4, q4, r4, vn + dt * n3, ve + dt * e3, vd + dt * d3,
+            1.5 * s2b - 0.5 * s2a, 1.5 * x2b - 0.5 * x2a, 1.5 * y2b - 0.5 * y2a, 1.5 * z2b - 0.5 * z2a,
+            1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga, 1.5 * mb - 0.5 * ma, lift,
+            -0.5, 1.5, lane, s,
+        )  # fmt: skip
+        k4w, k4x, k4y, k4z = rotation_rate(a, b, c, d, p4, q4, r4)
+        sixth = dt / 6.0
+        qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
+        qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
+        qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
+        qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
+        scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)
+        s[X_QW + lane], s[X_QX + lane] = qw * scale, qx * scale
+        s[X_QY + lane], s[X_QZ + lane] = qy * scale, qz * scale
+        s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
+        s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
+        s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
+        s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
+        s[S_BENDZ + lane] = h * (a4z - a1z)
+        if air:
+            s[X_VN + lane] = vn + sixth * (n1 + 2.0 * (n2 + n3) + n4)
+            s[X_VE + lane] = ve + sixth * (e1 + 2.0 * (e2 + e3) + e4)
+            s[X_VD + lane] = vd + sixth * (d1 + 2.0 * (d2 + d3) + d4)
+            s[X_N + lane] += dt * vn + dt * sixth * (n1 + n2 + n3)
+            s[X_E + lane] += dt * ve + dt * sixth * (e1 + e2 + e3)
+            s[X_D + lane] += dt * vd + dt * sixth * (d1 + d2 + d3)
+        # Means over the halves from a parabola through the stages.
+        fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
+        put_force(
+            TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
+            TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
+            lane, s,
+        )  # fmt: skip
+
+
+def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
+    """A step for a group of effects, see `_step`."""
 
     @nb.njit(**jit)
     @variant(f"{air:d}{hub:d}{solid:d}{rare:d}")
     def step(dt: float, s: FloatArray) -> None:
         lane_kernel()
-        h = 0.5 * dt
-        for lane in range(LANES):
-            s2a, s2b = s[A_S2 + lane], s[A_S2 + HALF + lane]
-            x2a, x2b = s[A_X2 + lane], s[A_X2 + HALF + lane]
-            y2a, y2b = s[A_Y2 + lane], s[A_Y2 + HALF + lane]
-            z2a, z2b = s[A_Z2 + lane], s[A_Z2 + HALF + lane]
-            o1a, o1b = s[A_O1 + lane], s[A_O1 + HALF + lane]
-            doa, dob = s[A_DO + lane], s[A_DO + HALF + lane]
-            ga, gb = s[A_G + lane], s[A_G + HALF + lane]
-            ma, mb = s[A_M + lane], s[A_M + HALF + lane]
-            qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
-            p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
-            s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
-            s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
-            vn, ve, vd = s[X_VN + lane], s[X_VE + lane], s[X_VD + lane]
-            # Ground effect at the middle of the step; a tiny number keeps 0 / 0 away where there is none.
-            lift = 1.0
-            if rare:
-                height = max(-s[X_D + lane] - h * vd, s[C_LOWEST + lane]) + 1e-12
-                lift = height * height / (height * height - s[C_GROUND + lane])
-            # stage 1
-            a1x, a1y, a1z, n1, e1, d1, f1x, f1y, f1z = body(
-                qw, qx, qy, qz, p, q, r, vn, ve, vd,
-                1.5 * s2a - 0.5 * s2b, 1.5 * x2a - 0.5 * x2b, 1.5 * y2a - 0.5 * y2b, 1.5 * z2a - 0.5 * z2b,
-                1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, 1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift,
-                1.5, -0.5, lane, s,
-            )  # fmt: skip
-            k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
-            # stage 2
-            s2, x2, y2, z2 = 0.5 * (s2a + s2b), 0.5 * (x2a + x2b), 0.5 * (y2a + y2b), 0.5 * (z2a + z2b)
-            o1, do = 0.5 * (o1a + o1b), 0.5 * (doa + dob)
-            g, im = 0.5 * (ga + gb), 0.5 * (ma + mb)
-            p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
-            a, b, c, d = qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z
-            a2x, a2y, a2z, n2, e2, d2, f2x, f2y, f2z = body(
-                a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1, s2, x2, y2, z2, o1, do, g, im, lift,
-                0.5, 0.5, lane, s,
-            )  # fmt: skip
-            k2w, k2x, k2y, k2z = rotation_rate(a, b, c, d, p2, q2, r2)
-            # stage 3
-            p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
-            a, b, c, d = qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z
-            a3x, a3y, a3z, n3, e3, d3, f3x, f3y, f3z = body(
-                a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2, s2, x2, y2, z2, o1, do, g, im, lift,
-                0.5, 0.5, lane, s,
-            )  # fmt: skip
-            k3w, k3x, k3y, k3z = rotation_rate(a, b, c, d, p3, q3, r3)
-            # stage 4
-            p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
-            a, b, c, d = qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z
-            a4x, a4y, a4z, n4, e4, d4, f4x, f4y, f4z = body(
-                a, b, c, d, p4, q4, r4, vn + dt * n3, ve + dt * e3, vd + dt * d3,
-                1.5 * s2b - 0.5 * s2a, 1.5 * x2b - 0.5 * x2a, 1.5 * y2b - 0.5 * y2a, 1.5 * z2b - 0.5 * z2a,
-                1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga, 1.5 * mb - 0.5 * ma, lift,
-                -0.5, 1.5, lane, s,
-            )  # fmt: skip
-            k4w, k4x, k4y, k4z = rotation_rate(a, b, c, d, p4, q4, r4)
-            sixth = dt / 6.0
-            qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
-            qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
-            qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
-            qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
-            scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)
-            s[X_QW + lane], s[X_QX + lane] = qw * scale, qx * scale
-            s[X_QY + lane], s[X_QZ + lane] = qy * scale, qz * scale
-            s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
-            s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
-            s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
-            s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
-            s[S_BENDZ + lane] = h * (a4z - a1z)
-            if air:
-                s[X_VN + lane] = vn + sixth * (n1 + 2.0 * (n2 + n3) + n4)
-                s[X_VE + lane] = ve + sixth * (e1 + 2.0 * (e2 + e3) + e4)
-                s[X_VD + lane] = vd + sixth * (d1 + 2.0 * (d2 + d3) + d4)
-                s[X_N + lane] += dt * vn + dt * sixth * (n1 + n2 + n3)
-                s[X_E + lane] += dt * ve + dt * sixth * (e1 + e2 + e3)
-                s[X_D + lane] += dt * vd + dt * sixth * (d1 + d2 + d3)
-            # Means over the halves from a parabola through the stages.
-            fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
-            put_force(
-                TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
-                TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
-                lane, s,
-            )  # fmt: skip
+        # bool() keeps numba from writing the step anew for each constant.
+        _step(bool(air), bool(hub), bool(solid), bool(rare), dt, s)
 
     return step
 

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from quadid.model.body_kernel import step_full
-from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core
+from quadid.model.kernel import Flight, body_constants, copy, flight_factors, load_payload, step_core
 from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
@@ -91,7 +91,7 @@ def _fly(
     wanted, torque = np.zeros((3, 3)), np.zeros(3)
     force, last, kept = np.zeros((2, 3, LANES)), np.zeros((3, LANES)), np.zeros((7, LANES))
     for k in range(len(references)):
-        last[:] = force[1]
+        copy(force[1], last)
         force[:] = 0.0
         rotation_of(references[k, 0], references[k, 1], references[k, 2], wanted)
         throttle = references[k, 3]
@@ -103,10 +103,14 @@ def _fly(
                 for r in range(rotors):
                     sent[step % HISTORY, r, lane] = command[r]
             for lane in range(lanes, LANES):
-                sent[step % HISTORY, :, lane] = sent[step % HISTORY, :, lanes - 1]
+                for r in range(rotors):
+                    sent[step % HISTORY, r, lane] = sent[step % HISTORY, r, lanes - 1]
             if step == 0:  # as if the first command had acted for ever
-                sent[1:] = sent[0]
-                rot[:, R_SPEED : R_SPEED + LANES] = sent[0]
+                for i in range(1, HISTORY):
+                    copy(sent[0], sent[i])
+                for r in range(rotors):
+                    for lane in range(LANES):
+                        rot[r, R_SPEED + lane] = sent[0, r, lane]
             _rotors(step, need, geometry, dt, sent, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
@@ -126,19 +130,24 @@ def _fly(
             _keep_half(2 * sub + 1, substeps, F2_X, force, s)
             if sub == 0:
                 for i in range(7):
-                    kept[i] = s[S_QW + i * LANES : S_QW + (i + 1) * LANES]
+                    for lane in range(LANES):
+                        kept[i, lane] = s[S_QW + i * LANES + lane]
         if k == 0:
-            last[:] = force[0]
+            copy(force[0], last)
         for i in range(3):
-            s[S_P + i * LANES : S_P + (i + 1) * LANES] = kept[4 + i]
-            # The accelerometer averages over one sample centred on t_k.
-            s[S_FX + i * LANES : S_FX + (i + 1) * LANES] = 0.5 * (last[i] + force[0, i])
+            for lane in range(LANES):
+                s[S_P + i * LANES + lane] = kept[4 + i, lane]
+                # The accelerometer averages over one sample centred on t_k.
+                s[S_FX + i * LANES + lane] = 0.5 * (last[i, lane] + force[0, i, lane])
         if need.imu_static:
             distort_imu(s)
         for i in range(3):
-            out[k, i] = s[S_P + i * LANES : S_P + (i + 1) * LANES]
-            out[k, 7 + i] = s[S_FX + i * LANES : S_FX + (i + 1) * LANES]
-        out[k, 3:7] = kept[:4]
+            for lane in range(LANES):
+                out[k, i, lane] = s[S_P + i * LANES + lane]
+                out[k, 7 + i, lane] = s[S_FX + i * LANES + lane]
+        for i in range(4):
+            for lane in range(LANES):
+                out[k, 3 + i, lane] = kept[i, lane]
 
 
 @nb.njit(**allocating)

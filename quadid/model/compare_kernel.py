@@ -113,10 +113,8 @@ def collect(
             turn = b3 * r[0, 0, 3 * LANES + lane] + b4 * r[0, 0, 4 * LANES + lane] + b5 * r[0, 0, 5 * LANES + lane]
             push = b6 * r[0, 0, 6 * LANES + lane] + b7 * r[0, 0, 7 * LANES + lane] + b8 * r[0, 0, 8 * LANES + lane]
             inside[j, lane] += rate + turn + push
-    if channels > 9:
-        _collect_three(9, seg, at, basis, r, total, inside)
-    if channels > 12:
-        _collect_three(12, seg, at, basis, r, total, inside)
+    for c in range(9, channels, 3):
+        _collect_three(c, seg, at, basis, r, total, inside)
 
 
 @nb.njit(**jit)

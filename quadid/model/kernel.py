@@ -143,6 +143,14 @@ def flight_factors(t: float, span0: float, span1: float, dt: float, s: FloatArra
             s[A_M + h * HALF + lane] = 1.0 - loaded * s[C_LOAD + lane]
 
 
+@nb.njit(**jit)
+def copy(source: FloatArray, target: FloatArray) -> None:
+    """Copies an array of two axes; loops, because an assignment of arrays compiles what tells shapes that differ."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
 @nb.njit(**exact)
 def load_payload(t: float, dt: float, theta: FloatArray, s: FloatArray) -> None:
     """Writes inertia, centre of gravity and lever arm with the share of a payload that is there in the step from t."""

@@ -93,155 +93,180 @@ def _held_piece(w0, a, e, e1, e3, h):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**inlined)
-def _sloped_piece(w0, a, slope, tau, piece, lane, s):  # type: ignore[no-untyped-def]
-    """As `_piece` for a sample of mean a and this slope; `piece`: which part of the step."""
-    e, e1, e2 = s[P_E + piece + lane], s[P_E1 + piece + lane], s[P_E2 + piece + lane]
-    e3, h, at = s[P_E3 + piece + lane], s[P_H + piece + lane], s[P_AT + piece + lane]
-    return _piece(w0, a + slope * at, slope, tau, e, e1, e2, e3, h)
+def _sloped_piece(w0, a, slope, tau, at, s):  # type: ignore[no-untyped-def]
+    """As `_piece` for a sample of mean a and this slope; `at`: which part of the step, and which lane."""
+    e, e1, e2, e3, h = s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at], s[P_H + at]
+    return _piece(w0, a + slope * s[P_AT + at], slope, tau, e, e1, e2, e3, h)
+
+
+@nb.njit(**inlined)
+def _add_rotor(keeps_means, m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s):  # type: ignore[no-untyped-def]
+    """Adds one rotor to `keep` times the moments of both half steps.
+
+    Integrals of omega and omega^2: m1, m2 over the first, n1, n2 over the second; omega: w0 at the start, wm, w1.
+    `keeps_means`: writes what later passes read, the means of speed and its square (rows R_M1 to R_N2).
+    """
+    gain, drag, dead, curve = rot[r, R_GAIN + lane], rot[r, R_DRAG + lane], 2.0 * s[C_W0 + lane], s[C_CURVE + lane]
+    m1, m2, n1, n2 = inv * m1, inv * m2, inv * n1, inv * n2
+    lift, next_lift = gain * (m2 - dead * m1 + curve), gain * (n2 - dead * n1 + curve)
+    if keeps_means:
+        rot[r, R_M1 + lane], rot[r, R_M2 + lane] = m1, m2
+        rot[r, R_N1 + lane], rot[r, R_N2 + lane] = n1, n2
+    s[A_S2 + lane] = keep * s[A_S2 + lane] + lift
+    s[A_X2 + lane] = keep * s[A_X2 + lane] + x * lift
+    s[A_Y2 + lane] = keep * s[A_Y2 + lane] + y * lift
+    s[A_Z2 + lane] = keep * s[A_Z2 + lane] + spin * drag * m2
+    s[A_O1 + lane] = keep * s[A_O1 + lane] + spin * m1
+    s[A_S1 + lane] = keep * s[A_S1 + lane] + m1
+    s[A_DO + lane] = keep * s[A_DO + lane] + spin * inv * (wm - w0)
+    s[A_S2 + HALF + lane] = keep * s[A_S2 + HALF + lane] + next_lift
+    s[A_X2 + HALF + lane] = keep * s[A_X2 + HALF + lane] + x * next_lift
+    s[A_Y2 + HALF + lane] = keep * s[A_Y2 + HALF + lane] + y * next_lift
+    s[A_Z2 + HALF + lane] = keep * s[A_Z2 + HALF + lane] + spin * drag * n2
+    s[A_O1 + HALF + lane] = keep * s[A_O1 + HALF + lane] + spin * n1
+    s[A_S1 + HALF + lane] = keep * s[A_S1 + HALF + lane] + n1
+    s[A_DO + HALF + lane] = keep * s[A_DO + HALF + lane] + spin * inv * (w1 - wm)
+
+
+@nb.njit(**inlined)
+def _held(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of constant input a: two pieces, the half steps."""
+    for lane in range(LANES):
+        w0 = rot[r, R_SPEED + lane]
+        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
+        m1, m2, wm = _held_piece(w0, a, e, e1, e3, h)
+        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
+        n1, n2, w1 = _held_piece(wm, a, e, e1, e3, h)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(keeps_means, m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+
+@nb.njit(**inlined)
+def _delayed(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of held input that switches within the step."""
+    for lane in range(LANES):
+        w0 = rot[r, R_SPEED + lane]
+        a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
+        e, e1, e3, h = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E3 + A + lane], s[P_H + A + lane]
+        k1, k2, w = _held_piece(w0, a0, e, e1, e3, h)
+        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
+        m1, m2, wm = _held_piece(w, a1, e, e1, e3, h)
+        e, e1, e3, h = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E3 + C + lane], s[P_H + C + lane]
+        l1, l2, w = _held_piece(wm, a0, e, e1, e3, h)
+        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
+        n1, n2, w1 = _held_piece(w, a1, e, e1, e3, h)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+
+@nb.njit(**inlined)
+def _sloped(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
+    for lane in range(LANES):
+        w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
+        a0, a1 = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
+        s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, rot[r, R_NEXT + lane]
+        rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
+        k1, k2, w = _sloped_piece(w0, a0, s0, tau, A + lane, s)
+        m1, m2, wm = _sloped_piece(w, a1, s1, tau, B + lane, s)
+        l1, l2, w = _sloped_piece(wm, a0, s0, tau, C + lane, s)
+        n1, n2, w1 = _sloped_piece(w, a1, s1, tau, D + lane, s)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+
+@nb.njit(**inlined)
+def _linear(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of piecewise linear input that bends within the step."""
+    for lane in range(LANES):
+        w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
+        a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
+        s0, s1 = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
+        a0 += (a1 - a0) * (1.0 - s[C_PART + lane])
+        e, e1, e2 = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E2 + A + lane]
+        e3, h = s[P_E3 + A + lane], s[P_H + A + lane]
+        k1, k2, w = _piece(w0, a0, s0, tau, e, e1, e2, e3, h)
+        a0 += s0 * h
+        e, e1, e2 = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E2 + B + lane]
+        e3, h = s[P_E3 + B + lane], s[P_H + B + lane]
+        m1, m2, wm = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
+        a1 += s1 * h
+        e, e1, e2 = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E2 + C + lane]
+        e3, h = s[P_E3 + C + lane], s[P_H + C + lane]
+        l1, l2, w = _piece(wm, a0, s0, tau, e, e1, e2, e3, h)
+        e, e1, e2 = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E2 + D + lane]
+        e3, h = s[P_E3 + D + lane], s[P_H + D + lane]
+        n1, n2, w1 = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+
+
+@nb.njit(**inlined)
+def _uneven_piece(w0, a, slope, at, lane, s):  # type: ignore[no-untyped-def]
+    """As `_piece`, with the lag of speeding up or of slowing down by where the input lies at its start.
+
+    `at`: which part of the step, and which lane.
+    """
+    down, faster = DOWN + at, a >= w0
+    # Both are read before one is chosen: a choice of where to read would not become vectors.
+    tau, e, e1, e2, e3 = s[C_TAU + lane], s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at]
+    tau_d, f, f1, f2, f3 = s[C_TAU_DOWN + lane], s[P_E + down], s[P_E1 + down], s[P_E2 + down], s[P_E3 + down]
+    tau, e, e1 = (tau if faster else tau_d), (e if faster else f), (e1 if faster else f1)
+    e2, e3 = (e2 if faster else f2), (e3 if faster else f3)
+    return _piece(w0, a, slope, tau, e, e1, e2, e3, s[P_H + at])
+
+
+@nb.njit(**inlined)
+def _uneven(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    """Rotor r through one step of any input (rows T_) where speeding up and slowing down lag differently."""
+    for lane in range(LANES):
+        w0 = rot[r, R_SPEED + lane]
+        a0, s0, a1, s1 = s[T_A0 + lane], s[T_S0 + lane], s[T_A1 + lane], s[T_S1 + lane]
+        k1, k2, w = _uneven_piece(w0, a0, s0, A + lane, lane, s)
+        m1, m2, wm = _uneven_piece(w, a1, s1, B + lane, lane, s)
+        l1, l2, w = _uneven_piece(wm, a0 + s0 * s[P_H + A + lane], s0, C + lane, lane, s)
+        n1, n2, w1 = _uneven_piece(w, a1 + s1 * s[P_H + B + lane], s1, D + lane, lane, s)
+        rot[r, R_SPEED + lane] = w1
+        _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
 
 def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
-    """Compiles the ways of one rotor through a step: by what its input does; `uneven` for lags that differ by way.
-
-    Args:
-        keeps_means: writes what later passes read, the means of speed and its square (rows R_M1 to R_N2).
-    """
+    """The ways of one rotor through a step, by what its input does, that keep the means of its speed or do not."""
     which = "mean" if keeps_means else "turn"
-
-    @nb.njit(**inlined)
-    @variant(which)
-    def add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s):  # type: ignore[no-untyped-def]
-        """Adds one rotor to `keep` times the moments of both half steps.
-
-        Integrals of omega and omega^2: m1, m2 over the first, n1, n2 over the second; omega: w0 at the start, wm, w1.
-        """
-        gain, drag, dead, curve = rot[r, R_GAIN + lane], rot[r, R_DRAG + lane], 2.0 * s[C_W0 + lane], s[C_CURVE + lane]
-        m1, m2, n1, n2 = inv * m1, inv * m2, inv * n1, inv * n2
-        lift, next_lift = gain * (m2 - dead * m1 + curve), gain * (n2 - dead * n1 + curve)
-        if keeps_means:
-            rot[r, R_M1 + lane], rot[r, R_M2 + lane] = m1, m2
-            rot[r, R_N1 + lane], rot[r, R_N2 + lane] = n1, n2
-        s[A_S2 + lane] = keep * s[A_S2 + lane] + lift
-        s[A_X2 + lane] = keep * s[A_X2 + lane] + x * lift
-        s[A_Y2 + lane] = keep * s[A_Y2 + lane] + y * lift
-        s[A_Z2 + lane] = keep * s[A_Z2 + lane] + spin * drag * m2
-        s[A_O1 + lane] = keep * s[A_O1 + lane] + spin * m1
-        s[A_S1 + lane] = keep * s[A_S1 + lane] + m1
-        s[A_DO + lane] = keep * s[A_DO + lane] + spin * inv * (wm - w0)
-        s[A_S2 + HALF + lane] = keep * s[A_S2 + HALF + lane] + next_lift
-        s[A_X2 + HALF + lane] = keep * s[A_X2 + HALF + lane] + x * next_lift
-        s[A_Y2 + HALF + lane] = keep * s[A_Y2 + HALF + lane] + y * next_lift
-        s[A_Z2 + HALF + lane] = keep * s[A_Z2 + HALF + lane] + spin * drag * n2
-        s[A_O1 + HALF + lane] = keep * s[A_O1 + HALF + lane] + spin * n1
-        s[A_S1 + HALF + lane] = keep * s[A_S1 + HALF + lane] + n1
-        s[A_DO + HALF + lane] = keep * s[A_DO + HALF + lane] + spin * inv * (w1 - wm)
+    # bool() keeps numba from writing each way anew for each constant.
 
     @nb.njit(**jit)
     @variant(which)
     def held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        """Rotor r through one step of constant input a: two pieces, the half steps."""
         lane_kernel()
-        for lane in range(LANES):
-            w0 = rot[r, R_SPEED + lane]
-            e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-            m1, m2, wm = _held_piece(w0, a, e, e1, e3, h)
-            e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-            n1, n2, w1 = _held_piece(wm, a, e, e1, e3, h)
-            rot[r, R_SPEED + lane] = w1
-            add_rotor(m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+        _held(bool(keeps_means), a, x, y, spin, r, inv, keep, rot, s)
 
     @nb.njit(**jit)
     @variant(which)
     def delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        """Rotor r through one step of held input that switches within the step."""
         lane_kernel()
-        for lane in range(LANES):
-            w0 = rot[r, R_SPEED + lane]
-            a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
-            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
-            e, e1, e3, h = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E3 + A + lane], s[P_H + A + lane]
-            k1, k2, w = _held_piece(w0, a0, e, e1, e3, h)
-            e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-            m1, m2, wm = _held_piece(w, a1, e, e1, e3, h)
-            e, e1, e3, h = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E3 + C + lane], s[P_H + C + lane]
-            l1, l2, w = _held_piece(wm, a0, e, e1, e3, h)
-            e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-            n1, n2, w1 = _held_piece(w, a1, e, e1, e3, h)
-            rot[r, R_SPEED + lane] = w1
-            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+        _delayed(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
 
     @nb.njit(**jit)
     @variant(which)
     def sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
         lane_kernel()
-        for lane in range(LANES):
-            w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
-            a0, a1 = rot[r, R_PAST + lane], rot[r, R_NOW + lane]
-            s0, s1 = rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane]
-            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, rot[r, R_NEXT + lane]
-            rot[r, R_PAST_SLOPE + lane], rot[r, R_NOW_SLOPE + lane] = s1, rot[r, R_NEXT_SLOPE + lane]
-            k1, k2, w = _sloped_piece(w0, a0, s0, tau, A, lane, s)
-            m1, m2, wm = _sloped_piece(w, a1, s1, tau, B, lane, s)
-            l1, l2, w = _sloped_piece(wm, a0, s0, tau, C, lane, s)
-            n1, n2, w1 = _sloped_piece(w, a1, s1, tau, D, lane, s)
-            rot[r, R_SPEED + lane] = w1
-            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+        _sloped(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
 
     @nb.njit(**jit)
     @variant(which)
     def linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        """Rotor r through one step of piecewise linear input that bends within the step."""
         lane_kernel()
-        for lane in range(LANES):
-            w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
-            a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
-            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
-            s0, s1 = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
-            a0 += (a1 - a0) * (1.0 - s[C_PART + lane])
-            e, e1, e2 = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E2 + A + lane]
-            e3, h = s[P_E3 + A + lane], s[P_H + A + lane]
-            k1, k2, w = _piece(w0, a0, s0, tau, e, e1, e2, e3, h)
-            a0 += s0 * h
-            e, e1, e2 = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E2 + B + lane]
-            e3, h = s[P_E3 + B + lane], s[P_H + B + lane]
-            m1, m2, wm = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
-            a1 += s1 * h
-            e, e1, e2 = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E2 + C + lane]
-            e3, h = s[P_E3 + C + lane], s[P_H + C + lane]
-            l1, l2, w = _piece(wm, a0, s0, tau, e, e1, e2, e3, h)
-            e, e1, e2 = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E2 + D + lane]
-            e3, h = s[P_E3 + D + lane], s[P_H + D + lane]
-            n1, n2, w1 = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
-            rot[r, R_SPEED + lane] = w1
-            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
-
-    @nb.njit(**inlined)
-    @variant(which)
-    def uneven_piece(w0, a, slope, piece, lane, s):  # type: ignore[no-untyped-def]
-        """As `_piece`, with the lag of speeding up or of slowing down by where the input lies at its start."""
-        at, down, faster = piece + lane, DOWN + piece + lane, a >= w0
-        # Both are read before one is chosen: a choice of where to read would not become vectors.
-        tau, e, e1, e2, e3 = s[C_TAU + lane], s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at]
-        tau_d, f, f1, f2, f3 = s[C_TAU_DOWN + lane], s[P_E + down], s[P_E1 + down], s[P_E2 + down], s[P_E3 + down]
-        tau, e, e1 = (tau if faster else tau_d), (e if faster else f), (e1 if faster else f1)
-        e2, e3 = (e2 if faster else f2), (e3 if faster else f3)
-        return _piece(w0, a, slope, tau, e, e1, e2, e3, s[P_H + at])
+        _linear(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
 
     @nb.njit(**jit)
     @variant(which)
     def uneven(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        """Rotor r through one step of any input (rows T_) where speeding up and slowing down lag differently."""
         lane_kernel()
-        for lane in range(LANES):
-            w0 = rot[r, R_SPEED + lane]
-            a0, s0, a1, s1 = s[T_A0 + lane], s[T_S0 + lane], s[T_A1 + lane], s[T_S1 + lane]
-            k1, k2, w = uneven_piece(w0, a0, s0, A, lane, s)
-            m1, m2, wm = uneven_piece(w, a1, s1, B, lane, s)
-            l1, l2, w = uneven_piece(wm, a0 + s0 * s[P_H + A + lane], s0, C, lane, s)
-            n1, n2, w1 = uneven_piece(w, a1 + s1 * s[P_H + B + lane], s1, D, lane, s)
-            rot[r, R_SPEED + lane] = w1
-            add_rotor(k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
+        _uneven(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
 
     return held, delayed, sloped, linear, uneven
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numba as nb
+import numpy as np
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
 from quadid.model.simd import SOURCES, cached, jit
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IntArray
 
 
 class Needs(NamedTuple):
@@ -63,12 +64,17 @@ ROTOR_ENTRIES = places(
     "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
 )
 """What makes rotors of one lane differ from those of another; losses beside them."""
-(SLOWER,), (EXPONENT,), (GROWTH,) = places("motor_lag.slower"), places("supply_voltage"), places("drag_torque_curve")
 (OFFSET,) = places("thrust_curve.offset")
+# As arrays, which all are of one type: `_any_of` would be compiled anew for each length of a tuple.
+_HUB, _RARE, _PAYLOAD, _FACTORS = (np.array(e) for e in (HUB_ENTRIES, RARE_ENTRIES, PAYLOAD_ENTRIES, FACTOR_ENTRIES))
+_SOLID, _IMU, _DELAY = (np.array(e) for e in (SOLID_ENTRIES, IMU_ENTRIES, DELAY_ENTRIES))
+_SLOWER, _EXPONENT = np.array(places("motor_lag.slower")), np.array(places("supply_voltage"))
+_GROWTH, _AHRS = np.array(places("drag_torque_curve")), np.array([ix.AHRS_K])
+_IMU_LAG, _ATT_DELAY = np.array([ix.IMU_PERIOD]), np.array([ix.ATT_DELAY])
 
 
 @nb.njit(**jit)
-def _any_of(theta: FloatArray, entries: tuple[int, ...]) -> bool:
+def _any_of(theta: FloatArray, entries: IntArray) -> bool:
     """Whether any of these entries is not neutral in any lane."""
     found = False
     for lane in range(len(theta)):
@@ -81,16 +87,16 @@ def _any_of(theta: FloatArray, entries: tuple[int, ...]) -> bool:
 def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
     """Returns what a block of parameter vectors (LANES, size) needs of the model."""
     rare, factors, payload = (
-        _any_of(theta, RARE_ENTRIES), _any_of(theta, FACTOR_ENTRIES), _any_of(theta, PAYLOAD_ENTRIES)
+        _any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD)
     )  # fmt: skip
     learned = False
     for lane in range(len(theta)):
         for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
             learned |= theta[lane, i] != 0.0
     rare |= learned
-    hub = rare or _any_of(theta, HUB_ENTRIES)
-    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, SOLID_ENTRIES)
-    growth = _any_of(theta, (GROWTH,))
+    hub = rare or _any_of(theta, _HUB)
+    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
+    growth = _any_of(theta, _GROWTH)
     varied = growth
     for lane in range(len(theta)):
         for i in ROTOR_ENTRIES:
@@ -99,9 +105,9 @@ def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
             varied |= theta[lane, i] != theta[0, i]
         varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
     return Needs(
-        air or solid, air, hub, solid, rare, not varied, _any_of(theta, DELAY_ENTRIES), _any_of(theta, (SLOWER,)),
-        _any_of(theta, (EXPONENT,)), growth, hub or growth, factors, payload, _any_of(theta, (ix.IMU_PERIOD,)),
-        _any_of(theta, (ix.ATT_DELAY,)), _any_of(theta, IMU_ENTRIES), _any_of(theta, (ix.AHRS_K,)), learned,
+        air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
+        _any_of(theta, _EXPONENT), growth, hub or growth, factors, payload, _any_of(theta, _IMU_LAG),
+        _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from quadid.model.body_kernel import (
     step_solid,
 )
 from quadid.model.compare_kernel import collect, compare, compare_motion, settle
-from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload, step_core, step_core_shared
+from quadid.model.kernel import Flight, body_constants, copy, flight_factors, load_payload, step_core, step_core_shared
 from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
@@ -70,13 +70,6 @@ def _settle_force(s: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def _copy(source: FloatArray, target: FloatArray) -> None:
-    for i in range(source.shape[0]):
-        for j in range(source.shape[1]):
-            target[i, j] = source[i, j]
-
-
-@nb.njit(**jit)
 def _march(
     drive: Drive, flight: Flight, theta: FloatArray, table: FloatArray,
     measured: FloatArray, scale: FloatArray, memory: int, starts: IntArray, n_pre: int, x0: FloatArray,
@@ -94,7 +87,7 @@ def _march(
         following = starts[seg + 1] - n_pre if seg + 1 < len(starts) else -1
         if not need.shared:
             if turned > first:
-                _copy(ahead, rot)
+                copy(ahead, rot)
             elif first - turned > memory:  # what they did before is forgotten
                 turned = first - memory
                 rotors_start(drive, turned, need, rot, s)
@@ -111,7 +104,7 @@ def _march(
                         spread_hub(table, k, s)
             else:
                 if k == following:
-                    _copy(rot, ahead)
+                    copy(rot, ahead)
                 rotors_step(drive, k, need, rot, s)
             if need.factors:
                 flight_factors(flight.t0 + dt * k, flight.span0, flight.span1, dt, s)

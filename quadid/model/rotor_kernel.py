@@ -233,9 +233,10 @@ def _table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> N
     rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
     rotor_constants(theta, drive.dt, rot, s)
     input_constants(theta, s)
-    rotors_start(drive, 0, need, rot, s)
     s[A_S2 : A_S2 + 2 * HALF] = 0.0
     for k in range(len(drive.u)):
+        if k == 0:
+            rotors_start(drive, k, need, rot, s)
         rotors_step(drive, k, need, rot, s)
         for row in range(ALL_MOMENTS):
             table[k, row] = s[A_S2 + row * LANES]

@@ -15,6 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
+from quadid.model.piece import PieceCompiler
 from quadid.types import FloatArray
 
 LANES = 16
@@ -29,18 +30,20 @@ _VECTOR = ir.VectorType(ir.DoubleType(), CACHE_LINE)
 FREE = {"contract", "nnan", "ninf", "nsz"}
 """Freedom of the compiler: fused multiply-add, and no regard for infinities.  No regrouping of sums: each compilation
 would round differently, and flights replayed after a restart would not be the same bit for bit."""
-cached: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FREE, "error_model": "numpy"}
-"""Options of the kernels that Python calls."""
+whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"}
+"""Options of functions that Python calls."""
+cached: dict[str, Any] = {**whole, "cache": True}
+"""Options of the kernels on disk."""
 allocating: dict[str, Any] = {
-    "nogil": True, "fastmath": FREE, "error_model": "numpy", "no_cfunc_wrapper": True
+    **whole, "no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": PieceCompiler
 }  # fmt: skip
-"""Options of kernels that make arrays."""
+"""Options of the pieces of kernels that make arrays."""
 jit: dict[str, Any] = {**allocating, "_nrt": False}
-"""Options of all others: without reference counts, whose atomic updates cost more than a short lane loop."""
+"""Options of all other pieces: no reference counts, whose atomic updates cost more than a short lane loop."""
 exact: dict[str, Any] = {**jit, "fastmath": False}
-"""Options of kernels that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
+"""Options of pieces that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
 inlined: dict[str, Any] = {**jit, "forceinline": True}
-"""Options of the pieces that kernels are made of."""
+"""Options of pieces that are merged into what calls them."""
 
 
 def _sources() -> int:
@@ -49,7 +52,7 @@ def _sources() -> int:
     names = sorted(
         entry.name
         for entry in folder.iterdir()
-        if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py"))
+        if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py", "piece.py"))
     )
     outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
     order = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters).encode()

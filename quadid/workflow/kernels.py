@@ -92,9 +92,11 @@ def _simulation() -> None:
     vehicle, window = _hover()
     rollout = Rollout(window, vehicle)
     theta = Layout(vehicle).initial(vehicle)[None].repeat(2, axis=0)
-    theta[1, Layout(vehicle).entry("motor_lag.tau").index] = 0.02  # rotors differ between lanes: no table is needed
     segments = Segments.cut(len(window), 10)
-    rollout.roll(segments, theta, rollout.initial_states(segments))
+    states = rollout.initial_states(segments)
+    rollout.roll(segments, theta, states)  # rotors do the same in both lanes: from a table
+    theta[1, Layout(vehicle).entry("motor_lag.tau").index] = 0.02
+    rollout.roll(segments, theta, states)
 
 
 def _statistics() -> None:
@@ -105,13 +107,8 @@ def _statistics() -> None:
     from quadid.identify.elimination_kernel import reduce_segments
     from quadid.model.closed_loop import ClosedLoop
     from quadid.model.layout import Layout
-    from quadid.model.needs_kernel import Needs
-    from quadid.model.rollout import Rollout
-    from quadid.model.rotor_kernel import rotor_table
-    from quadid.model.rows import ALL_MOMENTS
     from quadid.model.simd import LANES, aligned
 
-    vehicle, window = _hover()
     own, rows, channels = 9, 8, 9
     out = aligned((1, 1, rows, channels, LANES))
     out[:] = np.random.default_rng(1).standard_normal(out.shape)
@@ -121,12 +118,8 @@ def _statistics() -> None:
         Whitening(np.ones(channels), np.zeros(channels, dtype=bool), eye),
         StatePrior(np.ones(own), 0.0, np.zeros((1, 3))), Reduced.room(1, own, 1, rows, channels),
     )  # fmt: skip
-    theta = Layout(vehicle).initial(vehicle)[None]
-    rotor_table(
-        Rollout(window, vehicle).drive, Needs(*[False] * len(Needs._fields)), np.repeat(theta, LANES, axis=0),
-        np.empty((len(window), 2 * ALL_MOMENTS)),
-    )  # fmt: skip
-    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(theta)
+    vehicle, window = _hover()
+    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
 
 
 def _flight() -> None:
@@ -138,16 +131,16 @@ def _flight() -> None:
 def _simulation_kernels() -> list[Any]:
     from quadid.model.needs_kernel import needs_of
     from quadid.model.rollout_kernel import roll_segments
+    from quadid.model.rotor_kernel import rotor_table
 
-    return [needs_of, roll_segments]
+    return [needs_of, roll_segments, rotor_table]
 
 
 def _statistics_kernels() -> list[Any]:
     from quadid.identify.elimination_kernel import _reduce_on_disk
     from quadid.model.closed_loop_kernel import fly_closed_loop
-    from quadid.model.rotor_kernel import rotor_table
 
-    return [rotor_table, _reduce_on_disk, fly_closed_loop]
+    return [_reduce_on_disk, fly_closed_loop]
 
 
 def _flight_kernels() -> list[Any]:
@@ -157,7 +150,7 @@ def _flight_kernels() -> list[Any]:
 
 
 PARTS = {
-    "simulation": Part(_simulation, _simulation_kernels, 120),
+    "simulation": Part(_simulation, _simulation_kernels, 100),
     "statistics": Part(_statistics, _statistics_kernels, 100),
     "flight": Part(_flight, _flight_kernels, 30),
 }
