@@ -25,7 +25,7 @@ def add_squares(place: int, a: FloatArray) -> float:
 
 @nb.njit(**whole)
 def both(a: FloatArray, first: int) -> float:
-    return add_squares(first, a) + square(a[first])
+    return float(add_squares(first, a) + square(a[first]))
 
 
 def test_a_kernel_calls_its_pieces() -> None:
