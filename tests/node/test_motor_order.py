@@ -60,7 +60,7 @@ def test_another_autopilot_is_not_waited_for() -> None:
     [
         ((33, 34, 35, 36), "SERVO1_FUNCTION", 34.0),
         ((33, 34, 35, 36), "SERVO3_FUNCTION", 0.0),
-        ((33, 34, 35, 36), "SERVO9_FUNCTION", 35.0),
+        ((33, 34, 35, 36), "SERVO4_FUNCTION", 37.0),
         ((), "SERVO1_FUNCTION", 36.0),  # told at last, and not as was taken to go without saying
         ((), "PWM_MAIN_FUNC1", 102.0),
     ],
@@ -86,6 +86,7 @@ def test_parameters_that_move_no_motor_change_nothing(order: MotorOrder) -> None
     assert take(order) == PULSES[:4]
     tell(order, 33, 34, 35, 36, 70, 0)
     order.tell("SERVO1_MIN", 1100.0)
+    order.tell("SERVO9_FUNCTION", 35.0)  # drives motor 3 too
     order.tell("SERVO5_FUNCTION", float("nan"))
     assert take(order) == PULSES[:4]
     assert order.problem == ""
