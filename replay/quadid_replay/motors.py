@@ -57,9 +57,12 @@ def motor_outputs(
         message: its name.
         ardupilot: whether it is an ArduPilot, be none of these parameters known.
     """
-    said = [(name, *_driven(name, value)) for name, value in parameters.items() if MOTOR_FUNCTION.fullmatch(name)]
+    ardupilot |= any(name.startswith("SERVO") and MOTOR_FUNCTION.fullmatch(name) for name in parameters)
+    said = [
+        (name, *_driven(name, value)) for name, value in parameters.items()
+        if MOTOR_FUNCTION.fullmatch(name) and (name.startswith("SERVO") or not ardupilot)
+    ]  # fmt: skip
     said.sort(key=lambda entry: entry[1])  # of several outputs that drive one motor the first counts
-    ardupilot |= any(name.startswith("SERVO") for name, _, _ in said)
     motors = {motor: output for _, output, motor in reversed(said) if motor is not None} if ardupilot else {}
     tricopter = ardupilot and (rotors == 3 or (not rotors and set(motors) == {*_TRICOPTER, _TAIL}))
     if tricopter:

@@ -62,7 +62,6 @@ def test_another_autopilot_is_not_waited_for() -> None:
         ((33, 34, 35, 36), "SERVO3_FUNCTION", 0.0),
         ((33, 34, 35, 36), "SERVO4_FUNCTION", 37.0),
         ((), "SERVO1_FUNCTION", 36.0),  # told at last, and not as was taken to go without saying
-        ((), "PWM_MAIN_FUNC1", 102.0),
     ],
 )
 def test_a_motor_that_moves_in_use_ends_the_use_of_all_outputs(
@@ -79,6 +78,16 @@ def test_a_motor_that_moves_in_use_ends_the_use_of_all_outputs(
     tell(order, 33, 34, 35, 36)
     assert take(order, 12.0) == (), "what came between is of other rotors"
     happened(31, f"{name} told as {value:g} in flight: no output is used from then on, said")
+
+
+@pytest.mark.parametrize("told", [[102.0], [101.0, 0.0]])
+def test_a_motor_of_px4_that_is_elsewhere_or_moves_ends_the_use_of_all_outputs(told: list[float]) -> None:
+    order = MotorOrder(4)
+    assert take(order) == PULSES[:4]
+    for value in told:
+        order.tell("PWM_MAIN_FUNC1", value)
+    assert take(order) == ()
+    assert "PWM_MAIN_FUNC1" in order.problem
 
 
 def test_parameters_that_move_no_motor_change_nothing(order: MotorOrder) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink import DFReader
 from quadid_replay import open_log
 from quadid_replay.dataflash_index import index_dataflash
@@ -196,6 +199,23 @@ def test_what_is_no_order_of_the_motors_is_said_and_no_output_guessed(
     assert found.columns == []
     assert found.problem.startswith(f"{said}: no order")
     happened(31, f"{said} of {rotors or 'nobody knows how many'} rotors: no output is taken for a motor, said")
+
+
+@given(
+    parameters=st.dictionaries(
+        st.sampled_from([*functions(*range(16)), *functions(*range(16), bank="MAIN"), *functions(1, 2, bank="AUX")]),
+        st.sampled_from([0, 33, 34, 35, 36, 37, 39, 82, 101, 102, 103, 104, -1, 1e30, math.nan, -math.inf]),
+    ),
+    rotors=st.sampled_from([0, 3, 4, 6, 12]), width=st.sampled_from([4, 8, 16, 32]), ardupilot=st.booleans(),
+)  # fmt: skip
+def test_whatever_parameters_say_each_rotor_has_an_output_of_its_own_or_none_is_used(
+    parameters: dict[str, float], rotors: int, width: int, ardupilot: bool
+) -> None:
+    found = motor_outputs(parameters, rotors, width, "RCOU", ardupilot)
+    assert not (found.columns and found.problem)
+    assert len(set(found.columns)) == len(found.columns)
+    assert all(0 <= column < width for column in found.columns)
+    assert found.problem or rotors in (0, len(found.columns))
 
 
 def test_outputs_of_px4_in_order_and_frames_by_their_names() -> None:
