@@ -217,10 +217,7 @@ def _removable(model: Model) -> list[Candidate]:
 
 
 def _start(shooting: Shooting, model: Model, score: Score) -> Start:
-    """Where a refit starts and what to expect: a cause that no slope at neutral shows, where its sketch leads.
-
-    One that begins at a moment starts where the scan found it.
-    """
+    """Where a refit starts and what to expect; a sketch leads to causes that no slope at neutral shows."""
     if score.candidate.start:
         return sketch(shooting, model, score.candidate)
     theta = model.theta.copy()
