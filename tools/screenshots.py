@@ -12,7 +12,7 @@ IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 
 
 def main() -> None:
-    """Top of the report, a finding, a prediction, and the phone's view in dark."""
+    """Top of the report, and a finding."""
     report = Path(sys.argv[1]).resolve().as_uri()
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     IMAGES.mkdir(exist_ok=True)
@@ -25,13 +25,8 @@ def main() -> None:
         page.screenshot(path=IMAGES / "report.png")
         settle(page, "article.finding .plot")
         page.locator("article.finding").first.screenshot(path=IMAGES / "finding.png")
-        settle(page, "#plot-log0-rates")
-        page.locator("figure:has(#plot-log0-rates)").screenshot(path=IMAGES / "prediction.png")
-        phone = browser.new_page(viewport={"width": 390, "height": 780}, color_scheme="dark")
-        phone.goto(report)
-        phone.screenshot(path=IMAGES / "phone.png")
         browser.close()
-    for name in ("report", "finding", "prediction", "phone"):
+    for name in ("report", "finding"):
         print(f"Written: {IMAGES / name}.png")
 
 

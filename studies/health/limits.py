@@ -184,7 +184,7 @@ def _doubles(judged: Sequence[Judged]) -> str:
     three = sum(len(j.named) == 3 for j in again)
     both = sum(set(j.named) == {1, 2} for j in again)
     return (
-        "Cuts of M1 and M2 are mostly answered with M3 too, because that set of propellers differs from the healthy "
-        f"one from the start. Against its own {len(least)} least cut flights, {three} of {len(again)} are answered "
-        f"with three rotors, {both} with the right two, the others with a weight between them."
+        "Cuts of M1 and M2 are mostly answered with M3 too, because that set of propellers differs from the start. "
+        f"Against its own {len(least)} least cut flights, {both} of {len(again)} are answered with the right two "
+        f"rotors, {three} with three, the others with a weight between them."
     )
