@@ -167,10 +167,9 @@ def _along(z: FloatArray, scaled: FloatArray, freedom: float) -> FloatArray:
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
-    """All explanations of an `exact` change, the best first.
+    """All explanations of an `exact` change, the most probable first.
 
-    Those of one kind and rotors count as one, with the best's values.  The best is the most probable one of the most
-    probable kind: a kind is not worth less because it has many members.
+    Those of one kind and rotors count as one, with the best's values.
     """
     groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
     for alike in _by_size(offered):
@@ -179,11 +178,5 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
     found = []
     for group in groups.values():
         best = max(group, key=lambda one: one.log_evidence)
-        total = float(np.logaddexp.reduce([one.log_evidence for one in group]))
-        found.append(best._replace(log_evidence=total))
-    kinds: dict[str, list[float]] = {}
-    for one in found:
-        kinds.setdefault(one.hypothesis.kind, []).append(one.log_evidence)
-    probable = max(kinds, key=lambda kind: float(np.logaddexp.reduce(kinds[kind])))
-    first = max((one for one in found if one.hypothesis.kind == probable), key=lambda one: one.log_evidence)
-    return [first, *sorted((one for one in found if one is not first), key=lambda one: -one.log_evidence)]
+        found.append(best._replace(log_evidence=float(np.logaddexp.reduce([one.log_evidence for one in group]))))
+    return sorted(found, key=lambda one: -one.log_evidence)

@@ -5,7 +5,7 @@ thrust), G the rows of `trim_directions` and f the specific force along -z, a fl
 
     (G w)_k / sum(w)  for roll, pitch, yaw,   and   log(sum(w) / f),
 
-each a mean over blocks of a second, at zero velocity and zero angular acceleration.
+each a mean over blocks of a second, at zero velocity.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     force, told = _specific_force(recording, edges)
     total = load.sum(axis=1)
     trims = trim_of_load(load, force, vehicle)
-    motion, moved = _motion(recording, vehicle, edges)
+    motion, moved = _motion(recording, edges)
     mean, rest = _at_rest(trims, motion)
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
@@ -136,25 +136,16 @@ def _specific_force(recording: Recording, edges: FloatArray) -> tuple[FloatArray
     return np.full(len(edges), GRAVITY), "force taken for that of hover"
 
 
-def _motion(recording: Recording, vehicle: Vehicle, edges: FloatArray) -> tuple[FloatArray, str]:
-    """What moves a trim beside the vehicle itself, in units of its prior size: velocity and angular acceleration."""
-    columns, told = [], "no motion"
+def _motion(recording: Recording, edges: FloatArray) -> tuple[FloatArray, str]:
+    """What moves a trim beside the vehicle itself, in units of its prior size: velocity, else what stands for it."""
     velocity = _velocity(recording, edges)
     if velocity is not None:
-        columns.append(velocity * _AIR_SLOPE)
-        told = "motion from position or velocity"
-    elif "accel" in recording.channels:
-        force, _ = _block_means(recording.channels["accel"].t, recording.channels["accel"].values[:, :2], edges)
-        columns.append(force * _AIR_SLOPE)
-        told = "motion from in-plane force"
-    gyro = recording.channels.get("gyro")
-    if gyro is not None and len(gyro.t) > 1:
-        turned = _gained(gyro, edges)
-        inertia = np.array([vehicle.parameters[f"J_{a}{a}"].initial for a in "xyz"])
-        yaw_arm = vehicle.parameters["d"].initial / vehicle.parameters["b"].initial
-        authority = vehicle.mass * GRAVITY * np.array([vehicle.arm, vehicle.arm, yaw_arm])
-        columns.append(2.0 * turned / BLOCK * inertia / authority)
-    return (np.hstack(columns) if columns else np.empty((len(edges), 0))), told
+        return velocity * _AIR_SLOPE, "motion from position or velocity"
+    accel = recording.channels.get("accel")
+    if accel is not None:
+        force, _ = _block_means(accel.t, accel.values[:, :2], edges)
+        return force * _AIR_SLOPE, "motion from in-plane force"
+    return np.empty((len(edges), 0)), "no motion"
 
 
 def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
@@ -182,9 +173,6 @@ def _gained(channel: Channel, edges: FloatArray) -> FloatArray:
 
 def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Regresses trims on motion with its prior; returns the trim at rest (4,) and what remains, shape (blocks, 4)."""
-    if motion.shape[1] == 0:
-        mean = trims.mean(axis=0)
-        return mean, trims - mean
     noise = np.median(np.abs(trims - np.median(trims, axis=0)), axis=0) / 0.6745 + 1e-6
     out = np.empty(trims.shape[1])
     rest = np.empty_like(trims)
