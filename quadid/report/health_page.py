@@ -37,8 +37,9 @@ def change_words(change: JsonDict) -> str:
     if effect == "weak_rotor":
         return f"rotor {change_value(change, 'rotor'):.0f}: {100.0 * change_value(change, 'loss'):.0f} % less thrust"
     if effect == "cg_offset":
-        shift = [1e3 * change_value(change, axis) for axis in "xy"]
-        return f"centre of gravity moved by {shift[0]:+.1f} mm (forward) and {shift[1]:+.1f} mm (right)"
+        x, y = (1e3 * change_value(change, axis) for axis in "xy")
+        along, across = "forward" if x > 0.0 else "backward", "right" if y > 0.0 else "left"
+        return f"centre of gravity moved {abs(x):.1f} mm {along} and {abs(y):.1f} mm to the {across}"
     fraction = 100.0 * change_value(change, "fraction")
     return (
         f"{_WORDS[effect]}: {fraction:+.0f} %" if effect == "mass_change" else f"{_WORDS[effect]}: {-fraction:+.0f} %"

@@ -10,6 +10,7 @@ from quadid.health import Health, assess, flight_trim, healthy_spread
 from quadid.health.comparison import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
 from quadid.health.trims import trim_directions, trim_of_load
+from quadid.report.health_page import change_words
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command
 from quadid.window import Recording
@@ -70,6 +71,15 @@ def test_a_weight_on_an_arm_is_a_payload_and_no_rotor() -> None:
     shift = 0.15 / 1.15 * np.array(place[:2])
     assert named(found)["cg_offset"]["x"] == pytest.approx(shift[0], rel=0.3)
     assert named(found)["cg_offset"]["y"] == pytest.approx(shift[1], rel=0.3)
+
+
+@pytest.mark.parametrize("rotor", [1, 2, 3, 4])
+def test_the_report_says_which_way_the_centre_of_gravity_moved(rotor: int) -> None:
+    x, y, _ = PELICAN_X.rotors[rotor - 1].position
+    found = judged(PELICAN_X, Wrong(mass=0.15 * PELICAN_X.mass, place=(x, y)), seed=8)
+    (words,) = (change_words(c) for c in found.to_dict()["changes"] if c["effect"] == "cg_offset")
+    assert ("forward" in words, "right" in words) == (x > 0.0, y > 0.0)
+    assert "-" not in words
 
 
 def test_a_light_weight_on_an_arm_is_mostly_no_rotor() -> None:
