@@ -30,14 +30,13 @@ def main() -> None:
     makers: dict[str, Callable[[], str]] = {
         "recorded": lambda: _recorded(judged, chosen.out / "health-score.png"),
         "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged)}",
-        "features": lambda: f"## What else the logs hold\n{features.text([j.flown for j in judged])}",
+        "features": lambda: f"## What else the logs hold, and why it is not used\n{features.text(judged)}",
         "simulated": lambda: _simulated(chosen.each),
     }
     for part in chosen.parts:
         text = makers[part]()
         print(text)
-        if part != "features":  # used nowhere: printed only
-            put_section(page, TITLE, part, text)
+        put_section(page, TITLE, part, text)
 
 
 def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:

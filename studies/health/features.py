@@ -1,4 +1,4 @@
-"""What else the recorded flights hold, and why it is not used: vibration, control effort, thrust in motion."""
+"""What else the recorded flights hold, and why it is not used: vibration, control effort, sag, thrust in motion."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
+from scipy.special import stdtrit
 
+from quadid.health.changes import SIGNIFICANT
 from quadid.health.trims import trim_directions
 from quadid.inspection.airborne import flying_spans
 from quadid.resample import linear
 from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.window import Recording
-from studies.health.recorded import CRAZYFLIE, LARGE, Flown
+from studies.health.recorded import CRAZYFLIE, LARGE, Flown, Judged, kind_right
 
 _BAND = (1.5, 15.0)
 """Motion that motors follow and position control does not make alone [Hz]."""
@@ -23,9 +25,10 @@ _LAG = 0.06
 
 
 class Feature(NamedTuple):
-    """A feature, its value for a log, and whether that is a logarithm."""
+    """A feature, the channel that it needs, and the logarithm of its size in a log."""
 
     name: str
+    channel: str
     value: Callable[[Recording], float]
 
 
@@ -35,40 +38,36 @@ def _steady(t: FloatArray, recording: Recording) -> BoolArray:
 
 
 def _bend(values: FloatArray) -> float:
-    """Logarithm of the root mean square of second differences, as a level of white noise."""
-    return float(np.log(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0)))
+    """Logarithm of the root mean square of second differences, as a level of white noise; mean over the columns."""
+    return float(np.log(np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)).mean())
 
 
-def _vertical(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    channel = recording.channels.get("accel_z") or recording.channels["accel_world"]
-    return channel.t, -channel.values[:, -1]
+def vibration(recording: Recording, name: str, axes: slice) -> float:
+    """Of a channel's axes above a quarter of its rate."""
+    channel = recording.channels[name]
+    return _bend(channel.values[_steady(channel.t, recording), axes])
 
 
-def vibration(recording: Recording) -> float:
-    """Of the accelerometer's z axis above a quarter of its rate."""
-    t, force = _vertical(recording)
-    return _bend(force[_steady(t, recording)])
-
-
-def _balance(recording: Recording, axis: int) -> float:
+def effort(recording: Recording) -> float:
+    """Of the roll and pitch commands, as a share of the load."""
     rotors = rotor_signal(recording, CRAZYFLIE)
     load = rotors.values[_steady(rotors.t, recording)] ** 2
-    return _bend(load @ trim_directions(CRAZYFLIE)[axis] / load.sum(axis=1))
+    return _bend(load @ trim_directions(CRAZYFLIE)[:2].T / load.sum(axis=1)[:, None])
 
 
-def roll_effort(recording: Recording) -> float:
-    """Of the roll command, as a share of the load."""
-    return _balance(recording, 0)
-
-
-def pitch_effort(recording: Recording) -> float:
-    """Of the pitch command."""
-    return _balance(recording, 1)
+def sag(recording: Recording) -> float:
+    """Of the battery under load, per command: the current that the motors draw."""
+    battery, rotors = recording.channels["battery"], rotor_signal(recording, CRAZYFLIE)
+    (begin, _), *_ = flying_spans(recording, CRAZYFLIE)
+    rest = np.median(battery.values[battery.t < begin - 0.3, 0])
+    flying = battery.values[_steady(battery.t, recording), 0].mean()
+    return float(np.log((rest - flying) / (rotors.values[_steady(rotors.t, recording)] ** 2).mean()))
 
 
 def thrust_in_motion(recording: Recording) -> float:
-    """Logarithm of what M3's command does to the vertical force, against what all do, within `_BAND`."""
-    rotors, (t, force) = rotor_signal(recording, CRAZYFLIE), _vertical(recording)
+    """What M3's command does to the vertical force, against what all do, within `_BAND`."""
+    channel = recording.channels.get("accel_z") or recording.channels["accel_world"]
+    rotors, t, force = rotor_signal(recording, CRAZYFLIE), channel.t, -channel.values[:, -1]
     count = min(len(rotors.t), len(t))
     band = butter(3, _BAND, "band", fs=1.0 / float(np.median(np.diff(t))), output="sos")
     load = linear(rotors.t, rotors.values**2, t[:count] - _LAG)
@@ -78,43 +77,68 @@ def thrust_in_motion(recording: Recording) -> float:
     return float(np.log(max(each[2] / each.mean(), 0.05)))
 
 
+GYRO = Feature("roll and pitch rate above 25 Hz", "gyro", lambda one: vibration(one, "gyro", slice(0, 2)))
 FEATURES = (
-    Feature("accelerometer's vibration, z", vibration), Feature("roll command above 25 Hz", roll_effort),
-    Feature("pitch command above 25 Hz", pitch_effort), Feature("M3's thrust per command in motion", thrust_in_motion),
-)  # fmt: skip
+    GYRO,
+    Feature("vertical acceleration above 25 Hz", "accel_z", lambda one: vibration(one, "accel_z", slice(None))),
+    Feature("acceleration above 25 Hz", "accel_world", lambda one: vibration(one, "accel_world", slice(None))),
+    Feature("roll and pitch command above 25 Hz", "position", effort),
+    Feature("battery's sag per command", "battery", sag),
+    Feature("M3's thrust per command in motion", "position", thrust_in_motion),
+)
+GROUPS: tuple[tuple[str, Callable[[Flown], bool]], ...] = (
+    ("cuts below 3 mm, tape", lambda f: f.condition == "tape" or (f.condition == "cut" and f.total < LARGE)),
+    ("larger, blades alike", lambda f: f.condition == "cut" and f.total >= LARGE and not f.uneven),
+    ("larger, blades unlike", lambda f: f.condition == "cut" and f.total >= LARGE and f.uneven),
+    ("glued weights", lambda f: "glued" in f.weight),
+)
 
 
-def positioning(flights: Sequence[Flown]) -> float:
-    """Correlation, over flights, of the roll command's noise with that of the roll that position control asks for."""
-    pairs = []
-    for recording in (f.recording for f in flights):
-        wanted = recording.channels.get("attitude_reference")
-        if wanted is not None:
-            pairs.append((roll_effort(recording), _bend(wanted.values[_steady(wanted.t, recording), 0])))
-    return float(np.corrcoef(np.array(pairs).T)[0, 1])
+def outside(feature: Feature, flights: Sequence[Flown]) -> tuple[float, dict[str, bool]]:
+    """The feature's spread between healthy flights, and by file whether one in a hundred of these is as far out.
+
+    Flights count from the healthy ones of their airframe and kind of log; the spread is that of all these.
+    """
+    values = {f.file: feature.value(f.recording) for f in flights if feature.channel in f.recording.channels}
+    by: dict[tuple[str, str], list[float]] = {}
+    for f in flights:
+        if f.file in values and f.condition == "healthy":
+            by.setdefault((f.airframe, f.kind), []).append(values[f.file])
+    freedom = sum(len(healthy) - 1 for healthy in by.values())
+    spread = float(np.sqrt(sum(np.var(healthy) * len(healthy) for healthy in by.values()) / freedom))
+    limit = spread * float(stdtrit(freedom, 1.0 - 0.5 * SIGNIFICANT))
+    out = {}
+    for f in flights:
+        if f.file in values and f.condition != "healthy":
+            healthy = by[f.airframe, f.kind]
+            far = abs(values[f.file] - np.mean(healthy))
+            out[f.file] = bool(far > limit * np.sqrt(1.0 + 1.0 / len(healthy)))
+    return spread, out
+
+
+def text(judged: Sequence[Judged]) -> str:
+    """The features as Markdown: spread of healthy flights, and how many others are outside of it."""
+    flights = [j.flown for j in judged]
+    lines = [
+        "| logarithm of | spread of healthy flights | " + " | ".join(name for name, _ in GROUPS) + " |",
+        "|---" * (2 + len(GROUPS)) + "|",
+    ]
+    for feature in FEATURES:
+        spread, far = outside(feature, flights)
+        cells = []
+        for _, chosen in GROUPS:
+            mine = [far[f.file] for f in flights if chosen(f) and f.file in far]
+            cells.append(f"{sum(mine)} of {len(mine)}")
+        lines.append(f"| {feature.name} | {spread:.2f} | " + " | ".join(cells) + " |")
+    _, shaking = outside(GYRO, flights)
+    mended = [j.flown.file for j in judged if j.flown.condition == "cut" and shaking.get(j.flown.file)]
+    wrong = [j.flown.file for j in judged if j.flown.file in mended and not kind_right(j)]
+    return "\n".join(lines) + _WHY.format(len(wrong))
 
 
 _WHY = """
-None is used. Vibration tells how well propellers are balanced: two equal cuts keep the balance, and healthy sets differ
-by half. The roll command's noise goes with the roll that position control asks for (correlation {:.2f}). What M3's
-command does in motion differs by a factor of {:.1f} between flights (1 sigma), whatever was cut."""
 
-
-def text(flights: Sequence[Flown]) -> str:
-    """The features as Markdown: spread of healthy flights, and cuts of M3 in units of it."""
-    lines = [
-        "| feature (logarithm) | spread of E8 | of E9 | cuts of E8 from 3 mm on, in spreads | of E9 |",
-        "|---|---|---|---|---|",
-    ]
-    for feature in FEATURES:
-        spreads, moved = [], []
-        for airframe in ("E8", "E9"):
-            mine = [f for f in flights if f.airframe == airframe]
-            healthy = np.array([feature.value(f.recording) for f in mine if f.condition == "healthy"])
-            cut = [feature.value(f.recording) for f in mine if f.rotors == {3} and f.total >= LARGE]
-            spreads.append(float(healthy.std(ddof=1)))
-            far = (np.array(cut) - healthy.mean()) / spreads[-1]
-            moved.append(f"{np.median(far):+.1f}")
-        lines.append(f"| {feature.name} | {spreads[0]:.2f} | {spreads[1]:.2f} | {moved[0]} | {moved[1]} |")
-    scatter = float(np.exp(np.std([thrust_in_motion(f.recording) for f in flights if f.condition == "cut"])))
-    return "\n".join(lines) + "\n" + _WHY.format(positioning(flights), scatter)
+Flights outside of what one healthy flight in a hundred shows; a log without the channel is not counted. None is used.
+A propeller with unlike blades shakes, one cut alike does not, and small cuts shake no more than healthy propellers do;
+the shaking moves with all four commands alike, so it names no rotor. Where it shows in the gyro, it would mend {} of
+the wrong answers."""

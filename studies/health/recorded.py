@@ -22,13 +22,17 @@ LARGE = 3.0
 
 @dataclass(frozen=True)
 class Flown:
-    """One recorded flight: its file, airframe, kind of log by content, what was done to it, its trim and the log."""
+    """One recorded flight: its file, airframe, kind of log by content, what was done to it, its trim and the log.
+
+    `uneven`: a propeller's two blades were cut unlike.
+    """
 
     file: str
     airframe: str
     kind: str
     condition: str
     cut: tuple[float, float, float]
+    uneven: bool
     weight: str
     trim: FlightTrim
     recording: Recording
@@ -77,14 +81,18 @@ def read(folder: Path) -> list[Flown]:
                 continue
             seen.add(recording.sha256)
             kind = "controller" if "mixer_input" in recording.channels else "motor"
-            cut = _size(row["cut_M1"]), _size(row["cut_M2"]), _size(row["cut_M3"])
-            trim = flight_trim(recording, CRAZYFLIE)
-            out.append(Flown(row["file"], row["drone"], kind, row["condition"], cut, row["weight"], trim, recording))
+            blades = [_blades(row[f"cut_M{j}"]) for j in (1, 2, 3)]
+            first, second, third = (sum(pair) for pair in blades)
+            trim, uneven = flight_trim(recording, CRAZYFLIE), any(a != b for a, b in blades)
+            out.append(Flown(row["file"], row["drone"], kind, row["condition"], (first, second, third), uneven,
+                             row["weight"], trim, recording))  # fmt: skip
     return out
 
 
-def _size(text: str) -> float:
-    return sum(float(part) for part in text.split("+")) if text else 0.0
+def _blades(text: str) -> tuple[float, float]:
+    """Millimetres cut from either blade."""
+    one, other, *_ = [*(float(part) for part in text.split("+") if part), 0.0, 0.0]
+    return one, other
 
 
 def judge(flights: Sequence[Flown]) -> list[Judged]:
@@ -139,14 +147,19 @@ def kind_right(one: Judged) -> bool:
     return rotor == (one.flown.condition == "cut")
 
 
+def order(judged: Sequence[Judged], airframe: str, kind: str) -> list[Judged]:
+    """Cuts and healthy flights of an airframe in one kind of log."""
+    return [
+        j for j in judged
+        if (j.flown.airframe, j.flown.kind) == (airframe, kind) and j.flown.condition in ("cut", "healthy")
+    ]  # fmt: skip
+
+
 def _orders(judged: Sequence[Judged]) -> str:
     parts = []
     for airframe in ("E8", "E9"):
         for kind in ("controller", "motor"):
-            cuts = [
-                j for j in judged
-                if (j.flown.airframe, j.flown.kind) == (airframe, kind) and j.flown.condition in ("cut", "healthy")
-            ]  # fmt: skip
+            cuts = order(judged, airframe, kind)
             some = [j for j in cuts if j.flown.total > 0.0]
             both = (
                 spearmanr([j.flown.total for j in part], [j.health.score for j in part])[0] for part in (cuts, some)
@@ -222,8 +235,7 @@ def curve(judged: Sequence[Judged], path: Path) -> None:
     figure, axes = pyplot.subplots(1, 2, figsize=(9.0, 3.6), sharey=True)
     for axis, airframe in zip(axes, ("E8", "E9"), strict=True):
         for kind, mark in (("controller", "o"), ("motor", "x")):
-            mine = [j for j in judged if (j.flown.airframe, j.flown.kind) == (airframe, kind)]
-            cuts = [j for j in mine if j.flown.condition in ("cut", "healthy")]
+            cuts = order(judged, airframe, kind)
             axis.plot([j.flown.total for j in cuts], [j.health.score for j in cuts], mark, label=f"{kind} log")
         axis.set(xlabel="mm cut in all", title=airframe)
         axis.legend()
