@@ -168,7 +168,7 @@ def text(judged: Sequence[Judged]) -> str:
         f"{100.0 * limits.large:.1f} % (least squares over all flights). If every cut cost just that, and flights "
         "differed from the healthy mean as healthy flights do, the single cuts would give, as means and 95 % of "
         "draws:\n",
-        "| single cuts | wanted | this comparison | at best | wanted is reached at best in | measured |",
+        "| single cuts | wanted | this comparison | at best | wanted is reached in | measured (chance of as few) |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for what, share, chosen, right, column in ROWS:
@@ -178,8 +178,9 @@ def text(judged: Sequence[Judged]) -> str:
         best = _counted(flown, lambda airframe, size: limits.told(airframe, limits.loss(size)))
         told = (_range(best, ".1f", ".0f"), f"{100.0 * np.mean(best >= wanted):.0f} %")
         told = told if column == "first" else ("–", "–")
-        got = f"{sum(right(j) for j in mine)} of {len(mine)}"
-        lines.append(f"| {what} | {wanted} | {_range(ours, '.1f', '.0f')} | {told[0]} | {told[1]} | {got} |")
+        got = sum(right(j) for j in mine)
+        few = f"{got} of {len(mine)} ({100.0 * np.mean(ours <= got):.0f} %)"
+        lines.append(f"| {what} | {wanted} | {_range(ours, '.1f', '.0f')} | {told[0]} | {told[1]} | {few} |")
     lines += [
         "\nAt best: the rotor under which the trims are likeliest, where the spread is known, that one was cut, and by "
         "how much; no test of the trims names the right one more often.",
@@ -248,15 +249,21 @@ def _again(judged: Sequence[Judged], airframe: str) -> FloatArray:
     return np.asarray(np.median(np.abs(pairs), axis=0) / 0.6745 / np.sqrt(2.0))
 
 
+def untraced(judged: Sequence[Judged]) -> list[Judged]:
+    """Large single cuts that fly as the common healthy flight does."""
+    return [j for j in judged if is_single(j, LARGE, 99.0) and j.health.p_value > 0.5]
+
+
 def _outside(judged: Sequence[Judged]) -> str:
     """Flights that no spread accounts for: cuts that fly as healthy ones, weights that move the yaw trim."""
-    uncut = [j for j in judged if is_single(j, LARGE, 99.0) and j.health.p_value > 0.5]
+    single, uncut = [j for j in judged if is_single(j, LARGE, 99.0)], untraced(judged)
     weights = [j for j in judged if "glued" in j.flown.weight and abs(j.health.distance[2]) > 3.0]
     cuts = [f"{j.flown.file} ({j.flown.total:g} mm, p = {j.health.p_value:.2f})" for j in uncut]
     yawed = [f"{j.flown.file} ({j.health.distance[2]:+.1f} spreads of yaw)" for j in weights]
     return (
-        f"Outliers: {' and '.join(cuts)} fly like healthy flights; {' and '.join(yawed)} carry a weight but yaw like a "
-        "cut."
+        f"Outside of this: {' and '.join(cuts)} fly as healthy flights do; nothing in their trims names a rotor, and "
+        f"{len(single) - len(uncut)} of {len(single)} is the most without them. A weight balances without yaw; "
+        f"{' and '.join(yawed)} carry one and yaw as with a cut, and get that answer."
     )
 
 
