@@ -6,7 +6,8 @@ stayed, so its flights share a draw from the healthy spread; their counts are co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import ceil
 from typing import NamedTuple
 
@@ -82,7 +83,8 @@ class Limits:
     def moved(self, flown: Flown) -> FloatArray:
         """Change of trim that the flight's cuts make, shape (4,)."""
         healthy = self.healthy[flown.airframe]
-        return np.sum([self.loss(size) * _effect(healthy, j) for j, size in enumerate(flown.cut)], axis=0)
+        each = [self.loss(size) * _effect(healthy, j) for j, size in enumerate(flown.cut)]
+        return np.asarray(np.sum(each, axis=0))
 
     def told(self, airframe: str, loss: float) -> BoolArray:
         """Whether M3 is likelier than any other rotor, with all of the spread and the loss known, shape (draws,).
@@ -157,6 +159,12 @@ def _range(values: FloatArray, mean: str, bounds: str) -> str:
     return f"{values.mean():{mean}} ({low:{bounds}} to {high:{bounds}})"
 
 
+def _answer(answers: Mapping[tuple[str, float], Answers], column: str, airframe: str, size: float) -> BoolArray:
+    """One of the answers to cuts of a size, shape (draws,)."""
+    chosen: BoolArray = getattr(answers[airframe, size], column)
+    return chosen
+
+
 def text(judged: Sequence[Judged]) -> str:
     """The limits as Markdown."""
     limits = Limits(judged)
@@ -174,12 +182,12 @@ def text(judged: Sequence[Judged]) -> str:
     for what, share, chosen, right, column in ROWS:
         mine = [j for j in single if chosen(j)]
         flown, wanted = [j.flown for j in mine], ceil(share * len(mine))
-        ours = _counted(flown, lambda airframe, size, column=column: getattr(answers[airframe, size], column))
+        ours = _counted(flown, partial(_answer, answers, column))
         best = _counted(flown, lambda airframe, size: limits.told(airframe, limits.loss(size)))
         told = (_range(best, ".1f", ".0f"), f"{100.0 * np.mean(best >= wanted):.0f} %")
         told = told if column == "first" else ("–", "–")
-        got = sum(right(j) for j in mine)
-        few = f"{got} of {len(mine)} ({100.0 * np.mean(ours <= got):.0f} %)"
+        count = sum(right(j) for j in mine)
+        few = f"{count} of {len(mine)} ({100.0 * np.mean(ours <= count):.0f} %)"
         lines.append(f"| {what} | {wanted} | {_range(ours, '.1f', '.0f')} | {told[0]} | {told[1]} | {few} |")
     lines += [
         "\nAt best: the rotor under which the trims are likeliest, where the spread is known, that one was cut, and by "
