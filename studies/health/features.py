@@ -120,14 +120,15 @@ def outside(feature: Feature, flights: Sequence[Flown]) -> tuple[float, dict[str
 def text(judged: Sequence[Judged]) -> str:
     """The features as Markdown: spread of healthy flights, and how many others are outside of it."""
     flights = [j.flown for j in judged]
-    none, hints = {j.flown.file for j in untraced(judged)}, 0
+    none = {j.flown.file for j in untraced(judged)}
+    hints: set[str] = set()
     lines = [
         "| logarithm of | spread of healthy flights | " + " | ".join(name for name, _ in GROUPS) + " |",
         "|---" * (2 + len(GROUPS)) + "|",
     ]
     for feature in FEATURES:
         spread, far = outside(feature, flights)
-        hints += sum(far.get(file, False) for file in none)
+        hints |= {file for file in none if far.get(file)}
         cells = []
         for _, chosen in GROUPS:
             mine = [far[f.file] for f in flights if chosen(f) and f.file in far]
@@ -136,13 +137,12 @@ def text(judged: Sequence[Judged]) -> str:
     _, shaking = outside(GYRO, flights)
     mended = [j.flown.file for j in judged if j.flown.condition == "cut" and shaking.get(j.flown.file)]
     wrong = [j.flown.file for j in judged if j.flown.file in mended and not kind_right(j)]
-    return "\n".join(lines) + _WHY.format(len(wrong), len(none), hints)
+    return "\n".join(lines) + _WHY.format(len(wrong), len(none), len(hints))
 
 
 _WHY = """
 
-Flights outside of what one healthy flight in a hundred shows; a log without the channel is not counted. None is used.
-A propeller with unlike blades shakes, one cut alike does not, and small cuts shake no more than healthy propellers do.
-On an X frame each rotor shakes roll and pitch alike, so it names none. As evidence of a propeller, not a weight, it
-would mend {} of the wrong answers; of the {} large cuts that fly as healthy flights do it says nothing ({} flights
-outside over all rows)."""
+Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. None is used. A
+propeller with unlike blades shakes; one cut alike does not, and small cuts shake no more than healthy propellers. On an
+X frame each rotor shakes roll and pitch alike, so it names none. As evidence of a propeller, not a weight, it would
+mend {} of the wrong answers. Of the {} large cuts that fly like healthy flights, {} are outside in any row."""

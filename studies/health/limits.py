@@ -172,10 +172,9 @@ def text(judged: Sequence[Judged]) -> str:
     cuts = {(j.flown.airframe, j.flown.total): limits.moved(j.flown) for j in single}
     answers = {(airframe, size): limits.answered(airframe, moved) for (airframe, size), moved in cuts.items()}
     lines = [
-        f"A single cut below {LARGE:g} mm costs {100.0 * limits.light:.1f} % of thrust a millimetre, a larger one "
-        f"{100.0 * limits.large:.1f} % (least squares over all flights). If every cut cost just that, and flights "
-        "differed from the healthy mean as healthy flights do, the single cuts would give, as means and 95 % of "
-        "draws:\n",
+        f"A single cut below {LARGE:g} mm costs {100.0 * limits.light:.1f} % of thrust per millimetre, a larger one "
+        f"{100.0 * limits.large:.1f} % (least squares). With exactly these losses and the spread of healthy flights "
+        "(means, 95 % of draws):\n",
         "| single cuts | wanted | this comparison | at best | wanted is reached in | measured (chance of as few) |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -203,11 +202,11 @@ def text(judged: Sequence[Judged]) -> str:
                 f"| {airframe} {kind} | {WANTED:g} | {_range(drawn, '.2f', '.2f')} | "
                 f"{100.0 * np.mean(drawn >= WANTED):.0f} % | {got:.2f} |"
             )
-    lines += ["\n| spread of roll, pitch, yaw, effort in % | of healthy flights | of two flights of one propeller |",
-              "|---|---|---|"]  # fmt: skip
-    for airframe in AIRFRAMES:
-        spread = limits.healthy[airframe].deviation
-        lines.append(f"| {airframe} | {_shown(spread)} | {_shown(_again(judged, airframe))} |")
+    spreads = [
+        f"{name} {_shown(one.deviation)} (same propeller {_shown(_again(judged, name))})"
+        for name, one in limits.healthy.items()
+    ]
+    lines += ["", f"Spread of roll, pitch, yaw and effort of healthy flights [%]: {'; '.join(spreads)}."]
     return "\n".join([*lines, "", _look_alikes(limits), "", _kinds(judged), "", _doubles(judged), "", _outside(judged)])
 
 
@@ -220,10 +219,9 @@ def _look_alikes(limits: Limits) -> str:
         f"{100.0 * stdtr(one.freedom[k], 0.5 * WEIGHT / one.predictive(1)[k]):.0f} %" for one in limits.healthy.values()
     )
     return (
-        f"A weight of {100.0 * WEIGHT:.0f} % at a hub and a loss of that rotor differ in yaw alone, by as much. Here "
-        f"it is told in {ours} of draws for {' and '.join(AIRFRAMES)}; {best} if weights were as likely as cuts. Two "
-        "neighbouring rotors that lose as much of thrust and drag torque do not differ from a weight between them in "
-        "any trim: what is likelier before the flight decides."
+        f"A weight of {100.0 * WEIGHT:.0f} % at a hub and a loss of that rotor differ only in yaw. It is separated in "
+        f"{ours} of draws for {' and '.join(AIRFRAMES)}; in {best} if weights were as likely as cuts. Equal losses of "
+        "two neighbouring rotors have the trims of a weight between them; the prior decides."
     )
 
 
@@ -232,8 +230,8 @@ def _kinds(judged: Sequence[Judged]) -> str:
     cut = [kind_right(j) for j in judged if j.flown.condition == "cut" and j.flown.total >= LARGE]
     glued = [kind_right(j) for j in judged if "glued" in j.flown.weight]
     return (
-        f"Propeller or weight: right for {sum(cut)} of {len(cut)} cuts and {sum(glued)} of {len(glued)} weights. To "
-        f"answer a propeller always would be right for {len(cut)} of {len(cut) + len(glued)}."
+        f"Propeller or weight: right for {sum(cut)} of {len(cut)} cuts and {sum(glued)} of {len(glued)} weights; "
+        f"always answering a propeller, {len(cut)} of {len(cut) + len(glued)}."
     )
 
 
@@ -269,9 +267,8 @@ def _outside(judged: Sequence[Judged]) -> str:
     cuts = [f"{j.flown.file} ({j.flown.total:g} mm, p = {j.health.p_value:.2f})" for j in uncut]
     yawed = [f"{j.flown.file} ({j.health.distance[2]:+.1f} spreads of yaw)" for j in weights]
     return (
-        f"Outside of this: {' and '.join(cuts)} fly as healthy flights do; nothing in their trims names a rotor, and "
-        f"{len(single) - len(uncut)} of {len(single)} is the most without them. A weight balances without yaw; "
-        f"{' and '.join(yawed)} carry one and yaw as with a cut, and get that answer."
+        f"Outliers: {' and '.join(cuts)} fly like healthy flights, so {len(single) - len(uncut)} of {len(single)} is "
+        f"the most without them; {' and '.join(yawed)} carry a weight but yaw like a cut."
     )
 
 
