@@ -26,12 +26,18 @@ def page(results: Result) -> str:
     for name in shown:
         title, write = PARTS[name]
         out += [f"## {title}", "", *write(results[name]), ""]
+        if results[name]["machine"] != results[shown[0]]["machine"]:
+            out += [_measured(results[name]["machine"]), ""]
     return "\n".join(out)
 
 
 def _machine(m: Result) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in m["versions"].items())
     return f"{m['date']}; {m['processor']}, {m['cores']} cores, load {m['load']:.1f}; Python {m['python']}, {versions}"
+
+
+def _measured(m: Result) -> str:
+    return f"Measured {m['date']}, load {m['load']:.1f}, {m['processor']}."
 
 
 def _kernel(r: Result) -> list[str]:

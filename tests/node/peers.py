@@ -54,15 +54,29 @@ class Process:
             time.sleep(0.02)
         raise AssertionError(f"'{word}' was not said within {seconds:g} s; said: {self.text}")
 
-    def end(self, number: int = signal.SIGINT, times: int = 1, seconds: float = 20.0) -> tuple[int, float]:
-        """Sends a signal (several times), waits; returns the exit code and how long it took [s]."""
+    def end(self, number: int = signal.SIGINT, times: int = 1, seconds: float = 60.0) -> tuple[int, float]:
+        """Sends a signal (several times), waits; returns the exit code and how long it took [s].
+
+        Without the time in which its first thread could have gone on, and other programs had the processors.
+        """
         begin = time.monotonic()
+        before = held = self._held(0.0)
         for _ in range(times):
             if self.child.poll() is None:
                 self.child.send_signal(number)
                 time.sleep(0.05)
-        code = self.child.wait(seconds)
-        return code, time.monotonic() - begin
+        while (code := self.child.poll()) is None:
+            assert time.monotonic() < begin + seconds, f"not ended {seconds:g} s after signal {number}"
+            held = self._held(held)
+            time.sleep(0.01)
+        return code, time.monotonic() - begin - (held - before)
+
+    def _held(self, last: float) -> float:
+        """How long its first thread has waited for a processor [s], as Linux counts; the last value if it is gone."""
+        try:
+            return 1e-9 * int(Path(f"/proc/{self.child.pid}/schedstat").read_text().split()[1])
+        except OSError:
+            return last
 
     def __enter__(self) -> Process:
         return self

@@ -262,15 +262,12 @@ def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
     ("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["int", "term", "int int"]
 )
 def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, times: int) -> None:
-    took: list[float] = []
-    while len(took) < 2 and (not took or took[-1] >= 2.0):  # other tests may hold the machine for a moment, not twice
-        with node(tmp_path / f"{len(took)}.sqlite") as identify:
-            identify.wait_for("ready", 120.0)
-            code, seconds = identify.end(number, times)
-        assert code == 0, identify.text
-        assert "Traceback" not in identify.text
-        took.append(seconds)
-    assert min(took) < 2.0
+    with node(tmp_path / "h.sqlite") as identify:
+        identify.wait_for("ready", 120.0)
+        code, took = identify.end(number, times)
+    assert code == 0, identify.text
+    assert "Traceback" not in identify.text
+    assert took < 2.0
 
 
 def test_a_killed_fit_process_is_replaced_and_the_set_comes(
