@@ -20,7 +20,7 @@ from tests.online.driving import published
 from tests.online.made_up import PELICAN, QUICK, light_flight, tells, works
 from tests.online.test_gate import TRUE
 
-FLIGHT = light_flight(30.0)
+FLIGHT = light_flight(20.0)
 Spoil = Callable[[FitReply], FitReply]
 
 
