@@ -45,8 +45,18 @@ class Cut:
             if inside[name].any()
         }
         if not channels:
-            raise LogError(f"{recording.name}: nothing between {self.start} and {self.stop} s", "a span inside the log")
+            raise self._empty(recording)
         return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
+    def _empty(self, recording: Recording) -> LogError:
+        """Nothing is there: which span was asked for, and which there is."""
+        zero = first_imu_time(recording)
+        times = [float(t) - zero for c in recording.channels.values() if len(c.t) for t in (c.t[0], c.t[-1])]
+        asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
+        if self.start is None:
+            asked = f"before {self.stop} s"
+        there = f", {min(times):.1f} to {max(times):.1f} s" if times else ""
+        return LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
 
 
 def parse_cut(text: str, start: float | None = None, stop: float | None = None) -> Cut:

@@ -66,7 +66,8 @@ def test_a_span_of_the_log(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
         (["absent.csv"], "no file"),
         (["{log}", "--vehicle", "pelikan"], "pelican"),
         (["{log}", "--preset", "mavro", "--json", "-"], "did you mean 'mavros'"),
-        (["{log}@100:200"], "nothing between"),
+        (["{log}@100:200"], "nothing between 100.0 and 200.0 s; allowed: a span inside the log, 0.0 to "),
+        (["{log}@100:"], "nothing after 100.0 s; allowed: a span inside the log, 0.0 to "),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(
