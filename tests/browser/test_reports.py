@@ -271,4 +271,6 @@ def test_a_printed_report_is_short_and_light(chromium: Browser, demo_page: Path,
     with opened(chromium, demo_page, scheme="dark") as one:
         paper = one.page.pdf(path=shots / "demo.pdf", format="A4")
         assert 2 <= len(re.findall(rb"/Type\s*/Page[^s]", paper)) <= 8
+        one.page.emulate_media(media="print")
+        assert not one.page.get_by_text("Drag to zoom").is_visible()
         assert one.complaints == []
