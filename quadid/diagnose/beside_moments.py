@@ -1,9 +1,10 @@
 """Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that quick motion shows.
 
 The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
-motion by itself (`quadid.identify.quick_motion`) is free of that.  Where the fit to it, without any cause, explains it
-better than the selected model does, and puts one of b, J_xx and J_yy elsewhere, all three are held there and the causes
-refitted.
+motion by itself (`quadid.identify.quick_motion`) is free of that.  The selected model is fitted to it too, its causes
+as they were found but for what is late: without them an offset of the centre of gravity would count as a random moment,
+free they would take up random moments.  Unless quick motion confirms b, J_xx and J_yy, all three are held at what it
+says and the causes refitted.
 """
 
 from __future__ import annotations
@@ -13,19 +14,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.diagnose.model import Model, fit_model, without
+from quadid.diagnose.model import Model, fit_model, free_names, without
 from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.segment_schedule import Stage
 from quadid.diagnose.selection import Search, pruned
+from quadid.effects import EFFECTS
 from quadid.identify.fit import YAW, quick_fit, restless
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_estimation import residual_noise
-from quadid.identify.process_noise import AXES
-from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion
+from quadid.identify.quick_motion import MOST_SEGMENTS, quick_motion
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, Parameter, ParameterSet
-from quadid.types import FloatArray
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
@@ -64,36 +64,28 @@ class Held:
         )
 
 
-def held_by_quick_motion(windows: Sequence[Window], short: Shooting, nominal: FloatArray, model: Model) -> Held | None:
+def held_by_quick_motion(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
     """What the selected model has wrong because moments that no model has turn the vehicle; None where it has not.
 
     Args:
         windows: the data.
         short: short segments.
-        nominal: optimum of the model without causes, full vector.
         model: the selected one.
     """
     short = short.at_most(MOST_SEGMENTS)
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     if not restless(short.with_noise(residual_noise(short, brief)), brief):
         return None
-    quick = quick_motion(windows, short, nominal, NOMINAL_NAMES)
-    if quick is None or not _better(quick, model):
+    names = free_names(tuple(c for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns))
+    quick = quick_motion(windows, short, model.theta, names)
+    if quick is None:
         return None
-    shown = {p.name: p for p in quick_fit(quick, NOMINAL_NAMES).parameters if p.name in SHOWN}
+    shown = {p.name: p for p in quick_fit(quick, names).parameters if p.name in SHOWN}
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
-    if all(p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
+    if all(p.status not in UNKNOWN and p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
         return None
     # Together: torque is b times a square over an inertia, and one may be known only relative to another.
     return Held(shown, _holding(short.vehicle, shown))
-
-
-def _better(quick: QuickMotion, model: Model) -> bool:
-    """Whether quick roll and pitch are better explained by the fit to quick motion, without causes, than by `model`."""
-    others = [c for c in range(quick.shooting.channels) if c not in AXES[:2]]
-    rates = quick.shooting.leaving_out(others)
-    own, selected = (polish(rates, theta, rates.free([]), iterations=6) for theta in (quick.found.theta, model.theta))
-    return not selected.lin.total_cost <= own.lin.total_cost
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:

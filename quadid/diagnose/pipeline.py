@@ -78,7 +78,7 @@ def diagnose(
     vehicle = with_reference_voltage(vehicle, windows)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     schedule, search = _select(windows, begun, report)
-    held = held_by_quick_motion(windows, schedule[-1], begun.nominal, search.model)
+    held = held_by_quick_motion(windows, schedule[-1], search.model)
     if held is not None:
         schedule, search = refitted(held, schedule, search)
     decisive, model = search.shooting, search.model

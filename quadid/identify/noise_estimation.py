@@ -10,7 +10,7 @@ import numpy as np
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import Polished, polish
 from quadid.identify.initial_states import InitialStates
-from quadid.identify.noise_model import SLOW_TIME, NoiseModel, estimate_noise
+from quadid.identify.noise_model import ATTITUDE, SLOW_TIME, NoiseModel, estimate_noise
 from quadid.identify.noise_spectrum import shaped_noise
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
@@ -78,9 +78,14 @@ def reweighted_fit(
 
 
 def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
-    """Everything the catalogue can free at once on these data: the model that leaves only noise."""
+    """Everything the catalogue can free at once on these data: the model that leaves only noise.
+
+    With attitude left out the scale of the gyro and an inertia are one number; then it is not among them.
+    """
     kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
     effects = [e for e in EFFECTS.values() if e.flexible in kinds]
+    if set(ATTITUDE) <= set(shooting.left_out):
+        effects.remove(EFFECTS["gyro_scale"])
     out = [*NOMINAL_NAMES, *(n for e in effects for n in e.flexible_entries)]
     losses = [n for n in layout.entries if n.startswith("weak_rotor.loss_")]
     return out + losses[1:]
