@@ -264,4 +264,11 @@ TABLE: tuple[Effect, ...] = (
         advice="Fly higher to identify, or keep it in the model for landing.",
         needs=("position",), flexible="never", shows=("a_z: height", "a_z: time"),
     ),
+    Effect(
+        "velocity_scale", "sensor", _axes("horizontal vertical", "", 0.5, 0.05, factor=1e2),
+        summary="The logged velocity has a wrong scale.",
+        sentence="the logged velocity is {horizontal:.1f} % too large horizontally, {vertical:.1f} % vertically",
+        advice="Check the scale of the estimator's velocity: height of the flow sensor, marker distances.",
+        needs=("velocity", "position"), flexible="never", sized=True, shows=("v_n: v_n", "v_e: v_e", "v_d: v_d"),
+    ),
 )  # fmt: skip

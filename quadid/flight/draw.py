@@ -41,12 +41,13 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "imu_lever_arm": {"x": (0.02, 0.08), "y": (0.02, 0.08), "z": (0.02, 0.08)},
     "ahrs_acceleration_error": {"k": (0.05, 0.5)},
     "ground_effect": {"radius_scale": (1.5, 3.0)},
+    "velocity_scale": {"horizontal": (0.03, 0.12), "vertical": (0.03, 0.12)},
 }
 """Realistic magnitudes on a Pelican, in contract units."""
 SIGNED = frozenset(
     (
         *("rotor_drag_moment", "wind", "cg_offset", "mass_change", "product_of_inertia"),
-        *("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment", "imu_lever_arm"),
+        *("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment", "imu_lever_arm", "velocity_scale"),
     )
 )
 """Effects whose numbers may have either sign (mass is dropped or taken up)."""

@@ -165,7 +165,8 @@ def _extras(flown: Flown, wanted: Sequence[str]) -> dict[str, FloatArray]:
         hover = flown.setup.body.hover_speed
         speeds = zip(t, flown.track.rotor, strict=True)
         volts = FULL_BATTERY * np.array([supply(float(x), omega, hover, events) for x, omega in speeds])
-    clean = {"velocity": flown.track.state[:, 3:6], "position": flown.track.state[:, 0:3], "battery": volts[:, None]}
+    felt = flown.track.state[:, 3:6] * flown.setup.velocity_gain
+    clean = {"velocity": felt, "position": flown.track.state[:, 0:3], "battery": volts[:, None]}
     sigma = {"velocity": flown.sensor.velocity, "position": flown.sensor.position, "battery": flown.sensor.battery}
     return {name: clean[name] + flown.noise(name, sigma[name], clean[name].shape[1]) for name in wanted}
 

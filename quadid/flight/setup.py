@@ -69,6 +69,7 @@ class Setup:
         reading_delay: by which logged rotor speeds come late [s].
         imu_cutoff: Butterworth cut-off in the IMU's telemetry path [Hz]; infinite for none.
         attitude_delay: of the attitude's telemetry path [s].
+        velocity_gain: factors on the logged velocity, north, east, down, shape (3,).
     """
 
     vehicle: Vehicle
@@ -84,6 +85,7 @@ class Setup:
     reading_delay: float
     imu_cutoff: float
     attitude_delay: float
+    velocity_gain: FloatArray
     odd: Oddity = field(default_factory=Oddity)
 
 
@@ -259,4 +261,5 @@ def prepare(
         reading_delay=value("rotor_telemetry_delay", "delay"),
         imu_cutoff=value("imu_lag", "cutoff"),
         attitude_delay=value("attitude_delay", "delay"),
+        velocity_gain=1.0 + value.vector("velocity_scale", "horizontal horizontal vertical"),
     )

@@ -198,7 +198,7 @@ def _finite(window: Window) -> dict[str, BoolArray]:
 def initial_states(window: Window, theta: FloatArray, known: dict[str, BoolArray]) -> FloatArray:
     """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown.
 
-    The model's gyro is undone, and an attitude that is late by the model is turned on by the rate.
+    The model's gyro and its scale of the velocity are undone; an attitude that is late by it is turned on by the rate.
     """
     x = np.zeros((len(window), N_STATE))
     x[:, 0] = 1.0
@@ -206,6 +206,7 @@ def initial_states(window: Window, theta: FloatArray, known: dict[str, BoolArray
         values = getattr(window, name)
         if values is not None:
             x[known[name], place : place + values.shape[1]] = values[known[name]]
+    x[:, 7:10] /= 1.0 + theta[[ix.VEL_SCALE, ix.VEL_SCALE, ix.VEL_SCALE_Z]]
     if window.gyro is not None:
         x[known["gyro"], 4:7] = true_rate(window.gyro[known["gyro"]], theta)
         delay = float(theta[ix.ATT_DELAY])

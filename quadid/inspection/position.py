@@ -73,7 +73,8 @@ def _compared(position: Channel, velocity: Channel) -> Check:
     return Check(
         "position_velocity", Verdict.WARNING,
         f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
-        "of them is wrong; nothing is corrected, and a simulation fitted to such a log misses positions by as much",
+        "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
+        "`velocity_scale`",
         "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)",
         numbers,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numba as nb
 
 # isort: off
 from quadid.model.rows import (
-    S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_N, X_VN,
+    C_VEL, C_VEL_Z, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_N, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -58,9 +58,9 @@ def compare_motion(
     """Writes predicted minus measured velocity and, with 15 channels, position at sample k; before the step."""
     lane_kernel()
     for lane in range(LANES):
-        out[seg, row, 9 * LANES + lane] = scale[k, 9] * (s[X_VN + lane] - measured[k, 10])
-        out[seg, row, 10 * LANES + lane] = scale[k, 10] * (s[X_VN + Y1 + lane] - measured[k, 11])
-        out[seg, row, 11 * LANES + lane] = scale[k, 11] * (s[X_VN + Y2 + lane] - measured[k, 12])
+        out[seg, row, 9 * LANES + lane] = scale[k, 9] * (s[C_VEL + lane] * s[X_VN + lane] - measured[k, 10])
+        out[seg, row, 10 * LANES + lane] = scale[k, 10] * (s[C_VEL + lane] * s[X_VN + Y1 + lane] - measured[k, 11])
+        out[seg, row, 11 * LANES + lane] = scale[k, 11] * (s[C_VEL_Z + lane] * s[X_VN + Y2 + lane] - measured[k, 12])
     if scale.shape[1] > 12:
         for lane in range(LANES):
             out[seg, row, 12 * LANES + lane] = scale[k, 12] * (s[X_N + lane] - measured[k, 13])

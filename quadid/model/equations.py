@@ -65,6 +65,7 @@ Sensors
     imu_misalignment    sensor = exp([m]x) body, gyro and accelerometer alike.
     gyro_scale, gyro_bias, accel_bias
                         gyro = (1 + scale) rate + bias;  accelerometer = force + bias, after the misalignment.
+    velocity_scale      velocity = (1 + horizontal) (north, east), (1 + vertical) down.
     imu_lag             y'' + 2 sigma y' + 2 sigma^2 (y - u) = 0, sigma = sqrt(2) pi cutoff: Butterworth, second order.
     attitude_delay      attitude(t - delay), from stored steps by rate and its change within the step.
     ahrs_acceleration_error

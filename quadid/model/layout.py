@@ -58,6 +58,7 @@ MAX_, MAY, MAZ = places("imu_misalignment")
 LAX, LAY, LAZ = places("imu_lever_arm")
 (AHRS_K,) = places("ahrs_acceleration_error")
 (GROUND,) = places("ground_effect")
+VEL_SCALE, VEL_SCALE_Z = places("velocity_scale")
 
 
 @dataclass(frozen=True)

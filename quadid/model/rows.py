@@ -29,9 +29,10 @@ def _rows(first: int, count: int) -> range:
 # Constants of the sensors; three rows from C_GB, C_AB, C_GS; nine, row by row of a matrix, from C_R.
 (C_SIGMA, C_KAPPA, C_EC, C_ES, C_EC2, C_ES2, C_AHRS, C_ATT_DELAY) = _rows(C_FLOW_ARM + LANES, 8)
 (C_GB, C_AB, C_GS, C_R) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)
+(C_VEL, C_VEL_Z) = _rows(C_R + 9 * LANES, 2)
 # Constants of the rotors: lags, delay in whole steps and the rest, input row in use; constant of the thrust curve,
 # exponent of the voltage, growth of the drag torque.
-(C_TAU, C_TAU_DOWN, C_SHIFT, C_PART, C_ROW, C_CURVE, C_VOLT, C_GROWTH) = _rows(C_R + 9 * LANES, 8)
+(C_TAU, C_TAU_DOWN, C_SHIFT, C_PART, C_ROW, C_CURVE, C_VOLT, C_GROWTH) = _rows(C_VEL_Z + LANES, 8)
 # Constants of the four pieces of a step: e = exp(-h / tau), its integrals, the length h, and where it begins, counted
 # from the middle of its sample of the input.
 (P_E, P_E1, P_E2, P_E3, P_H, P_AT) = _rows(C_GROWTH + LANES, 6)

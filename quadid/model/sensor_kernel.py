@@ -15,9 +15,9 @@ from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
-    C_AB, C_AHRS, C_ATT_DELAY, C_EC, C_EC2, C_ES, C_ES2, C_GB, C_GS, C_KAPPA, C_R, C_SIGMA, D_H, D_P, D_P0, D_Q,
-    D_Q0, D_QW, D_QX, D_QY, D_QZ, D_R, D_R0, E_QW, E_QX, E_QY, E_QZ, F1_X, F2_X, G_BEND, G_DF, G_DW, G_F, G_F0,
-    G_FM, G_W, G_W0, N_QW, N_QX, N_QY, N_QZ, S_BENDX, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R,
+    C_AB, C_AHRS, C_ATT_DELAY, C_EC, C_EC2, C_ES, C_ES2, C_GB, C_GS, C_KAPPA, C_R, C_SIGMA, C_VEL, C_VEL_Z, D_H, D_P,
+    D_P0, D_Q, D_Q0, D_QW, D_QX, D_QY, D_QZ, D_R, D_R0, E_QW, E_QX, E_QY, E_QZ, F1_X, F2_X, G_BEND, G_DF, G_DW, G_F,
+    G_F0, G_FM, G_W, G_W0, N_QW, N_QX, N_QY, N_QZ, S_BENDX, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R,
     X_P, X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 
@@ -64,6 +64,7 @@ def sensor_constants(theta: FloatArray, dt: float, s: FloatArray) -> None:
         for i in range(3):
             s[C_GB + i * LANES + lane], s[C_AB + i * LANES + lane] = th[ix.GBX + i], th[ix.ABX + i]
             s[C_GS + i * LANES + lane] = 1.0 + th[ix.GSX + i]
+        s[C_VEL + lane], s[C_VEL_Z + lane] = 1.0 + th[ix.VEL_SCALE], 1.0 + th[ix.VEL_SCALE_Z]
         _rotation(th[ix.MAX_], th[ix.MAY], th[ix.MAZ], lane, s)
 
 

@@ -35,13 +35,12 @@ SLOPE_SECONDS = 0.1
 MOST_SECONDS = 300.0
 """Flight that a map is made of, at most [s]."""
 _VELOCITY = slice(7, 10)
-_CHANNELS = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z")
 
 
 def _pair(text: str) -> tuple[Mode, int, str]:
     """How the residual is taken, its channel, and what it is drawn against, from the table's words."""
     channel, against = text.split(": ")
-    return ("slope" if channel.endswith("'") else "value"), _CHANNELS.index(channel.rstrip("'")), against
+    return ("slope" if channel.endswith("'") else "value"), CHANNEL_NAMES.index(channel.rstrip("'")), against
 
 
 PAIRS = {e.name: tuple(_pair(text) for text in e.shows) for e in EFFECTS.values()}
@@ -53,6 +52,8 @@ _NAMES = {
     "v_z": ("downward speed", "m/s"), "thrust": ("thrust over its mean", ""), "heading": ("heading", "rad"),
     "thrust_rate": ("rate of change of thrust over its mean", "1/s"), "rotor_speed": ("mean rotor speed", "rad/s"),
     "spin_rate": ("rate of change of the summed rotor speed", "rad/s^2"), "height": ("height", "m"),
+    "v_n": ("logged velocity north", "m/s"), "v_e": ("logged velocity east", "m/s"),
+    "v_d": ("logged velocity down", "m/s"),
 }  # fmt: skip
 
 
@@ -164,6 +165,8 @@ def _of_window(window: Window, rows: IndexArray, rates: FloatArray, shooting: Sh
     for i, name in enumerate("pqr"):
         out[name] = rates[..., i]
         out[f"{name}_dot"] = np.gradient(rates[..., i], dt, axis=1)
+    if window.velocity is not None:
+        out |= {name: window.velocity[rows, i] for i, name in enumerate(("v_n", "v_e", "v_d"))}
     if window.position is not None:
         out["height"] = -window.position[rows, 2]
     return out

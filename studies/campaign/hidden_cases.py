@@ -23,6 +23,7 @@ GUESS = 0.2
 """Standard deviation of the logarithm of the initial guess against the truth."""
 LATER = (
     "translational_lift", "supply_voltage", "rotor_telemetry_delay", "drag_torque_curve", "no_gyroscopic_coupling",
+    "velocity_scale",
 )  # fmt: skip
 """Effects that joined the catalogue when the numbers of the cases below were in use; a class of their own."""
 SINGLES = tuple(name for name in EFFECTS if name not in LATER)

@@ -26,6 +26,12 @@ FLOWN: dict[str, tuple[Vehicle, tuple[str, ...], dict[str, dict[str, float]]]] =
     "slower down": (PELICAN, (), {"motor_lag": {"tau": 0.03, "tau_down": 0.05}}),
     "as slow down": (PELICAN, (), {"motor_lag": {"tau": 0.04}}),
     "weak in thrust": (PELICAN, (), {"weak_rotor": {"rotor": 2.0, "loss": 0.1, "drag_loss": 0.02}}),
+    "scaled velocity": (
+        PELICAN,
+        ("velocity", "position"),
+        DRAG | {"velocity_scale": {"horizontal": 0.08, "vertical": -0.15}},
+    ),
+    "velocity as it is": (PELICAN, ("velocity", "position"), DRAG),
     "weak in both": (PELICAN, (), {"weak_rotor": {"rotor": 2.0, "loss": 0.1}}),
 }
 """Each effect beside what looks like it: vehicle, channels beyond the usual, what is hidden."""

@@ -22,8 +22,8 @@ LEVEL = Rotation.identity()
 
 def same(a: Flight, b: Flight) -> bool:
     """True when two logs agree bit for bit."""
-    pairs = [(getattr(a.window, n), getattr(b.window, n)) for n in ("gyro", "accel", "attitude", "rotor_speed")]
-    return all(np.array_equal(x, y) for x, y in pairs)
+    logged = ("gyro", "accel", "attitude", "velocity", "rotor_speed")
+    return all(np.array_equal(getattr(a.window, n), getattr(b.window, n)) for n in logged)
 
 
 def acceleration(effects: Effects, velocity: FloatArray | None = None, rates: FloatArray | None = None) -> FloatArray:
@@ -36,7 +36,7 @@ def acceleration(effects: Effects, velocity: FloatArray | None = None, rates: Fl
 
 @pytest.fixture(scope="module")
 def nominal() -> Flight:
-    return fly(PELICAN, seconds=10.0, seed=5)
+    return fly(PELICAN, seconds=10.0, seed=5, extras=("velocity",))
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +47,11 @@ def quiet() -> Flight:
 @pytest.mark.parametrize("name", list(EFFECTS))
 def test_neutral_changes_nothing_and_a_realistic_size_does(name: str, nominal: Flight) -> None:
     neutral = {p.name: p.neutral for p in EFFECTS[name].parameters}
-    altitude = 30.0
-    assert same(fly(PELICAN, seconds=10.0, seed=5, effects={name: neutral}, altitude=altitude), nominal)
+    logged = ("velocity",)
+    assert same(fly(PELICAN, seconds=10.0, seed=5, effects={name: neutral}, altitude=30.0, extras=logged), nominal)
     drawn = draw_effect(name, 1, seconds=10.0)
     assert name in drawn
-    assert not same(fly(PELICAN, seconds=10.0, seed=5, effects=drawn, altitude=None), nominal)
+    assert not same(fly(PELICAN, seconds=10.0, seed=5, effects=drawn, altitude=None, extras=logged), nominal)
 
 
 def test_every_effect_of_the_catalogue_can_be_drawn() -> None:
@@ -234,6 +234,14 @@ def test_bias_scale_and_misalignment_of_the_imu() -> None:
     _, nominal = accel_z(flight)
     force = turn.apply(np.column_stack([0 * nominal, 0 * nominal, nominal])) + [0.2, -0.3, 0.1]
     np.testing.assert_allclose(w.accel[1:], force, atol=1e-9)
+
+
+def test_scale_of_the_logged_velocity() -> None:
+    effects = {"velocity_scale": {"horizontal": 0.1, "vertical": -0.05}}
+    flight = fly(PELICAN, seconds=10.0, seed=5, noise_scale=0.0, effects=effects, extras=("velocity", "position"))
+    assert flight.window.velocity is not None
+    np.testing.assert_allclose(flight.window.velocity, flight.truth.velocity * [1.1, 1.1, 0.95], atol=1e-12)
+    np.testing.assert_array_equal(flight.window.position, flight.truth.position)
 
 
 def test_misaligned_imu_at_rest_sees_gravity_turned() -> None:

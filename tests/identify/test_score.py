@@ -114,6 +114,17 @@ def test_gyro_errors_of_the_model_are_undone_at_the_start() -> None:
     np.testing.assert_allclose(true_rate(quiet.window.gyro, theta), quiet.truth.rates, atol=2e-4)
 
 
+def test_the_scale_of_the_velocity_is_undone_at_the_start_and_predicted_at_the_end() -> None:
+    effects = {"velocity_scale": {"horizontal": 0.2, "vertical": -0.15}}
+    quiet = fly(PELICAN, seconds=20.0, seed=35, noise_scale=0.0, effects=effects, extras=("velocity", "position"))
+    theta = true_theta(quiet)
+    ignored, _ = horizon_scores([[quiet.window]], PELICAN, theta)
+    Layout(PELICAN).write_effects(theta, effects)
+    known, _ = horizon_scores([[quiet.window]], PELICAN, theta)
+    assert known.at(50)["position"] < 0.02 < 0.1 < ignored.at(50)["position"]
+    assert known.at(50)["velocity"] < 0.05 < 0.1 < ignored.at(50)["velocity"]
+
+
 def test_a_late_attitude_of_the_model_is_turned_on_at_the_start() -> None:
     effects = {"attitude_delay": {"delay": 0.05}}
     quiet = fly(PELICAN, seconds=20.0, seed=34, noise_scale=0.0, effects=effects, extras=("velocity", "position"))

@@ -20,7 +20,7 @@ from tests.model.independent import EULER, RATE, Flown, quaternion
 
 PELICAN = Vehicle.shipped("pelican")
 DT = 0.01
-GYRO, ATTITUDE, ACCEL = slice(0, 3), slice(3, 6), slice(6, 9)
+GYRO, ATTITUDE, ACCEL, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 
 
 @lru_cache(maxsize=1)
@@ -31,13 +31,13 @@ def flight() -> Flown:
 
 
 def residuals(window: Window, effects: dict[str, float], n_pre: int = 1) -> FloatArray:
-    """Residuals (rows, 9) of the rows from `n_pre` + 1 on, of a model with these sensor effects."""
+    """Residuals (rows, channels) of the rows from `n_pre` + 1 on, of a model with these sensor effects."""
     values = values_of(PELICAN, {"rotor_drag.k_x": 0.4, "rotor_drag.k_y": 0.4, "motor_lag.tau": 0.03, **effects})
     first = n_pre + 1
     segments = Segments(len(window) - first - 1, n_pre, np.array([first]))
     rollout = Rollout(window, PELICAN)
     start = flight().states(segments.starts - n_pre)
-    return np.asarray(rollout.roll(segments, vector(PELICAN, values)[None], start, n_pre=n_pre)[0][0, 0, :, :9, 0])
+    return np.asarray(rollout.roll(segments, vector(PELICAN, values)[None], start, n_pre=n_pre)[0][0, 0, :, :, 0])
 
 
 def filtered(signal: FloatArray, fine: float, cutoff: float) -> FloatArray:
@@ -105,6 +105,16 @@ def test_imu_statics() -> None:
     found = residuals(window, effects)
     assert np.abs(found[:, GYRO]).max() < 1e-6
     assert np.abs(found[:, ACCEL]).max() < 1e-6
+
+
+def test_scale_of_the_velocity() -> None:
+    """Logged is (1 + horizontal) (north, east), (1 + vertical) down; position and all else stay."""
+    clean = flight().window()
+    assert clean.velocity is not None
+    window = flight().window(velocity=clean.velocity * [1.1, 1.1, 0.95])
+    found = residuals(window, {"velocity_scale.horizontal": 0.1, "velocity_scale.vertical": -0.05})
+    assert np.abs(found - residuals(clean, {})).max() < 1e-6
+    assert np.abs(residuals(window, {})[:, VELOCITY]).max() > 1e-2
 
 
 def test_small_misalignments_are_smooth() -> None:
