@@ -19,6 +19,7 @@ from quadid.diagnose.plausibility import impossible_causes
 from quadid.diagnose.segment_schedule import Stage
 from quadid.diagnose.selection import Search, pruned
 from quadid.effects import EFFECTS
+from quadid.identify.covariance import SPREAD_LIMIT
 from quadid.identify.fit import YAW, quick_fit, restless
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_estimation import residual_noise
@@ -41,10 +42,12 @@ class Held:
     Attributes:
         parameters: by name, as an identification gives them.
         vehicle: with these values.
+        regardless: names of those that quick motion shows without any cause too.
     """
 
     parameters: Mapping[str, Parameter]
     vehicle: Vehicle
+    regardless: frozenset[str]
 
     def on(self, shooting: Shooting) -> Shooting:
         """The same problem with what is held."""
@@ -84,8 +87,13 @@ def held_by_quick_motion(windows: Sequence[Window], short: Shooting, model: Mode
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
     if all(p.status not in UNKNOWN and p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
         return None
+    neutral = short.layout.initial(short.vehicle)
+    neutral[short.free(NOMINAL_NAMES).index] = model.theta[short.free(NOMINAL_NAMES).index]
+    alone = quick_motion(windows, short, neutral, NOMINAL_NAMES)
+    told = {} if alone is None else dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
+    same = frozenset(n for n, p in shown.items() if n in told and abs(np.log(told[n] / p.value)) <= SPREAD_LIMIT)
     # Together: torque is b times a square over an inertia, and one may be known only relative to another.
-    return Held(shown, _holding(short.vehicle, shown))
+    return Held(shown, _holding(short.vehicle, shown), same)
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:

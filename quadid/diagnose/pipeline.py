@@ -133,8 +133,8 @@ def _nominal_parameters(
 
     Estimates must agree as those of an identification, and with those of the models without each cause that is
     `doubted` (by label): it stands for something else, which may do to them what it does.  Where the cause of the error
-    is unknown, so is what it does to them: none is to be used; nor an inertia beside a doubtful moment.  What is `held`
-    is not concerned.
+    is unknown, so is what it does to them: none is to be used; nor an inertia beside a doubtful moment.  What is
+    `held`, and shows without any cause, is not concerned.
     """
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     trust = reliability(decisive, model, model.free, model.prior, brief)
@@ -157,7 +157,7 @@ def _nominal_parameters(
     if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
         spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
     for names, why in spoilt.items():
-        open_to_it = set(names) - set(held.parameters if held else ())
+        open_to_it = set(names) - (held.regardless if held else set())
         if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
             nominal = unreliable(nominal, lost)
             reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")
