@@ -1,15 +1,17 @@
-"""The last word on a fit: what these data cannot show keeps its guess, and guesses belong to a rigid body."""
+"""The answer of an identification: what these data cannot show keeps its guess, and guesses belong to a rigid body."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from quadid.chi_square import Z95
+from quadid.identify.covariance import Uncertainty
+from quadid.identify.gauss_newton import Convergence
+from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.parameters import (
     INERTIAS,
@@ -21,9 +23,47 @@ from quadid.parameters import (
     at_bound,
     impossible_inertia,
 )
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from quadid.identify.fit import Fit
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of an identification.
+
+    Attributes:
+        vehicle: the vehicle as given.
+        theta: full parameter vector.
+        parameters: free parameters with intervals and status.
+        noise: estimated sensor noise, in which errors are stated.
+        uncertainty: covariance of the scaled parameters.
+        outcome: how the polish ended.
+        evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
+        warnings: what a user should know.
+    """
+
+    vehicle: Vehicle
+    theta: FloatArray
+    parameters: ParameterSet
+    noise: NoiseModel
+    uncertainty: Uncertainty
+    outcome: Convergence
+    evaluations: int
+    warnings: tuple[str, ...] = ()
+
+    def of(self, names: Sequence[str]) -> Fit:
+        """The same for some of its parameters, which come first; others were fitted along and are neutral again."""
+        if len(names) == len(self.parameters):
+            return self
+        theta, layout = self.theta.copy(), Layout(self.vehicle)
+        for p in self.parameters.parameters[len(names) :]:
+            theta[layout.entry(p.name).index] = p.initial
+        return replace(
+            self,
+            theta=theta,
+            parameters=self.parameters.first(len(names)),
+            uncertainty=self.uncertainty.first(len(names)),
+        )
 
 
 def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from quadid.errors import NotIdentifiableError, WindowError
+from quadid.identify.answer import Fit as Fit
 from quadid.identify.answer import final_answer, on_bounds
 from quadid.identify.composite_likelihood import with_second_cut
-from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, parameter_set, uncertainty
+from quadid.identify.covariance import SPREAD_LIMIT, parameter_set, uncertainty
 from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
 from quadid.identify.long_logs import spread
@@ -27,8 +28,7 @@ from quadid.identify.reliability import reliability
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Shooting
 from quadid.identify.uncertain_scale import with_uncertain_scale
-from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, ParameterSet
+from quadid.parameters import INERTIAS, NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -62,45 +62,6 @@ class FitOptions:
     swarm: SwarmOptions = field(default_factory=SwarmOptions)
     seed: int = 0
     robust: bool = True
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Result of an identification.
-
-    Attributes:
-        vehicle: the vehicle as given.
-        theta: full parameter vector.
-        parameters: free parameters with intervals and status.
-        noise: estimated sensor noise, in which errors are stated.
-        uncertainty: covariance of the scaled parameters.
-        outcome: how the polish ended.
-        evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
-        warnings: what a user should know.
-    """
-
-    vehicle: Vehicle
-    theta: FloatArray
-    parameters: ParameterSet
-    noise: NoiseModel
-    uncertainty: Uncertainty
-    outcome: Convergence
-    evaluations: int
-    warnings: tuple[str, ...] = ()
-
-    def of(self, names: Sequence[str]) -> Fit:
-        """The same for some of its parameters, which come first; others were fitted along and are neutral again."""
-        if len(names) == len(self.parameters):
-            return self
-        theta, layout = self.theta.copy(), Layout(self.vehicle)
-        for p in self.parameters.parameters[len(names) :]:
-            theta[layout.entry(p.name).index] = p.initial
-        return replace(
-            self,
-            theta=theta,
-            parameters=self.parameters.first(len(names)),
-            uncertainty=self.uncertainty.first(len(names)),
-        )
 
 
 LEAST_SECONDS = 2.0

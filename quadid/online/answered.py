@@ -6,38 +6,26 @@ estimate itself, which the gate judges.
 
 from __future__ import annotations
 
-from collections.abc import Container
-from typing import TYPE_CHECKING
+from collections.abc import Container, Sequence
 
 import numpy as np
 
 from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.model.layout import Layout
+from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid.window import Window
-
-if TYPE_CHECKING:
-    from quadid.online.fusion import WindowEstimate
-    from quadid.online.window_fit import FitReply, FitRequest
 
 ROOM = 2.0
 """An estimate may lie so far outside the bounds, log scale: b at hover is not the b that was bounded."""
-_SIX = len(NOMINAL_NAMES)
+SIX = len(NOMINAL_NAMES)
 
 
-def answers(request: FitRequest, reply: FitReply) -> bool:
-    """Whether a reply has the form of an answer to this request."""
-    channels = {min((_channels(w) for w in request.windows), default=0)}
-    if request.noise is not None:
-        channels.add(len(request.noise.white))
-    no_numbers = reply.estimate is not None and not reply.estimate.finite
-    return (
-        all(a is None or a.shape == (_SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
-        and all(n is None or _is_noise(n, channels) for n in (reply.noise, reply.measured))
-        and (reply.theta is None or _is_vector(reply.theta, request.theta, no_numbers))
-        and (reply.estimate is None or _is_estimate(reply.estimate, request))
-    )
+def channels_of(windows: Sequence[Window]) -> int:
+    """Residual channels that all of these windows have."""
+    return min((_channels(w) for w in windows), default=0)
 
 
 def _channels(window: Window) -> int:
@@ -46,27 +34,28 @@ def _channels(window: Window) -> int:
     return 9 if window.velocity is None else 12
 
 
-def _is_noise(noise: NoiseModel, channels: Container[int]) -> bool:
+def is_noise(noise: NoiseModel, channels: Container[int]) -> bool:
+    """A noise model of so many channels."""
     shape = noise.white.shape
     if len(shape) != 1 or shape[0] not in channels or noise.slow.shape != shape or not noise.slow_time > 0.0:
         return False
     return noise.shape is None or noise.shape.shape == (*shape, SHAPE_POINTS)
 
 
-def _is_vector(theta: FloatArray, asked: FloatArray, no_numbers: bool) -> bool:
+def is_vector(theta: FloatArray, asked: FloatArray, no_numbers: bool) -> bool:
     """Finite and possible, but where the estimate is told to be no numbers: then nothing of it is taken in."""
-    possible = bool(np.isfinite(theta).all() and np.all(theta[:_SIX] > 0.0))
+    possible = bool(np.isfinite(theta).all() and np.all(theta[:SIX] > 0.0))
     return theta.shape == asked.shape and (possible or no_numbers)
 
 
-def _is_estimate(estimate: WindowEstimate, request: FitRequest) -> bool:
-    """One that is no numbers is told as such later."""
+def is_estimate(estimate: WindowEstimate, vehicle: Vehicle, start: float, stop: float) -> bool:
+    """An estimate of this vehicle from this time [s]; one that is no numbers is told as such later."""
     shapes = (estimate.z.shape, estimate.score.shape, estimate.information.shape)
-    if shapes != ((_SIX,), (_SIX,), (_SIX, _SIX)) or (estimate.start, estimate.stop) != (request.start, request.stop):
+    if shapes != ((SIX,), (SIX,), (SIX, SIX)) or (estimate.start, estimate.stop) != (start, stop):
         return False
     if not estimate.finite:
         return True
-    entries = [Layout(request.vehicle).entry(name) for name in NOMINAL_NAMES]
+    entries = [Layout(vehicle).entry(name) for name in NOMINAL_NAMES]
     low, high = (np.log([getattr(e, side) for e in entries]) for side in ("lower", "upper"))
     if np.any(estimate.z < low - ROOM) or np.any(estimate.z > high + ROOM):
         return False

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TypeGuard
 
 import numpy as np
 
-from quadid.effects import EFFECTS
 from quadid.identify.excitation import bounds_of
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.gauss_newton import Polished, polish, robust_weights
@@ -19,12 +17,10 @@ from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import Layout
-from quadid.online.answered import answers
+from quadid.online.answered import SIX, channels_of, is_estimate, is_noise, is_vector
 from quadid.online.flexible_fit import (
-    EFFECT_WIDTH,
     alike,
     flexible_fit,
-    moving_names,
     reduced,
     sampling_error,
     widened,
@@ -32,6 +28,7 @@ from quadid.online.flexible_fit import (
 )
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
+from quadid.online.lack_of_fit import LackOfFit, lack_of_fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -54,12 +51,6 @@ INFLATED = 9.0
 """Noise whose variance is above this multiple of the usual in some channel may have been taken from bad data."""
 RATED = ("J_xx", "J_yy")
 """Parameters whose bound decides on excitation."""
-TRIFLE = 0.01
-"""Share of the residuals that effects of the catalogue may explain without being looked for,"""
-LACKING = 6.0
-"""... and the standard deviations by which it must exceed what noise gives."""
-FEWEST_SEGMENTS = 5
-"""Fewer segments do not give the noise well enough to say what is more than noise."""
 INERTIAL = (0, 1, 2, 6, 7, 8)
 """Residual channels of gyro and accelerometer: their noise is the sensor's own, no estimator's."""
 
@@ -96,33 +87,18 @@ class FitRequest(Job):
 
     def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
         """Whether a reply is to this job, and of its form."""
-        return super().is_answered_by(reply) and isinstance(reply, FitReply) and answers(self, reply)
-
-
-@dataclass(frozen=True)
-class LackOfFit:
-    """What the effects of the catalogue would take from the residuals, all freed at once.
-
-    Attributes:
-        drop: of the deviance, in units of the residuals' own level.
-        freedom: numbers freed: what noise alone would give.
-        rows: independent residuals.
-    """
-
-    drop: float = 0.0
-    freedom: int = 0
-    rows: float = 0.0
-
-    @property
-    def share(self) -> float:
-        """Share of the residuals, beyond what noise gives."""
-        return (self.drop - self.freedom) / max(self.rows, 1.0)
-
-    @property
-    def significant(self) -> bool:
-        """Whether it is more than a trifle, and more than noise gives."""
-        errors = (self.drop - self.freedom) / math.sqrt(2.0 * max(self.freedom, 1))
-        return self.share > TRIFLE and errors > LACKING
+        if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
+            return False
+        channels = {channels_of(self.windows), *([] if self.noise is None else [len(self.noise.white)])}
+        estimate = reply.estimate
+        return (
+            all(a is None or a.shape == (SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
+            and all(n is None or is_noise(n, channels) for n in (reply.noise, reply.measured))
+            and (
+                reply.theta is None or is_vector(reply.theta, self.theta, estimate is not None and not estimate.finite)
+            )
+            and (estimate is None or is_estimate(estimate, self.vehicle, self.start, self.stop))
+        )
 
 
 @dataclass(frozen=True)
@@ -197,7 +173,7 @@ def _fit(request: FitRequest) -> FitReply:
     reply = FitReply(request.number, "", bounds_of(lin.information), True, estimate, result.theta, noise, measured)
     if sensor is None:
         return reply
-    lack = _lack_of_fit(shooting, result)
+    lack = lack_of_fit(shooting, result)
     if lack.significant:
         joined = replace(request, vehicle=with_room(request.vehicle))
         return replace(_flexible(joined, result.theta, None), lack=lack)
@@ -224,22 +200,6 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
         flexible=True, between_rows=np.sqrt(np.diag(missed)),
     )  # fmt: skip
     return replace(reply, measured=residual_noise(shooting, result)) if request.measure else reply
-
-
-def _lack_of_fit(problem: Shooting, result: Polished) -> LackOfFit:
-    """Score test of the flexible part of everything that moves the vehicle, and of the IMU filter, freed at once.
-
-    Errors of sensors are left out: with them a slow error of the AHRS would look like a lack.
-    """
-    if problem.count < FEWEST_SEGMENTS:
-        return LackOfFit()
-    rigid = {n for e in EFFECTS.values() for n in (*e.entries, *e.refinements) if n not in e.flexible_entries}
-    rigid |= {n for e in EFFECTS.values() if e.flexible == "never" for n in e.entries}
-    free = problem.free([n for n in moving_names(problem) if n not in rigid])
-    lin = problem.linearise(result.theta, free)
-    weight = np.where(free.is_log, 0.0, 1.0 / EFFECT_WIDTH**2) + 1e-9
-    drop = float(lin.gradient @ np.linalg.solve(lin.information + np.diag(weight), lin.gradient))
-    return LackOfFit(drop * lin.total_rows / max(lin.total_cost, 1.0), len(weight), lin.total_rows)
 
 
 def is_excited(bounds: FloatArray) -> bool:
