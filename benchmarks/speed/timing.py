@@ -76,11 +76,13 @@ def child(code: str, *arguments: str, environment: Mapping[str, str] | None = No
     return {**told, **spent, "peak_mb": int(lines[-1].split()[1]) / 1024.0}
 
 
-def command(*arguments: str) -> None:
+def command(*arguments: str, environment: Mapping[str, str] | None = None) -> None:
     """Runs `quadid` in a process of its own, quietly."""
     with tempfile.TemporaryFile() as nothing:
         launch = [str(Path(sys.executable).with_name("quadid")), *arguments]
-        subprocess.run(launch, stdout=nothing, stderr=nothing, check=True, env=_surroundings())
+        subprocess.run(
+            launch, stdout=nothing, stderr=nothing, check=True, env={**_surroundings(), **(environment or {})}
+        )
 
 
 def _surroundings() -> dict[str, str]:

@@ -164,7 +164,7 @@ def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
     if len(body) < 40:
         return
     if body[8] & ~1 or any(body[9:16]):
-        raise LogError(f"{name}: unknown message format", "ULog version 1", "update quadid")
+        raise LogError(f"{name}: flags that this version cannot read", "ULog version 1", "update quadid")
     if body[8] & 1:
         found.boundaries = [b for b in struct.unpack("<3Q", body[16:40]) if b]
 

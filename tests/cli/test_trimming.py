@@ -71,7 +71,7 @@ def test_when_it_flies_is_worked_out_once(standing: Path, monkeypatch: pytest.Mo
 def test_only_what_is_in_the_air_is_used_and_said_once(standing: Path) -> None:
     log = quadid.load(standing, vehicle="pelican")
     assert [w for w in log.warnings if "ground" in w] == [
-        "standing.csv: time on the ground is left out: fits use standing.csv@12:30; for all of it give standing.csv@0:"
+        "standing.csv: time on the ground is left out: fits use standing.csv@12:30; to use all of it: standing.csv@0:"
     ]
     (flown,) = log.windows
     (cut,) = quadid.load(f"{standing}@12:30", vehicle="pelican").windows

@@ -52,13 +52,17 @@ def test_inertias_beside_causes_that_leave_much_are_identified_only_where_estima
     assert all(any(name in warning for warning in found.warnings) for name in doubted), found.warnings
 
 
-def test_causes_that_make_the_stated_error_worse_explain_nothing(data_dir: Path) -> None:
-    """In segments that find states of their own they leave a third of the error; from measured states they run away."""
+def test_a_crazyflie_without_attitude_has_its_lag_and_inertias_but_nothing_that_is_sure(data_dir: Path) -> None:
+    """Motors lag 40 to 70 ms and commands come 5 to 10 ms late; the notebook of its authors has J of 1.0 to 1.1e-5,
+    regressions up to 1.8e-5.  18 s do not show b beside a thrust curve: nothing is confident, no number identified."""
     folder = data_dir / "arpl"
     found = quadid.diagnose(quadid.load(f"{folder / 'log15.csv'}@:18", vehicle=folder / "vehicle.yaml"))
     stated = found.result["validation"]
-    assert stated["deciding"]["mse_extended"] < 0.5 * stated["deciding"]["mse_nominal"]
-    assert stated["mse_extended"] > stated["mse_nominal"]
+    assert stated["mse_extended"] < 0.5 * stated["mse_nominal"]
+    late = {f["effect"]: f["parameters"][0]["value"] for f in found.result["findings"]}
+    assert 0.04 < late["motor_lag"] < 0.07
+    assert late["command_delay"] < 0.015
+    assert all(1.0e-5 < p["value"] < 1.8e-5 for p in found.result["parameters"] if p["name"] in ("J_xx", "J_yy"))
     assert found.result["verdict"] == "unknown"
     assert not any(f["confident"] for f in found.result["findings"])
     assert not any(p["status"] == "identified" for p in found.result["parameters"])

@@ -376,7 +376,7 @@ def test_a_signed_link_without_a_key_is_said(port: int) -> None:
     try:
         vehicle.heartbeat()
         samples(link, 0.1)
-        assert any("no key is given" in problem for problem in link.traffic().problems)
+        assert any("there is no key to check them" in problem for problem in link.traffic().problems)
     finally:
         link.close()
 

@@ -85,7 +85,7 @@ def test_a_loss_of_a_tenth_is_named_within_five_seconds_of_its_onset(history: Pa
     assert alarm.rotor_loss[1] == pytest.approx(0.1, abs=0.03)
     warnings = [o.text for o in out if isinstance(o, Event) and o.kind == "health" and o.level == "warning"]
     assert len(warnings) == 1
-    assert warnings[0].startswith("For the same command rotor 2 gives 10 % less thrust")
+    assert warnings[0].startswith("For the same command rotor 2 produces 10 % less thrust")
     assert not any(isinstance(o, HealthyFlight) for o in out), "a damaged flight is no baseline"
     before = next(o for o in out if isinstance(o, HealthReport) and o.has_baseline)
     message = health_message(before, "quad1")

@@ -79,5 +79,5 @@ def test_the_place_of_the_imu_is_a_known_lever_arm() -> None:
     with pytest.raises(VehicleError, match="unknown key 'mounting.angle'"):
         Vehicle.from_yaml(PELICAN.to_yaml() + "mounting: {angle: [0, 0, 0]}\n")
     text = "effects: {imu_lever_arm: {x: 1.0, y: 0, z: 0}}\nmounting: {position: [0, 0, 0.1]}\n"
-    with pytest.raises(VehicleError, match="differ; give one"):
+    with pytest.raises(VehicleError, match="differ; keep one of them"):
         Vehicle.from_yaml(PELICAN.to_yaml().replace("effects: {}\n", "") + text)

@@ -184,7 +184,7 @@ def test_data_appended_after_a_crash_is_read(tmp_path: Path) -> None:
     assert recording.warnings == ()
     future = bytearray(data)
     future[19 + 9] = 1
-    with pytest.raises(LogError, match="does not know"):
+    with pytest.raises(LogError, match="flags that this version cannot read"):
         open_log(opened(tmp_path, bytes(future)))
 
 
