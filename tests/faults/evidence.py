@@ -118,8 +118,8 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
         "",
         f"{green} of {len(FAULTS)} rows have evidence, from {len({e.test for e in evidence})} tests{_days(evidence)}.",
         "",
-        "| # | fault | promise | passed tests |",
-        "|---|---|---|---|",
+        "| fault | promise | passed tests |",
+        "|---|---|---|",
         *(_row(number, *FAULTS[number], rows[number]) for number in FAULTS),
     ]
     for title, names in (("Failed", failed), ("Skipped", skipped)):
@@ -129,7 +129,7 @@ def page(evidence: Sequence[Evidence], failed: Sequence[str], skipped: Sequence[
 
 
 def _row(number: int, fault: str, promise: str, said: Sequence[Evidence]) -> str:
-    left = f"| {number} | {_cell(fault)} | {_cell(promise)} |"
+    left = f"| {number}. {_cell(fault)} | {_cell(promise)} |"
     if not said:
         return f"{left} **no test of this row passed** |"
     return f"{left} {len({e.test for e in said})} |"

@@ -58,6 +58,6 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
 def test_every_row_is_listed_once_with_its_number() -> None:
     said = [Evidence(7, "second", "b::x"), Evidence(7, "once more", "a::z"), Evidence(7, "first", "a::y")]
     text = page(said, [], [], "make faults")
-    assert [line.endswith("| 3 |") for line in text.splitlines() if line.startswith("| 7 |")] == [True]
+    assert [line.endswith("| 3 |") for line in text.splitlines() if line.startswith("| 7. ")] == [True]
     assert text.count("no test of this row passed") == len(FAULTS) - 1
     assert list(FAULTS) == list(range(1, len(FAULTS) + 1))
