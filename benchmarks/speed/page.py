@@ -12,9 +12,9 @@ Result = Mapping[str, Any]
 SHOWN = ("nominal, cost", "motor lag, one a particle, cost", "rotor drag, cost", "every effect, cost")
 """Cases of the kernel in the table."""
 INTRODUCTION = (
-    "Medians of interleaved runs; compare ratios, since other programs share the machine. Processor time (in brackets "
-    "in the first table) is that of all threads and child processes. `speed.json` has "
-    "every value. Limits: the arithmetic peak, both cores busy, least squares alone, disk and SHA-256, Python's start."
+    "Medians of interleaved runs; compare ratios, since other programs share the machine. In brackets: processor time "
+    "of all threads and child processes. `speed.json` has every value. Limits: the arithmetic peak, both cores busy, "
+    "least squares alone, disk and SHA-256, Python's start."
 )
 
 

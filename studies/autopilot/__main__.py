@@ -25,7 +25,7 @@ from quadid_node.settings import session_settings
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log
 
-from quadid.online import Event, Publish
+from quadid.online import Event, Phase, Publish
 from quadid.window import Sample
 from quadid.workflow.loading import load_vehicle
 from studies.autopilot.flights import ARDUCOPTER, OTHERS, Flown, Outcome, errors_of
@@ -115,7 +115,7 @@ def row(one: Flown, done: Outcome) -> str:
     if one.truth:
         sets = (done.published[0], done.published[-1]) if done.published else ()
         cells += ["; ".join(errors_of(s, one.truth)) for s in sets] or ["", ""]
-    ending = done.status.partition(":")[0] if done.published else done.status
+    ending = "" if done.status.startswith(Phase.ACCEPTED.value) else done.status
     return "| " + " | ".join([*cells, ending]) + " |"
 
 
@@ -123,7 +123,7 @@ def section(kind: str, way: str, rows: list[str], seconds: float) -> str:
     """Markdown of one kind of flights."""
     truth = ["first set", "last set"] if kind == "ArduCopter" else []
     counts = "sets, wrong ones, alarms" if truth else "sets, alarms"
-    heads = ["flight", counts, "excited flight to first set [s]", *truth, "at the end"]
+    heads = ["flight", counts, "excited flight to first set [s]", *truth, "at the end, unless a set is in force"]
     how = f"`{COMMAND}`, {way}" + (" in real time through `quadid serve`" if way == "live" else "")
     how += f"; the first {seconds:g} s of each log" if seconds < 1e9 else ""
     lines = [f"## {kind}, {way}", "", f"{how}; seed 0.", "", "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]

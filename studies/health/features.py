@@ -95,8 +95,8 @@ GROUPS: tuple[tuple[str, Callable[[Flown], bool]], ...] = (
 )
 
 
-def outside(feature: Feature, flights: Sequence[Flown]) -> tuple[float, dict[str, bool]]:
-    """The feature's spread between healthy flights, and by file whether one in a hundred of these is as far out.
+def outside(feature: Feature, flights: Sequence[Flown]) -> dict[str, bool]:
+    """By file, whether one in a hundred healthy flights is as far out.
 
     Flights count from the healthy ones of their airframe and kind of log; the spread is that of all these.
     """
@@ -114,27 +114,27 @@ def outside(feature: Feature, flights: Sequence[Flown]) -> tuple[float, dict[str
             healthy = by[f.airframe, f.kind]
             far = abs(values[f.file] - np.mean(healthy))
             out[f.file] = bool(far > limit * np.sqrt(1.0 + 1.0 / len(healthy)))
-    return spread, out
+    return out
 
 
 def text(judged: Sequence[Judged]) -> str:
-    """The features as Markdown: spread of healthy flights, and how many others are outside of it."""
+    """The features as Markdown: how many flights are outside of what healthy ones show."""
     flights = [j.flown for j in judged]
     none = {j.flown.file for j in untraced(judged)}
     hints: set[str] = set()
     lines = [
-        "| logarithm of | spread of healthy flights | " + " | ".join(name for name, _ in GROUPS) + " |",
-        "|---" * (2 + len(GROUPS)) + "|",
+        "| logarithm of | " + " | ".join(name for name, _ in GROUPS) + " |",
+        "|---" * (1 + len(GROUPS)) + "|",
     ]
     for feature in FEATURES:
-        spread, far = outside(feature, flights)
+        far = outside(feature, flights)
         hints |= {file for file in none if far.get(file)}
         cells = []
         for _, chosen in GROUPS:
             mine = [far[f.file] for f in flights if chosen(f) and f.file in far]
-            cells.append(f"{sum(mine)} of {len(mine)}")
-        lines.append(f"| {feature.name} | {spread:.2f} | " + " | ".join(cells) + " |")
-    _, shaking = outside(GYRO, flights)
+            cells.append(f"{sum(mine)}/{len(mine)}")
+        lines.append(f"| {feature.name} | " + " | ".join(cells) + " |")
+    shaking = outside(GYRO, flights)
     mended = [j.flown.file for j in judged if j.flown.condition == "cut" and shaking.get(j.flown.file)]
     wrong = [j.flown.file for j in judged if j.flown.file in mended and not kind_right(j)]
     return "\n".join(lines) + _WHY.format(len(wrong), len(none), len(hints))
@@ -142,7 +142,7 @@ def text(judged: Sequence[Judged]) -> str:
 
 _WHY = """
 
-Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. None is used. A
-propeller with unlike blades shakes; one cut alike does not, and small cuts shake no more than healthy propellers. On an
-X frame each rotor shakes roll and pitch alike, so it names none. As evidence of a propeller, not a weight, it would
-mend {} of the wrong answers. Of the {} large cuts that fly like healthy flights, {} are outside in any row."""
+Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. None is used:
+propellers with unlike blades shake, alike or small cuts no more than healthy ones, and on an X frame each rotor shakes
+roll and pitch alike. As evidence of a propeller, not a weight, shaking would mend {} of the wrong answers. Of the {}
+large cuts that fly like healthy flights, {} are outside in any row."""

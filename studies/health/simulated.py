@@ -130,11 +130,11 @@ def table(each: int = 6) -> str:
             rows = done.setdefault(case.group, {}).setdefault(name, [])
             rows.append(judged(case, k, simulate))
     head = "; ".join(SIMULATORS)
-    lines = [f"| hidden | of | changed, right: {head} | error of loss, of drag loss |", "|---|---|---|---|"]
+    lines = [f"| hidden (flights) | changed, right: {head} | error of loss, of drag loss [%] |", "|---|---|---|"]
     for group, by in done.items():
         cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(rows).T)[:2]) for rows in by.values()]
         errors = np.array(by["closed loop"]).T[2:]
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
-        cells.append(f"{', '.join(sizes)} %" if sizes else "–")
-        lines.append(f"| {group} | {len(errors.T)} | {'; '.join(cells[:-1])} | {cells[-1]} |")
+        cells.append(", ".join(sizes) or "–")
+        lines.append(f"| {group} ({len(errors.T)}) | {'; '.join(cells[:-1])} | {cells[-1]} |")
     return "\n".join(lines)

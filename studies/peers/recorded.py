@@ -85,8 +85,9 @@ def section(data: Path) -> list[str]:
         rows += _rows(name, rotorpy() if name == ROTORPY else recorded(name, data))
     return [
         "## mujoco.sysid on vehicles of others", "",
-        "`python -m studies.peers recorded`: nominal model in `mujoco.sysid`, chunks from the measured state, noise as "
-        f"quadid estimates it. RotorPy's Hummingbird has its aerodynamics and motors that lag {1000 * LAG:g} ms.",
+        "`python -m studies.peers recorded`: nominal model in `mujoco.sysid`, chunks of "
+        f"{' and '.join(f'{c:g}' for c in CHUNKS)} s from the measured state, noise as quadid estimates it. RotorPy's "
+        f"Hummingbird has its aerodynamics and motors that lag {1000 * LAG:g} ms.",
         "", *rows,
     ]  # fmt: skip
 
@@ -103,11 +104,11 @@ def _rows(name: str, flights: Flights) -> list[str]:
         theirs = mujoco_sysid.identify(windows, vehicle, noise, chunk=chunk)
         low, value, high = (np.exp(theirs.values + k * theirs.half) for k in (-1.0, 0.0, 1.0))
         told = {n: (value[k], low[k], high[k], "") for k, n in enumerate(NOMINAL_NAMES)}
-        program = f"mujoco.sysid, chunks of {chunk:g} s"
-        rows.append(_row(name, program, told, _with(vehicle, value), flights, theirs.seconds))
+        program = f"mujoco.sysid, {chunk:g} s"
+        rows.append(_row("" if rows else name, program, told, _with(vehicle, value), flights, theirs.seconds))
     for program, answer, spent in (("identify", identified, seconds), ("diagnose", diagnosed, longer)):
         told = {p["name"]: (p["value"], *p["ci95"], p["status"]) for p in answer.result["parameters"]}
-        rows.append(_row(name, f"quadid {program}", told, answer.vehicle, flights, spent))
+        rows.append(_row("", f"quadid {program}", told, answer.vehicle, flights, spent))
     return rows
 
 
@@ -134,7 +135,8 @@ def _row(name: str, program: str, told: _Told, model: Vehicle, flights: Flights,
         cells.append(f"{n} {off:+.1f}" + (f" ({status})" if status not in ("", "identified") else ""))
         held += bool(least <= high and low <= most)
     ahead = _ahead([w for log in flights.unseen for w in log.windows], model)
-    return f"| {name} | {program} | {', '.join(cells)} | {held} of {len(known)} | {ahead:.2f} | {seconds:.1f} |"
+    row = [name, program, ", ".join(cells), f"{held} of {len(known)}", f"{ahead:.2f}", f"{seconds:.1f}"]
+    return f"| {' | '.join(row)} |".replace("|  |", "| |")
 
 
 def _ahead(windows: Sequence[Window], model: Vehicle) -> float:
