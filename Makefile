@@ -33,7 +33,7 @@ $(BIN)/python:
 $(RUNTIME): pyproject.toml | $(BIN)/python
 	@echo "Installing quadid and what it needs into $(VENV): a minute or so ..."
 	$(PIP) install --no-compile --editable .
-	@echo "Compiling the simulation for this processor: about half a minute ..."
+	@echo "Compiling the simulation for this processor: under a minute ..."
 	$(BIN)/quadid warmup
 	@touch $@
 
