@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# Before NumPy is loaded: workers share the processors, and threads over matrices of ten rows only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import hypothesis
 import pytest
 
@@ -12,6 +15,8 @@ from tests.faults.evidence import Collector
 from tests.faults.evidence import happened as happened  # a fixture for every folder
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+LONG = ("diagnose", "online", "examples", "node", "cli", "identify", "health", "studies")
+"""Folders that take long; those that compute begin while the nodes, which mostly wait, are at it."""
 THIS_MACHINE = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
     "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "quadid_node" / "config" / "loopback.xml"),
@@ -41,11 +46,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One process runs a file from beginning to end: what its tests share is flown, fitted or compiled once.
 
     Files that start ROS nodes are one group, because a process has one DDS domain, and nodes find each other by clocks.
+    That group, which is the longest, comes first, then the folders whose files take long, so that no process ends late.
     """
+    items.sort(key=_turn)
     for item in items:
         place = item.path.relative_to(REPOSITORY)
-        nodes = place.stem.startswith("test_ros")
-        item.add_marker(pytest.mark.xdist_group("ros" if nodes else str(place)))
+        item.add_marker(pytest.mark.xdist_group("ros" if _starts_nodes(item) else str(place)))
+
+
+def _starts_nodes(item: pytest.Item) -> bool:
+    return item.path.stem.startswith("test_ros") and item.path.parent.name == "node"
+
+
+def _turn(item: pytest.Item) -> int:
+    folder = item.path.relative_to(REPOSITORY).parts[1]
+    return 0 if _starts_nodes(item) else 1 + (LONG.index(folder) if folder in LONG else len(LONG))
 
 
 def in_ci() -> bool:

@@ -55,7 +55,7 @@ LEAST_OF_EXPLAINED = 1e-3
 
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False, nominal: Identified | None = None,
+    progress: Progress | None = None, swarm: bool = False, nominal: Identified | None = None, predict: bool = True,
 ) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
@@ -67,6 +67,7 @@ def diagnose(
         progress: called with a stage and a fraction.
         swarm: search globally first, for poor initial guesses.
         nominal: identification of `windows` that errors are stated with; by default that of the selection.
+        predict: learn residual terms where much is left; the answer is the same without, but for its `prediction`.
 
     Raises:
         WindowError, NotIdentifiableError: as `quadid.identify.fit.fit`.
@@ -109,7 +110,7 @@ def diagnose(
     ]  # fmt: skip
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     prediction = None
-    if model.reduced_chi_square > POOR:
+    if predict and model.reduced_chi_square > POOR:
         report("prediction", 0.0)
         try:
             prediction = learn_prediction(windows, physical, validation)

@@ -45,7 +45,7 @@ class DiagnosisRequest(Job):
         """Diagnoses the windows."""
         from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
 
-        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True)
+        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
         return DiagnosisReply(self.number, "", tuple(map(_online, result.findings)), result.verdict.value)
 
     def failed(self, problem: str) -> DiagnosisReply:

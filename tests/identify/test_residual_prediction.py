@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from quadid_cli.main import app
 from quadid_replay import open_log
 from typer.testing import CliRunner
 
-from quadid.diagnose import diagnose
+from quadid.diagnose import diagnose, pipeline
 from quadid.flight import fly
 from quadid.grid import grid_recording
 from quadid.identify.residual_prediction import AHEAD, _relative, learn_prediction
@@ -62,6 +63,20 @@ def test_without_velocity_only_moments_are_learnt(data_dir: Path) -> None:
     assert learnt is not None
     assert {t.acts_on[:6] for t in learnt.terms} == {"moment"}
     assert not {s for t in learnt.terms for s in t.product} & {"v_x", "v_y", "v_z", "V"}
+
+
+def test_without_it_the_diagnosis_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a flight that leaves enough for a prediction, as every flight does here."""
+    monkeypatch.setattr(pipeline, "POOR", 0.0)
+    learnt = SimpleNamespace(sentence="learnt")
+    monkeypatch.setattr(pipeline, "learn_prediction", lambda *data: learnt)
+    windows = [fly(PELICAN, seconds=20.0, seed=2, effects={"motor_lag": {"tau": 0.04}}).window]
+    (full, _), (bare, _) = (diagnose(windows, PELICAN, predict=p) for p in (True, False))
+    assert full.prediction is learnt  # type: ignore[comparison-overlap]
+    assert full.warnings == (*bare.warnings, "learnt")
+    assert bare.prediction is None
+    assert bare.findings
+    assert replace(full, prediction=None, warnings=bare.warnings).to_dict() == bare.to_dict()
 
 
 def test_a_flight_that_is_explained_needs_no_other_file() -> None:

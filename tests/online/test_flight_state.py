@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +26,20 @@ from quadid.vehicle import GRAVITY, Vehicle
 RATE = 50.0
 
 
-def rows_of(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
-    """Rows of the grid of the session, with a known attitude all along."""
+@lru_cache(maxsize=2)
+def read(log: Path, vehicle: Path) -> tuple[Rows, ...]:
+    """Rows of the grid of the session; tests of one flight that follow each other share them."""
+    return tuple(resampled(log, Vehicle.from_yaml(vehicle.read_text())))
+
+
+def rows_of(log: Path, vehicle: Path) -> Iterator[Rows]:
+    """Rows of the grid of the session, with a known attitude all along, which may be written to."""
+    for rows in read(log, vehicle):
+        yield replace(rows, columns={name: values.copy() for name, values in rows.columns.items()})
+
+
+def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
+    """Rows as they come."""
     resampler = Resampler(vehicle, RATE)
     for count, sample in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
         resampler.push(sample)
@@ -35,12 +49,13 @@ def rows_of(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
 
 
 def steps(
-    log: Path, vehicle: Vehicle, scale: float = 1.0, at: float = np.inf, velocity: bool = True
+    log: Path, file: Path, scale: float = 1.0, at: float = np.inf, velocity: bool = True
 ) -> list[tuple[float, str, float]]:
     """What is seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
+    vehicle = Vehicle.from_yaml(file.read_text())
     store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
     supervisor, seen, first, tick = ChangeSupervisor(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
-    for rows in rows_of(log, vehicle):
+    for rows in rows_of(log, file):
         if rows.fresh:
             first, tick = float(rows.t[0]), np.floor(rows.t[0] + 1.0)
         rows.columns["rotor_speed"][rows.t - first > at] /= np.sqrt(scale)
@@ -65,26 +80,26 @@ def _last(work: Iterator[None]) -> Seen | None:
 
 
 FLIGHTS = [
-    ("x.bin", "sitl_x.yaml"),
     ("x.tlog", "sitl_x.yaml"),
     ("quad_sq.bin", "quad_sq.yaml"),
     ("quad_sq.tlog", "quad_sq.yaml"),
     ("quad_sq_pwm.tlog", "quad_sq_pwm.yaml"),
     ("x_zero_rpm.tlog", "sitl_x_pwm.yaml"),
+    ("x.bin", "sitl_x.yaml"),
 ]
 
 
 @pytest.mark.parametrize(("log", "file"), FLIGHTS)
 def test_take_off_climbs_manoeuvres_descents_and_landing_are_no_change(log: str, file: str, data_dir: Path) -> None:
     folder = data_dir / "ardupilot_sitl"
-    assert steps(folder / log, Vehicle.from_yaml((folder / file).read_text())) == []
+    assert steps(folder / log, folder / file) == []
 
 
 def test_velocity_that_nobody_measures_may_be_off(data_dir: Path) -> None:
     folder = data_dir / "ardupilot_sitl"
-    vehicle = Vehicle.from_yaml((folder / "sitl_x_pwm.yaml").read_text())
-    assert steps(folder / "x_zero_rpm.tlog", vehicle, velocity=False) == []
-    found = steps(folder / "x_zero_rpm.tlog", vehicle, 0.85, 120.0, velocity=False)
+    flight = folder / "x_zero_rpm.tlog", folder / "sitl_x_pwm.yaml"
+    assert steps(*flight, velocity=False) == []
+    found = steps(*flight, 0.85, 120.0, velocity=False)
     assert [channel for _, channel, _ in found] == ["thrust"]
     assert 120.0 < found[0][0] < 123.5
 
@@ -92,10 +107,11 @@ def test_velocity_that_nobody_measures_may_be_off(data_dir: Path) -> None:
 def test_a_wrong_guess_of_the_yaw_inertia_moves_no_moment(data_dir: Path) -> None:
     """Coupling of roll and pitch with yaw: this flight has none, and the guess would make six times what a body may."""
     folder = data_dir / "ardupilot_sitl"
-    vehicle = Vehicle.from_yaml((folder / "sitl_x.yaml").read_text())
+    file = folder / "sitl_x.yaml"
+    vehicle = Vehicle.from_yaml(file.read_text())
     detector, seen, first, tick = ChangeDetector(vehicle), [], 0.0, 0.0
     store = GridBuffer(RATE, 60.0)
-    for rows in rows_of(folder / "x.bin", vehicle):
+    for rows in rows_of(folder / "x.bin", file):
         if rows.fresh:
             first, tick = float(rows.t[0]), np.floor(rows.t[0] + 20.0)
         store.add(rows)
@@ -111,7 +127,7 @@ def test_a_wrong_guess_of_the_yaw_inertia_moves_no_moment(data_dir: Path) -> Non
 @pytest.mark.parametrize("scale", [1.0 / 1.15, 1.0 / 0.85, 0.9])
 def test_in_the_same_flight_a_real_step_is_seen(scale: float, data_dir: Path) -> None:
     folder = data_dir / "ardupilot_sitl"
-    seen = steps(folder / "x.bin", Vehicle.from_yaml((folder / "sitl_x.yaml").read_text()), scale, 120.0)
+    seen = steps(folder / "x.bin", folder / "sitl_x.yaml", scale, 120.0)
     (when, channel, size), *others = seen
     assert not others
     assert channel == "thrust"
