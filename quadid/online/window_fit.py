@@ -145,11 +145,17 @@ def _fit(request: FitRequest) -> FitReply:
     if shooting.count == 0:
         return request.failed("no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
-    bounds = bounds_of(shooting.linearise(theta, free).information)
+    lin, guess = shooting.linearise(theta, free), layout.initial(request.vehicle)
+    if not np.isfinite(lin.total_cost) and not np.array_equal(theta, guess):
+        # A simulation that diverges shows no motion, and would at every later window: begin as with the first one.
+        return _fit(replace(request, theta=guess, noise=None, search=True))
+    bounds = bounds_of(lin.information)
     spoilt = not is_excited(bounds) and _noise_is_spoilt(shooting, theta, free)
     if not is_excited(bounds) and not spoilt:
         return FitReply(request.number, excitation=bounds)
     if request.flexible:
+        if noise is None:
+            theta, _ = _search(request, layout)
         return _flexible(request, theta, None if spoilt else noise)
     sensor = None
     if request.search or noise is None or spoilt:

@@ -74,7 +74,7 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     vehicle = load_vehicle(str(file))
     recording = open_log(str(data / one.log), "auto", vehicle.columns)
     if one.interval:
-        recording = telemetry(recording, one.interval)
+        recording = telemetry(recording, one.interval, one.pulses)
     service = Service(vehicle, session_settings("auto", seed=0), InlineWorker())
     outputs: list[Output] = []
     for count, sample in enumerate(until(stream(recording), seconds)):

@@ -22,17 +22,20 @@ class Flown:
         log, vehicle: below the data folder; a vehicle that begins with ``studies`` is one of the repository.
         truth: of the parameters that are known.
         interval: the log as a live link would bring it, with rotor readings so far apart [s]; 0: as it is.
+        pulses: such a link brings motor outputs, not rotor speeds.
     """
 
     log: str
     vehicle: str
     truth: Mapping[str, float] = field(default_factory=dict)
     interval: float = 0.0
+    pulses: bool = False
 
     @property
     def name(self) -> str:
         """Log and vehicle file."""
-        thinned = f", rotors every {self.interval * 1e3:g} ms" if self.interval else ""
+        told = "motor outputs" if self.pulses else "rotors"
+        thinned = f", {told} every {self.interval * 1e3:g} ms" if self.interval else ""
         return f"{self.log} with {self.vehicle.rsplit('/', 1)[-1]}{thinned}"
 
 
@@ -47,6 +50,8 @@ ARDUCOPTER = (
     Flown(f"{SITL}/x_zero_rpm.tlog", f"{SITL}/sitl_x_pwm.yaml", X_PWM),
     *(Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x.yaml", X, interval) for interval in (0.02, 0.0125)),
     *(Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq.yaml", SQUARE, interval) for interval in (0.02, 0.0125)),
+    Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x_pwm.yaml", X_PWM, 0.0125, True),
+    Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq_pwm.yaml", SQUARE, 0.0125, True),
 )
 """A real autopilot in a simulator of others: the truth is known, and nothing changes in flight."""
 OTHERS = (

@@ -29,14 +29,17 @@ MOTION = {"gyro": 0.01, "accel": 0.01, "attitude": 0.02}
 """Time between messages, as `quadid serve` asks for them [s]."""
 REACH = 8
 """Logged readings on each side that one between them is made of."""
+IDLE, SPEED_OF_PULSE = 1150.0, 7200.0 / 800.0 * np.pi / 30.0
+"""Pulse at rest [us] and rotor speed of one more [rad/s]: the simulator's motors follow their pulses at once."""
 
 
-def telemetry(recording: Recording, interval: float) -> Recording:
+def telemetry(recording: Recording, interval: float, pulses: bool = False) -> Recording:
     """A DataFlash flight as a live link would bring it.
 
     Args:
         recording: its rotor readings are evenly spaced.
         interval: between two rotor readings [s]; those between logged ones are band-limited (Lanczos).
+        pulses: motor outputs in whole microseconds instead of rotor speeds.
     """
     channels = dict(recording.channels)
     for name, step in MOTION.items():
@@ -48,7 +51,13 @@ def telemetry(recording: Recording, interval: float) -> Recording:
     away = (at[:, None] - rotors.t[near]) / period
     weight = np.where(np.abs(away) < REACH, np.sinc(away) * np.sinc(away / REACH), 0.0)
     values = np.einsum("nk,nkr->nr", weight / weight.sum(axis=1, keepdims=True), rotors.values[near])
-    channels["rotor_speed"] = replace(rotors, t=at, values=values)
+    values = np.maximum(values, 0.0)  # between readings the band-limited curve may pass below rest; no motor does
+    if pulses:
+        del channels["rotor_speed"]
+        pulse = np.round(IDLE + values / SPEED_OF_PULSE)
+        channels["motor_command"] = Channel("motor_command", at, pulse, rotors.source)
+    else:
+        channels["rotor_speed"] = replace(rotors, t=at, values=values)
     return replace(recording, channels=channels)
 
 
