@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations
 
 import numpy as np
@@ -94,17 +95,22 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
     rate = 1.0 / float(np.median(np.diff(signal.t)))
     if rate < _LEAST_RATE:
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
+    return lagged_of(windows, vehicle)
+
+
+def lagged_of(windows: Sequence[Window], vehicle: Vehicle) -> Lagged | str:
+    """As `lagged_motion`, of windows in flight."""
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
     lagged = [_quick_motion(windows, acted, lag) for lag in range(_LAGS)]
     return lagged if len(lagged[0][0]) >= 100 else "too little flight to check the motor order"
 
 
-def _quick_motion(windows: list[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
+def _quick_motion(windows: Sequence[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
     """Returns thrust over b `lag` rows earlier (n, rotors) and angular acceleration (n, 3), no slow parts."""
-    width = max(3, round(_SLOW_MOTION * _RATE))
     squares, gains = [], []
     for w, acted in zip(windows, thrust, strict=True):
+        width = max(3, round(_SLOW_MOTION / w.dt))
         if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
             continue
         # The change over two steps against what acted in between: the row itself and its neighbours' halves.
@@ -126,20 +132,17 @@ def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     rotors = len(vehicle.rotors)
     if float(np.max(np.std(lagged[0][1], axis=0))) < 0.05:
         return Check("motor_order", Verdict.UNKNOWN, "too little rotation to check the motor order")
-    scores = {
-        order: max((_correlations(squares[:, order], motion, vehicle) for squares, motion in lagged), key=np.mean)
-        for order in _orders(rotors)
-    }
-    own = scores[tuple(range(rotors))]
-    best = max(scores, key=lambda order: float(np.mean(scores[order])))
+    orders = _orders(rotors)
+    scores = _correlations(lagged, vehicle, orders)
+    own, means = scores[orders.index(tuple(range(rotors)))], scores.mean(axis=1)
+    best = int(np.argmax(means))
     numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
     text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
-    gain = float(np.mean(scores[best]) - np.mean(own))
-    if gain > _MARGIN and float(np.mean(scores[best])) > _CLEAR:
-        order = ", ".join(str(i + 1) for i in best)
+    if means[best] - own.mean() > _MARGIN and means[best] > _CLEAR:
+        order = ", ".join(str(i + 1) for i in orders[best])
         return Check(
             "motor_order", Verdict.ERROR,
-            f"{text}; much better ({np.mean(scores[best]):.2f} on average) with the log's columns in the order {order}",
+            f"{text}; much better ({means[best]:.2f} on average) with the log's columns in the order {order}",
             f"reorder the rotors of the vehicle file to take columns {order}", numbers,
         )  # fmt: skip
     if own[2] < -_CLEAR:
@@ -159,9 +162,17 @@ def _orders(rotors: int) -> list[tuple[int, ...]]:
     return turns + [turn[::-1] for turn in turns]
 
 
-def _correlations(squares: FloatArray, motion: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Correlation per axis; thrust acts along -z, so torque is (-y, x) times thrust, and spin times drag about z."""
+def _correlations(lagged: Lagged, vehicle: Vehicle, orders: list[tuple[int, ...]]) -> FloatArray:
+    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3).
+
+    Thrust acts along -z, so torque is (-y, x) times thrust, and spin times drag about z.
+    """
     place = vehicle.rotor_positions
-    torque = np.column_stack([squares @ -place[:, 1], squares @ place[:, 0], squares @ vehicle.spins])
-    norm = np.linalg.norm(torque, axis=0) * np.linalg.norm(motion, axis=0)
-    return np.asarray(np.sum(torque * motion, axis=0) / np.maximum(norm, 1e-300))
+    arms = np.column_stack([-place[:, 1], place[:, 0], vehicle.spins])[np.argsort(orders, axis=1)]
+    found = []
+    for squares, motion in lagged:
+        along = np.einsum("ora,ra->oa", arms, squares.T @ motion)
+        power = np.einsum("ora,rs,osa->oa", arms, squares.T @ squares, arms)
+        found.append(along / np.maximum(np.sqrt(power) * np.linalg.norm(motion, axis=0), 1e-300))
+    at_lag = np.array(found)
+    return np.asarray(at_lag[at_lag.mean(axis=2).argmax(axis=0), np.arange(len(orders))])

@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import Verdict
+from quadid.inspection.motor_checks import lagged_of, motor_order_check
 from quadid.model.thrust import ThrustModel
 from quadid.resample import true_runs
 from quadid.saturation import at_limit
@@ -57,6 +58,8 @@ def judge(windows: Sequence[Window], vehicle: Vehicle, thrust: ThrustModel, know
         fault = _broken(window) or wrong_unit(window)
         if fault:
             return Quality(fault=fault)
+    if not known and (fault := wrong_order(windows, vehicle)):
+        return Quality(fault=fault)
     return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, thrust))), ""))
 
 
@@ -86,6 +89,12 @@ def wrong_unit(window: Window) -> str:
         if check.verdict is Verdict.ERROR:
             return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
+
+
+def wrong_order(windows: Sequence[Window], vehicle: Vehicle) -> str:
+    """Names rotors in another order than the vehicle file's, or with all spins reversed; empty where there are none."""
+    check = motor_order_check(lagged_of(windows, vehicle), vehicle)
+    return f"motor order: {check.message}; {check.fix}" if check.verdict is Verdict.ERROR else ""
 
 
 def _as_recording(window: Window) -> Recording:

@@ -231,8 +231,8 @@ class Session:
         self._consistency.add(self._store.span(tick - self._tick - _EPS, tick - _EPS))
         if self._consistency.fault:
             yield
-            # A unit or a frame that is wrong has a name; which two channels it sets apart is less of a help.
-            self._supervisor.distrust(tick, self._windows.wrong_unit(tick) or self._consistency.fault)
+            # A unit, frame or motor order that is wrong has a name; which two channels it sets apart is less of a help.
+            self._supervisor.distrust(tick, self._windows.mistake(tick) or self._consistency.fault)
             self._change_supervisor.restart()
             return
         yield

@@ -8,7 +8,7 @@ from collections.abc import Generator
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import Cut, GridBuffer
 from quadid.online.outbox import Outbox
-from quadid.online.quality import Quality, judge, wrong_unit
+from quadid.online.quality import Quality, judge, wrong_order, wrong_unit
 from quadid.online.records import Phase
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
@@ -74,10 +74,11 @@ class WindowSupervisor:
         start = max(start, tick - self._settings.window)
         return estimator.request(number, self.cut, start, tick)
 
-    def wrong_unit(self, tick: float) -> str:
-        """The wrong unit or frame that the rows before `tick` [s] show, learned from or not; empty: none."""
+    def mistake(self, tick: float) -> str:
+        """The wrong unit, frame or motor order in the rows before `tick` [s], learned from or not; empty: none."""
         windows = self._store.cut(tick - self._settings.window - _EPS, tick - _EPS).windows
-        return next((why for window in windows if (why := wrong_unit(window))), "")
+        units = (why for window in windows if (why := wrong_unit(window)))
+        return next(units, "") or wrong_order(windows, self._vehicle)
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self.cut.blocked:

@@ -51,6 +51,10 @@ class Chooser:
             return
         yield from self._hold(sample, rank)
 
+    def has(self, channel: str) -> bool:
+        """Whether some source tells the channel."""
+        return channel in self._chosen or channel in self._held
+
     def settled(self, channel: str, rank: int, newest: float) -> bool | None:
         """Whether all samples of a source up to time `newest` [s] may be used; None: to be decided one by one."""
         chosen = self._chosen.get(channel)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from quadid_replay.signal_columns import SignalColumns
 from quadid.errors import QuadidError
 from quadid.window import Block, Sample
 from quadid_node.chooser import Chooser
+from quadid_node.pace import Pace
 from quadid_node.presets import Input
 from quadid_node.stamps import many_seconds, seconds
 
@@ -73,6 +74,7 @@ class Decoder:
 
     Attributes:
         failed: messages that could not be decoded; unstamped: those whose stamp is zero.
+        pace: how evenly they come.
     """
 
     def __init__(
@@ -91,6 +93,8 @@ class Decoder:
         self._ranks = dict(entry.channels)
         self._chooser, self._rotors = chooser, rotors
         self.failed = self.unstamped = 0
+        self.pace = Pace()
+        self._deniable, self._denied = _DENIABLE.get(entry.type, {}), list[str]()
 
         self._layout: BlockReader | None = None
         if kind.stamp is None:
@@ -110,7 +114,14 @@ class Decoder:
         """What is wrong with messages of this topic, or empty."""
         if self.unstamped:
             return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
-        return f"{self.failed} messages could not be read" if self.failed else ""
+        if self.failed:
+            return f"{self.failed} messages could not be read"
+        for name in self._denied:
+            channel = SIGNALS[name][0]
+            if channel in self._ranks and not self._chooser.has(channel):
+                field = self._deniable[name]
+                return f"says that it has no {field} ({field}_covariance[0] is -1; 0 if unknown); nothing else tells it"
+        return self.pace.trouble
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
@@ -131,6 +142,8 @@ class Decoder:
         if not (ns > 0).all():
             return None
         t = many_seconds(ns)
+        self.pace.stamped(t)
+        self._deny(name for name, _ in told)
         columns = []
         for name, values in told:
             channel, convert = SIGNALS[name]
@@ -160,6 +173,8 @@ class Decoder:
             self.unstamped += 1
             return
         t = seconds(ns)
+        self.pace.stamped(np.array([t]))
+        self._deny(name for name, _ in signals)
         for name, values in signals:
             channel, convert = SIGNALS[name]
             rank = self._ranks.get(channel)
@@ -169,6 +184,18 @@ class Decoder:
             if channel in ("motor_command", "rotor_speed"):
                 plain = plain[: self._rotors]
             yield from self._chooser.take(Sample(t, channel, plain), rank + _BEHIND.get(name, 0))
+
+    def _deny(self, told: Iterable[str]) -> None:
+        """Notes which signals the newest messages say to have none of."""
+        self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
+
+
+_DENIABLE = {
+    "sensor_msgs/Imu": {
+        "body_rate": "angular_velocity", "body_force": "linear_acceleration", "attitude": "orientation",
+    }
+}  # fmt: skip
+"""Signals that a message may say to have none of, by a covariance of -1 (REP-145), and its field."""
 
 
 def _flip(v: Any) -> tuple[float, ...]:

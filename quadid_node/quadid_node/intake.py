@@ -69,6 +69,8 @@ class Intake:
         """Takes all messages that wait; those that are not read are forgotten."""
         before, self._looked = self._looked, self._clock()
         messages = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
+        for topic, taken in zip(self._topics, messages, strict=True):
+            topic.decoder.pace.look(self._looked, before, len(taken))
         return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
 
     def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Sample | Block]]:
@@ -86,6 +88,10 @@ class Intake:
                         record(entry.topic, entry.type.replace("/", "/msg/"), data)
                 if piece:
                     yield list(decoder.take(piece))
+
+    def troubles(self) -> dict[str, str]:
+        """What is wrong with the messages of topics, by topic name as resolved."""
+        return {topic: why for topic, decoder in self.decoders.items() if (why := decoder.trouble)}
 
     def clear(self) -> None:
         """Forgets the topics."""

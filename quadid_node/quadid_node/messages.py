@@ -126,7 +126,9 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
     }
 
 
-def diagnostics(health: Health, name: str, hardware: str, now: Message, notes: dict[str, str]) -> Message:
+def diagnostics(
+    health: Health, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str]
+) -> Message:
     """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).
 
     Args:
@@ -135,6 +137,7 @@ def diagnostics(health: Health, name: str, hardware: str, now: Message, notes: d
         hardware: vehicle.
         now: stamp of the report.
         notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
+        hints: what is wrong with the messages of a topic.
     """
     status = health.status
     blocked = status.phase in (Phase.BLOCKED, Phase.FAILED)
@@ -150,11 +153,11 @@ def diagnostics(health: Health, name: str, hardware: str, now: Message, notes: d
     worker = _entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
     history_level = OK if health.history in ("", "none kept") else ERROR
     history = _entry(name, "history", hardware, history_level, health.history or "written", {})
-    entries = [session, _inputs(health, name, hardware, notes), worker, history]
+    entries = [session, _inputs(health, name, hardware, notes, hints), worker, history]
     return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
 
 
-def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str]) -> Message:
+def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str], hints: dict[str, str]) -> Message:
     level, message = OK, "data arrive"
     worst = max(health.feeds.items(), key=lambda item: item[1].silence, default=None)
     if worst is None:
@@ -162,8 +165,10 @@ def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str]) -> 
     elif worst[1].silence > SILENT_WARNING:
         level = ERROR if worst[1].silence > SILENT_ERROR else WARN
         message = f"{worst[0]} is silent for {worst[1].silence:.0f} s"
-    if notes:
-        level, message = ERROR, "; ".join(f"{k}: {v}" for k, v in notes.items())
+    troubles = [f"{topic}: {why}" for topic, why in [*notes.items(), *hints.items()]]
+    if troubles:
+        message = "; ".join(troubles if level == OK else [message, *troubles])
+        level = ERROR if notes else max(level, WARN)
     values: dict[str, Any] = {f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()}
     values |= {f"dropped: {reason}": count for reason, count in health.status.faults.items()}
     return _entry(name, "inputs", hardware, level, message, values)

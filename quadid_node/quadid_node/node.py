@@ -271,11 +271,10 @@ class IdentifyNode(PollingNode, LifecycleNode):
             fields["reason"] += f"; here: {self._hint}"
         speaker.publish("status", fields)
         yield
-        notes = dict(self._neighbours.notes)
-        notes |= {t: why for t, d in self._intake.decoders.items() if (why := d.trouble)}
+        notes, hints = dict(self._neighbours.notes), self._intake.troubles()
         stamp = self.get_clock().now().to_msg()
         now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
-        report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes)
+        report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes, hints)
         speaker.publish("diagnostics", report)
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:

@@ -45,6 +45,8 @@ MISTAKES: dict[str, tuple[dict[str, Callable[[Values], Values]], str]] = {
     "acceleration in g": ({"accel": lambda v: tuple(c / GRAVITY for c in v)}, "in g"),
     "degrees": ({"gyro": lambda v: tuple(map(math.degrees, v))}, "deg/s"),
     "rpm": ({"rotor_speed": lambda v: tuple(c * 30.0 / math.pi for c in v)}, "rpm"),
+    "two rotors exchanged": ({"rotor_speed": lambda v: (v[1], v[0], *v[2:])}, "in the order 2, 1, 3, 4"),
+    "rotors numbered around": ({"rotor_speed": lambda v: (v[1], v[2], v[3], v[0])}, "in the order 4, 1, 2, 3"),
 }
 
 
@@ -56,7 +58,7 @@ def test_a_mistake_is_named_at_warn_and_nothing_is_learned(mistake: str) -> None
         change = changes.get(sample.channel)
         service.push(sample if change is None else replace(sample, values=change(sample.values)))
     service.step()
-    told = diagnostics(service.health(), "quadid", "pelican", {}, {})
+    told = diagnostics(service.health(), "quadid", "pelican", {}, {}, {})
     session = next(entry for entry in told["status"] if entry["name"].endswith("session"))
     assert word in session["message"]
     assert session["level"] == WARN
