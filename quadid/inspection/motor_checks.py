@@ -171,8 +171,8 @@ def _correlations(lagged: Lagged, vehicle: Vehicle, orders: list[tuple[int, ...]
     arms = np.column_stack([-place[:, 1], place[:, 0], vehicle.spins])[np.argsort(orders, axis=1)]
     found = []
     for squares, motion in lagged:
-        along = np.einsum("ora,ra->oa", arms, squares.T @ motion)
-        power = np.einsum("ora,rs,osa->oa", arms, squares.T @ squares, arms)
-        found.append(along / np.maximum(np.sqrt(power) * np.linalg.norm(motion, axis=0), 1e-300))
+        torque = np.einsum("nr,ora->noa", squares, arms, optimize=True)
+        norm = np.linalg.norm(torque, axis=0) * np.linalg.norm(motion, axis=0)
+        found.append(np.einsum("noa,na->oa", torque, motion) / np.maximum(norm, 1e-300))
     at_lag = np.array(found)
     return np.asarray(at_lag[at_lag.mean(axis=2).argmax(axis=0), np.arange(len(orders))])
