@@ -47,8 +47,8 @@ def change_words(change: JsonDict) -> str:
 
 
 def rival_words(rival: JsonDict) -> str:
-    """An explanation that lost, with its probability: ``weak rotor 3 and 4 (0.08)``."""
-    names = " and ".join([rival["effect"], *rival.get("with", ())]).replace("_", " ")
+    """An explanation that lost, with its probability: ``rotor 3 and 4 (0.08)``."""
+    names = " and ".join(_WORDS[effect] for effect in (rival["effect"], *rival.get("with", ())))
     rotors = " and ".join(map(str, rival.get("rotors", ())))
     return f"{names} {rotors}".rstrip() + f" ({rival['probability']:.2f})"
 
@@ -125,8 +125,9 @@ def trim_table(result: JsonDict) -> TextTable:
         for t in result["trim"]
     )  # fmt: skip
     title = (
-        "Trim: roll, pitch and yaw as shares of all command, effort as logarithm of command per force; distance in "
-        "standard deviations of healthy flights"
+        "Trim, how the rotors share the work in steady flight: roll (left more than right), pitch (front more than "
+        "back) and yaw (one direction of spin more than the other) as parts of all command; effort, the logarithm of "
+        "command per force, from the baseline; distance in spreads (standard deviations) of healthy flights"
     )
     return TextTable(title, columns, rows)
 
