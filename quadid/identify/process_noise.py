@@ -18,8 +18,6 @@ ANY = 100.0
 """Angular acceleration [rad/s^2] beyond all at the beginning of a segment."""
 AXES = (0, 1, 2)
 """Residual channels that it acts on: the rates."""
-FEWEST_SEGMENTS = 10
-"""Complete segments below which it cannot be estimated."""
 _USUAL = 0.98
 """Share of the segments, those with the least power, that count: the rest holds outliers."""
 LEAST_WHITE = 1e-4

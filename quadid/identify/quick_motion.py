@@ -17,7 +17,7 @@ from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.noise_estimation import SPECTRUM_SECONDS
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.priors import Prior, default_prior
-from quadid.identify.process_noise import AXES, FEWEST_SEGMENTS, LEAST_WHITE, likeliest
+from quadid.identify.process_noise import AXES, LEAST_WHITE, likeliest
 from quadid.identify.shooting import Free, Linearised, Shooting
 from quadid.types import FloatArray
 from quadid.window import Window
@@ -117,7 +117,7 @@ def with_moments(shooting: Shooting, lin: Linearised) -> NoiseModel:
     white, moments = np.maximum(noise.white, LEAST_WHITE), np.array(noise.moments or (0.0, 0.0, 0.0))
     for c in AXES:
         complete = np.all(lin.weights[:, :, c] > 0.0, axis=1)
-        if np.count_nonzero(complete) >= FEWEST_SEGMENTS:
+        if complete.any():
             white[c], moments[c] = likeliest(lin.residuals[complete, :, c], shooting.dt)
     x, y, z = moments.tolist()
     return replace(noise, white=white, moments=(x, y, z), shape=None)
