@@ -90,7 +90,7 @@ def test_a_calm_flight_is_fitted_whole() -> None:
     assert not any("fast motion" in w for w in fitted(window).warnings)
 
 
-@pytest.mark.parametrize("start, stop", [(0.0, 5.6), (0.0, 2.8), (2.8, 5.6)])
+@pytest.mark.parametrize(("start", "stop"), [(0.0, 5.6), (0.0, 2.8), (2.8, 5.6)])
 def test_a_few_seconds_have_the_inertia_of_other_flights(data_dir: Path, start: float, stop: float) -> None:
     """Few segments tell of random moments too: taken for none, they made J_yy 3.0e-5; longer flights have 1.75e-5."""
     folder = data_dir / "crazyflie_rpm"
