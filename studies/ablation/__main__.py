@@ -106,7 +106,8 @@ def _sorted(rows: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
 
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
     """The result page: rows that change something as a table, the others by name."""
-    command = f"python -m studies.ablation --flights '{options.flights}'"
+    default = options.flights == ",".join(FLIGHTS)
+    command = "make ablation" if default else f"python -m studies.ablation --flights '{options.flights}'"
     command += f" --only '{options.only}'" if options.only else ""
     sizes = str(measured()).splitlines()[:3]
     right = [a for a in base if a.right is not None]
@@ -116,7 +117,7 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
 
 {len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
 
-Class and number of a campaign case are its seed; recorded flights have the seed 0. Unchanged, the diagnosis is right on
+The number of a campaign case is its seed. Unchanged, the diagnosis is right on
 {sum(bool(a.right) for a in right)} of the {len(right)} with known answer.
 Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 
@@ -128,7 +129,7 @@ No change of: {", ".join(idle)}.
 Only errors, intervals or effort change (more than 3 % of linearisations): {", ".join(slight)}.
 
 +n −n: cases that become right or wrong; one difference is quoted: causes (− no longer, + newly listed), verdict, error
-on unseen data (> 1 %). Fits: linearisations (> 3 %); –: no change. Rows rest on 9 to 16 flights.
+on unseen data (> 1 %). Fits: linearisations (> 3 %); –: no change. Halves and doubles: {len(SCALED)} flights.
 
 | changed | without | × 0.5 | × 2 |
 |---|---|---|---|
