@@ -1,7 +1,8 @@
-"""A page for users of an autopilot, "From logs": every command as it stands there, with what a person fills in."""
+"""Pages of the documents, followed: every command as it stands there, with what a person fills in."""
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -10,14 +11,18 @@ from typing import Any
 from tests.cli.conftest import Cli
 
 
-def from_logs(page: Path) -> list[list[str]]:
-    """The commands of the page's chapter "From logs", as a shell splits them, without the program's name."""
-    block = page.read_text(encoding="utf-8").split("## From logs\n```\n")[1].split("```")[0]
-    return [shlex.split(line, comments=True)[1:] for line in block.splitlines()]
+def commands(page: Path, chapter: str = "") -> list[list[str]]:
+    """Every `quadid ...` line of the code blocks of a page, or of one of its chapters, without the program's name."""
+    text = page.read_text(encoding="utf-8")
+    if chapter:
+        text = text.split(f"\n## {chapter}\n")[1].split("\n## ")[0]
+    blocks = re.findall(r"^```\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    lines = [line for block in blocks for line in block.splitlines() if line.startswith("quadid ")]
+    return [shlex.split(line, comments=True)[1:] for line in lines]
 
 
 def follow(page: Path, quadid: Cli, fill_in: Callable[[str], str]) -> dict[str, dict[str, Any]]:
-    """Does what the page says in the current folder, which holds its logs; what each command said, by its name.
+    """Does what "From logs" says in the current folder, which holds its logs; what each command said, by its name.
 
     Args:
         page: of the documents.
@@ -25,7 +30,7 @@ def follow(page: Path, quadid: Cli, fill_in: Callable[[str], str]) -> dict[str, 
         fill_in: what a person makes of the text of the vehicle file that `init` wrote.
     """
     told: dict[str, dict[str, Any]] = {}
-    for name, *arguments in from_logs(page):
+    for name, *arguments in commands(page, "From logs"):
         given = [told["diagnose"]["vehicle_file"] if "…" in a else a for a in arguments]
         run = quadid(name, *given, "--json", "-")
         assert run.code == 0, (name, given, run.err)

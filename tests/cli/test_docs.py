@@ -11,13 +11,7 @@ import pytest
 from quadid_cli.main import COMMANDS, EXAMPLES, load
 
 from tests.cli.conftest import Cli
-
-
-def commands(page: Path) -> list[list[str]]:
-    """Every `quadid ...` line of the code blocks of a page."""
-    blocks = re.findall(r"^```\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    lines = [line for block in blocks for line in block.splitlines() if line.startswith("quadid ")]
-    return [shlex.split(line, comments=True)[1:] for line in lines]
+from tests.cli.followed_page import commands
 
 
 @pytest.mark.slow

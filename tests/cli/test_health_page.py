@@ -11,7 +11,7 @@ import pytest
 from quadid.vehicle import GRAVITY, Vehicle
 from studies.health.flights import Wrong, hover
 from tests.cli.conftest import Cli
-from tests.cli.test_docs import commands
+from tests.cli.followed_page import commands
 from tests.replay import blackbox_writer as writer
 
 FLIGHTS = {"today": "controller_055", "a": "controller_067", "b": "controller_068", "c": "motor_144"}

@@ -3,30 +3,22 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
 
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli
-
-
-def _commands(repository: Path) -> list[list[str]]:
-    text = (repository / "README.md").read_text(encoding="utf-8")
-    use = text[text.index("## Use") : text.index("## With ROS 2")]
-    block = re.search(r"```\n(.*?)```", use, re.S)
-    assert block is not None
-    return [shlex.split(line, comments=True)[1:] for line in block[1].splitlines()]
+from tests.cli.followed_page import commands
 
 
 def test_commands_of_the_readme_work(
     inside: Cli, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    commands = _commands(repository)
-    assert len(commands) == 7
-    for arguments in commands:
+    found = commands(repository / "README.md", "Use")
+    assert len(found) == 7
+    for arguments in found:
         run = inside(*arguments)
         assert run.code == 0, (arguments, run.err)
     for file in ("report.html", "pelican.fitted.yaml", "pelican.params"):
