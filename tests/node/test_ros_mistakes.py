@@ -11,6 +11,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from quadid_node.convert import deserializer, message_class
 from quadid_node.topic_player import QOS
@@ -46,8 +47,8 @@ def spoilt(mistake: str) -> Recording:
     recording = flight(16.0, 3).recording
     channels = dict(recording.channels)
     for name, change in MISTAKES[mistake][0].items():
-        values = [change(tuple(row)) for row in channels[name].values.tolist()]
-        channels[name] = replace(channels[name], values=channels[name].values.copy() * 0.0 + values)
+        values = np.array([change(tuple(row)) for row in channels[name].values.tolist()])
+        channels[name] = replace(channels[name], values=values)
     return replace(recording, channels=channels)
 
 
