@@ -131,10 +131,12 @@ bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (h
 
 # --- check
 
+# One process a group of files, in the order of tests/conftest.py: long ones first.
+XDIST := --dist loadgroup --no-loadscope-reorder
 # Three workers for two cores: tests of the service wait for processes and clocks.
 .PHONY: test test-browser test-slow lint typecheck format
 test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and the browser's
-	$(BIN)/pytest -n 3 --dist loadgroup --no-loadscope-reorder -m "not browser and not slow"
+	$(BIN)/pytest -n 3 $(XDIST) -m "not browser and not slow"
 
 test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
 	$(BIN)/pytest -m browser tests/browser
@@ -142,7 +144,7 @@ test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install
 .PHONY: faults
 faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/results/faults.md
 	rm -f docs/results/faults.json
-	$(BIN)/pytest -n 2 --dist loadgroup --no-loadscope-reorder -m "not browser" --faults-page docs/results/faults.md tests
+	$(BIN)/pytest -n 2 $(XDIST) -m "not browser" --faults-page docs/results/faults.md tests
 
 .PHONY: poisoning
 poisoning: venv ## every sensor wrong by a factor, at once or slowly: what is published, into docs/results/poisoning.md (half an hour)
@@ -168,7 +170,7 @@ COVERED_BY := $(filter-out tests/node tests/ros tests/fuzz tests/browser tests/p
 .PHONY: coverage mutation audit sbom pins
 coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into docs/results/coverage.md (10 min)
 	$(BIN)/coverage erase
-	OPENBLAS_NUM_THREADS=1 $(BIN)/coverage run -m pytest -q -n 2 --dist loadgroup --no-loadscope-reorder -m "not browser and not slow" \
+	$(BIN)/coverage run -m pytest -q -n 2 $(XDIST) -m "not browser and not slow" \
 		--deselect $(TOO_NARROW) $(COVERED_BY)
 	$(BIN)/coverage combine --quiet
 	$(STUDY) studies.coverage --out docs/results
