@@ -46,8 +46,8 @@ def choose_order(
 ) -> OrderChoice:
     """Fits each order to the first 70 % of every record and scores it on segments of the rest.
 
-    The information criterion of `fit_subspace` judges one step ahead; a model that is to run a second deserves to be
-    judged by a second.  No record but those given is looked at.
+    An information criterion judges one step ahead; a model that is to run a second deserves to be judged by a second.
+    No record but those given is looked at.
 
     Args:
         method: this and all that is not explained here: as `quadid.baselines.subspace.fit_subspace`.

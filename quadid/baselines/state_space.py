@@ -33,7 +33,6 @@ class SubspaceModel:
         output_offset: g, shape (p,): what the operating point adds.
         innovation_covariance: covariance of e, shape (p, p).
         rows: number of equations the model was fitted to.
-        order_scores: information criterion of the orders 1, 2, ...; the lowest is best; empty when the order was given.
     """
 
     A: FloatArray
@@ -45,7 +44,6 @@ class SubspaceModel:
     output_offset: FloatArray
     innovation_covariance: FloatArray
     rows: int
-    order_scores: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Makes the arrays read-only."""

@@ -30,15 +30,13 @@ Loop = Literal["closed", "open"]
 METHODS = ("cva", "moesp")
 CUTOFF = 1e-9
 """Directions smaller than this fraction of the largest are taken for empty (data without noise)."""
-LARGEST_ORDER = 24
-"""Orders beyond this are not tried when the order is to be chosen."""
 
 
 def fit_subspace(
     method: str,
     inputs: ArrayLike | Sequence[ArrayLike],
     outputs: ArrayLike | Sequence[ArrayLike],
-    order: int | None = None,
+    order: int,
     past: int = 20,
     future: int = 15,
     loop: Loop = "closed",
@@ -50,7 +48,7 @@ def fit_subspace(
         method: ``cva`` or ``moesp``.
         inputs: shape (rows, m), or one such array a record.
         outputs: shape (rows, p), or one such array a record; rows with NaN are left out with all that reach over them.
-        order: number of states; None to choose it by the Bayesian information criterion of the one-step prediction.
+        order: number of states.
         past: block rows of the past; the predictor must have forgotten its state after so many rows.
         future: block rows of the future, at most `past`.
         loop: ``closed`` where the inputs were computed from the outputs, as in flight; ``open`` where they were not.
@@ -68,7 +66,7 @@ def fit_orders(
     method: str,
     inputs: ArrayLike | Sequence[ArrayLike],
     outputs: ArrayLike | Sequence[ArrayLike],
-    orders: Sequence[int | None],
+    orders: Sequence[int],
     past: int = 20,
     future: int = 15,
     loop: Loop = "closed",
@@ -83,19 +81,12 @@ def fit_orders(
     p = y[0].shape[1]
     largest = min(p * future, past * (p + u[0].shape[1]))
     for order in orders:
-        if order is not None and not 1 <= order <= largest:
+        if not 1 <= order <= largest:
             raise ParameterError(f"order {order}", f"1 to {largest} with this past and future")
     direct = np.broadcast_to(np.asarray(feedthrough, dtype=bool), (p,))
     triangle = stack(u, y, past, future)
     to_state = _state_map(triangle, method, loop, direct)
-    models = []
-    for order in orders:
-        scores: tuple[float, ...] = ()
-        if order is None:
-            scores = _order_scores(triangle, to_state, direct, min(largest, LARGEST_ORDER))
-        chosen = int(np.argmin(scores)) + 1 if order is None else order
-        models.append(_regress(triangle, to_state[:, :chosen], direct, scores))
-    return models
+    return [_regress(triangle, to_state[:, :order], direct) for order in orders]
 
 
 def _state_map(t: Triangle, method: str, loop: str, direct: BoolArray) -> FloatArray:
@@ -151,18 +142,6 @@ def _least_squares(
     return theta, d
 
 
-def _order_scores(t: Triangle, to_state: FloatArray, direct: BoolArray, largest: int) -> tuple[float, ...]:
-    """Bayesian information criterion of the orders 1 ... `largest` from their one-step prediction errors."""
-    p, m = t.y_future.shape[1], t.u_future.shape[1]
-    scores = []
-    for n in range(1, min(largest, to_state.shape[1]) + 1):
-        error = _innovations(t, to_state[:, :n], direct)[0]
-        covariance = error.T @ error / t.rows + 1e-16 * np.eye(p)
-        free = n * (2 * p + m) + m * int(direct.sum()) + p  # innovation form in a canonical basis, and offsets
-        scores.append(float(t.rows * np.linalg.slogdet(covariance)[1] + free * np.log(t.rows)))
-    return tuple(scores)
-
-
 def _innovations(t: Triangle, to_state: FloatArray, direct: BoolArray) -> tuple[FloatArray, ...]:
     """R columns of e[k], then [g; C'] of shape (1 + n, p) and D' of shape (m, p)."""
     known = np.concatenate([t.R[:, t.one], t.R[:, t.z_past.ravel()] @ to_state], axis=1)
@@ -170,7 +149,7 @@ def _innovations(t: Triangle, to_state: FloatArray, direct: BoolArray) -> tuple[
     return t.R[:, t.y_future[0]] - known @ c - t.R[:, t.u_future[0]] @ d, c, d
 
 
-def _regress(t: Triangle, to_state: FloatArray, direct: BoolArray, scores: tuple[float, ...]) -> SubspaceModel:
+def _regress(t: Triangle, to_state: FloatArray, direct: BoolArray) -> SubspaceModel:
     """Output equation, innovations, then the state equation with the innovations as known inputs."""
     n, m = to_state.shape[1], t.u_future.shape[1]
     error, c, d = _innovations(t, to_state, direct)
@@ -180,13 +159,12 @@ def _regress(t: Triangle, to_state: FloatArray, direct: BoolArray, scores: tuple
     state, following = t.R[:, t.z_past.ravel()] @ to_state, t.R[:, moved_on] @ to_state
     causes = np.concatenate([state, t.R[:, t.u_future[0]], error, t.R[:, t.one]], axis=1)
     a, b, k, f = np.split(np.linalg.lstsq(causes, following, rcond=CUTOFF)[0].T, np.cumsum([n, m, error.shape[1]]), 1)
-    return _in_data_units(t, (a, b, c[1:].T, d.T, k), f[:, 0], c[0], error.T @ error / t.rows, scores)
+    return _in_data_units(t, (a, b, c[1:].T, d.T, k), f[:, 0], c[0], error.T @ error / t.rows)
 
 
 def _in_data_units(
-    t: Triangle, matrices: tuple[FloatArray, ...], f: FloatArray, g: FloatArray, covariance: FloatArray,
-    scores: tuple[float, ...],
-) -> SubspaceModel:  # fmt: skip
+    t: Triangle, matrices: tuple[FloatArray, ...], f: FloatArray, g: FloatArray, covariance: FloatArray
+) -> SubspaceModel:
     """Undoes the scaling: u = u_mean + u_scale u', y = y_mean + y_scale y'."""
     a, b, c, d, k = matrices
     s = t.scaling
@@ -194,7 +172,7 @@ def _in_data_units(
     c, d = s.y_scale[:, None] * c, s.y_scale[:, None] * d / s.u_scale
     return SubspaceModel(
         a.copy(), b, c, d, k / s.y_scale, f - b @ s.u_mean, s.y_mean + s.y_scale * g - d @ s.u_mean,
-        covariance * np.outer(s.y_scale, s.y_scale), t.rows, scores,
+        covariance * np.outer(s.y_scale, s.y_scale), t.rows,
     )  # fmt: skip
 
 
