@@ -73,7 +73,8 @@ def ask(flight: Flight, given: Given, variant: str, memory: Memory) -> Answer:
     train, held, vehicle = given
     memory.asked = 0
     try:
-        found, _ = diagnose(train, vehicle, held, seed=0 if flight.case is None else flight.case.seed)
+        seed = 0 if flight.case is None else flight.case.seed
+        found, _ = diagnose(train, vehicle, held, seed, predict=False)
     except QuadidError as error:
         return Answer(flight.name, variant, f"refused: {error}", (), (), None, math.nan, math.nan, memory.asked, {})
     named = tuple(f.effect for f in found.findings if f.confident)
