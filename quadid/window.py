@@ -5,14 +5,15 @@ Inside the core all data are SI, world NED, body FRD, quaternions body to world,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadid.errors import WindowError
+from quadid.errors import LogError, WindowError
 from quadid.types import FloatArray
 
 Sampling = Literal["held", "instant"]
@@ -31,13 +32,13 @@ CHANNELS: dict[str, tuple[int | None, str]] = {
     "accel_z": (1, "m/s^2"),
     "accel_world": (3, "m/s^2, NED"),
 }
-_MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
-"""Channels of a window that may be missing."""
 """Known channels: number of columns (None: as many as the vehicle asks for) and unit.
 
 ``accel`` is specific force (-g on z at rest); ``accel_z`` its z alone, ``accel_world`` the same in world axes, from
 logs that hold no more.
 """
+_MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
+"""Channels of a window that may be missing."""
 
 
 @dataclass(frozen=True)
@@ -241,6 +242,27 @@ class Window:
         values = {name: getattr(self, name) for name in ("rotor_speed", "rotor_slope", *_MEASURED)}
         cut: dict[str, Any] = {name: rows[start:stop] for name, rows in values.items() if rows is not None}
         return replace(self, t0=self.t0 + self.dt * start, **cut)
+
+
+def as_recording(windows: Sequence[Window]) -> Recording:
+    """One recording of windows of one log, without the rows where nothing was measured.
+
+    Raises:
+        LogError: no window, or windows that overlap in time.
+    """
+    if not windows:
+        raise LogError("no window", "at least one")
+    if any(a.t[-1] >= b.t0 for a, b in pairwise(windows)):
+        raise LogError("windows overlap in time", "windows of one log in rising order of time")
+    channels = {}
+    for name in CHANNELS:
+        parts = [(w.t, getattr(w, name)) for w in windows if getattr(w, name, None) is not None]
+        if parts:
+            t, values = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+            measured = np.isfinite(values).all(axis=1)
+            if measured.any():
+                channels[name] = Channel(name, t[measured], values[measured], "window")
+    return Recording(windows[0].name, "window", channels, grid=windows[0].dt)
 
 
 def beginning(windows: Iterable[Window], longest: float, least: float = 1.0) -> tuple[list[Window], float]:

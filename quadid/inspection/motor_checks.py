@@ -24,6 +24,7 @@ _RATE = 50.0
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
 _LEAST_RATE = 30.0
+"""Slower rotor readings [Hz] miss the motion that orders are told apart by."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
 _CLEAR, _MARGIN = 0.25, 0.15
@@ -92,14 +93,13 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
         windows = to_windows(recording, vehicle, _RATE, spans[0][0], spans[-1][1])
     except QuadidError as error:
         return error.found
-    rate = 1.0 / float(np.median(np.diff(signal.t)))
+    return lagged_of(windows, vehicle, 1.0 / float(np.median(np.diff(signal.t))))
+
+
+def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagged | str:
+    """As `lagged_motion`, of windows in flight, with rotor readings at `rate` [Hz]."""
     if rate < _LEAST_RATE:
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
-    return lagged_of(windows, vehicle)
-
-
-def lagged_of(windows: Sequence[Window], vehicle: Vehicle) -> Lagged | str:
-    """As `lagged_motion`, of windows in flight."""
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
     lagged = [_quick_motion(windows, acted, lag) for lag in range(_LAGS)]

@@ -59,7 +59,7 @@ class ChangeSupervisor:
         yield
         recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
         yield
-        if recent.reason or judge(recent.windows, self._vehicle, estimator.thrust, estimator.learned) != Quality():
+        if recent.reason or judge(recent, self._vehicle, estimator.thrust, estimator.learned) != Quality():
             self._detector.restart()
             return None
         yield

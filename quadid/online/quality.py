@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +10,12 @@ from quadid.inspection.conventions import attitude_check, gravity_check, velocit
 from quadid.inspection.findings import Verdict
 from quadid.inspection.motor_checks import lagged_of, motor_order_check
 from quadid.model.thrust import ThrustModel
+from quadid.online.grid_buffer import Cut
 from quadid.resample import true_runs
 from quadid.saturation import at_limit
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Channel, Recording, Window
+from quadid.window import Window, as_recording
 
 STUCK_SECONDS = 1.0
 """A sensor that repeats itself to the bit for longer than this [s] is stuck."""
@@ -41,26 +41,25 @@ class Quality:
     grounded: str = ""
 
 
-def judge(windows: Sequence[Window], vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
+def judge(cut: Cut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
     """Judges the windows of one fit.
 
     Args:
-        windows: stretches on the grid.
+        cut: stretches on the grid.
         vehicle: the vehicle.
         thrust: of the rotors, by the best estimate at hand.
         known: whether it was identified or is a guess.
     """
     # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
-    for window in windows:
+    for window in cut.windows:
         lift = _lift(_weight_share(window, vehicle, thrust), window.dt, known)
         if lift != Quality():
             return lift
-        fault = _broken(window) or wrong_unit(window)
-        if fault:
+        if fault := _broken(window):
             return Quality(fault=fault)
-    if not known and (fault := wrong_order(windows, vehicle)):
+    if fault := mistake(cut, vehicle, known):
         return Quality(fault=fault)
-    return Quality(grounded=next((why for w in windows if (why := _not_flying(w, vehicle, thrust))), ""))
+    return Quality(grounded=next((why for w in cut.windows if (why := _not_flying(w, vehicle, thrust))), ""))
 
 
 def _broken(window: Window) -> str:
@@ -82,31 +81,33 @@ def _longest_repeat(rows: FloatArray) -> int:
     return int(np.max(end - first, initial=0))
 
 
-def wrong_unit(window: Window) -> str:
-    """Names a wrong unit or frame that would otherwise be fitted into the parameters; empty where there is none."""
-    recording, spans = _as_recording(window), ((window.t0, window.t0 + window.dt * len(window)),)
+def mistake(cut: Cut, vehicle: Vehicle, known: bool) -> str:
+    """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
+
+    Args:
+        cut: stretches on the grid.
+        vehicle: the vehicle.
+        known: whether it was identified: then its rotors are in order.
+
+    Returns:
+        What is wrong and how to mend it; empty for nothing.
+    """
+    units = next((why for window in cut.windows if (why := _wrong_unit(window))), "")
+    return units or ("" if known else _wrong_order(cut, vehicle))
+
+
+def _wrong_unit(window: Window) -> str:
+    recording, spans = as_recording([window]), ((window.t0, window.t0 + window.dt * len(window)),)
     for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
         if check.verdict is Verdict.ERROR:
             return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
 
-def wrong_order(windows: Sequence[Window], vehicle: Vehicle) -> str:
-    """Names rotors in another order than the vehicle file's, or with all spins reversed; empty where there are none."""
-    check = motor_order_check(lagged_of(windows, vehicle), vehicle)
+def _wrong_order(cut: Cut, vehicle: Vehicle) -> str:
+    rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
+    check = motor_order_check(lagged_of(cut.windows, vehicle, rate), vehicle)
     return f"motor order: {check.message}; {check.fix}" if check.verdict is Verdict.ERROR else ""
-
-
-def _as_recording(window: Window) -> Recording:
-    """What was measured, a channel each."""
-    t = window.t0 + window.dt * np.arange(len(window))
-    channels = {}
-    for name in ("gyro", "accel", "attitude", "velocity"):
-        values = getattr(window, name)
-        if values is not None:
-            good = np.isfinite(values).all(axis=1)
-            channels[name] = Channel(name, t[good], values[good])
-    return Recording(window.name, "stream", channels)
 
 
 def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:

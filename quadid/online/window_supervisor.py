@@ -8,7 +8,7 @@ from collections.abc import Generator
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import Cut, GridBuffer
 from quadid.online.outbox import Outbox
-from quadid.online.quality import Quality, judge, wrong_order, wrong_unit
+from quadid.online.quality import Quality, judge, mistake
 from quadid.online.records import Phase
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
@@ -64,7 +64,7 @@ class WindowSupervisor:
             self._incomplete(tick, start)
             return None
         yield
-        self.quality = judge(self.cut.windows, self._vehicle, estimator.thrust, estimator.learned)
+        self.quality = judge(self.cut, self._vehicle, estimator.thrust, estimator.learned)
         if self.quality != Quality():
             phase = Phase.BLOCKED if self.quality.fault else Phase.NOT_FLYING
             self._outbox.note(tick, phase, self.quality.fault or self.quality.grounded)
@@ -76,9 +76,7 @@ class WindowSupervisor:
 
     def mistake(self, tick: float) -> str:
         """The wrong unit, frame or motor order in the rows before `tick` [s], learned from or not; empty: none."""
-        windows = self._store.cut(tick - self._settings.window - _EPS, tick - _EPS).windows
-        units = (why for window in windows if (why := wrong_unit(window)))
-        return next(units, "") or wrong_order(windows, self._vehicle)
+        return mistake(self._store.cut(tick - self._settings.window - _EPS, tick - _EPS), self._vehicle, known=False)
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self.cut.blocked:

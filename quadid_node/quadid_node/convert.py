@@ -19,7 +19,7 @@ from quadid_replay.signal_columns import SignalColumns
 from quadid.errors import QuadidError
 from quadid.window import Block, Sample
 from quadid_node.chooser import Chooser
-from quadid_node.pace import Pace
+from quadid_node.pace import MEMORY, Pace
 from quadid_node.presets import Input
 from quadid_node.stamps import many_seconds, seconds
 
@@ -73,7 +73,7 @@ class Decoder:
     """Turns the serialized messages of one topic into samples.
 
     Attributes:
-        failed: messages that could not be decoded; unstamped: those whose stamp is zero.
+        failed: messages that could not be decoded; unstamped: those whose stamp is zero; of all that came.
         pace: how evenly they come.
     """
 
@@ -93,6 +93,7 @@ class Decoder:
         self._ranks = dict(entry.channels)
         self._chooser, self._rotors = chooser, rotors
         self.failed = self.unstamped = 0
+        self._failed_at = self._unstamped_at = -math.inf
         self.pace = Pace()
         self._deniable, self._denied = _DENIABLE.get(entry.type, {}), list[str]()
 
@@ -112,9 +113,10 @@ class Decoder:
     @property
     def trouble(self) -> str:
         """What is wrong with messages of this topic, or empty."""
-        if self.unstamped:
+        lately = self.pace.looked - MEMORY
+        if self._unstamped_at >= lately:
             return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
-        if self.failed:
+        if self._failed_at >= lately:
             return f"{self.failed} messages could not be read"
         for name in self._denied:
             channel = SIGNALS[name][0]
@@ -166,11 +168,11 @@ class Decoder:
             message = self._read(data)
             signals = self._kind.signals(message.blocks, message.extra)
         except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
-            self.failed += 1
+            self.failed, self._failed_at = self.failed + 1, self.pace.looked
             return
         ns = message.seconds * 10**9 + message.nanoseconds
         if ns <= 0:
-            self.unstamped += 1
+            self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
             return
         t = seconds(ns)
         self.pace.stamped(np.array([t]))

@@ -13,7 +13,7 @@ QUIET = 0.25
 TOGETHER = 5
 """... of so many at least."""
 AGAIN, MEMORY = 3, 10.0
-"""So many bursts within this [s] are no accident."""
+"""So many bursts within this [s] are no accident.  What was wrong with a message is told for as long."""
 STAMPS = 100
 """Newest stamps that are compared."""
 GAP = 1.0
@@ -23,10 +23,14 @@ CLOSE, CROWDED = 0.2, 0.4
 
 
 class Pace:
-    """The pace of one topic."""
+    """The pace of one topic.
+
+    Attributes:
+        looked: when somebody looked for its messages last [s].
+    """
 
     def __init__(self) -> None:
-        self._looked, self._quiet = 0.0, 0.0
+        self.looked, self._quiet = 0.0, 0.0
         self._bursts: deque[tuple[float, int, float]] = deque(maxlen=AGAIN)
         self._stamps: deque[float] = deque(maxlen=STAMPS)
 
@@ -38,7 +42,7 @@ class Pace:
             since: of the look before [s].
             count: messages that were there.
         """
-        self._looked = now
+        self.looked = now
         if not count:
             self._quiet += now - since
             return
@@ -53,7 +57,7 @@ class Pace:
     @property
     def trouble(self) -> str:
         """How they bunch; empty where they do not."""
-        if len(self._bursts) == AGAIN and self._bursts[0][0] > self._looked - MEMORY:
+        if len(self._bursts) == AGAIN and self._bursts[0][0] > self.looked - MEMORY:
             _, count, quiet = self._bursts[-1]
             return f"comes in bursts: {count} messages at once after {quiet:.1f} s without one: send each when measured"
         steps = np.diff(np.sort(np.array(self._stamps)))

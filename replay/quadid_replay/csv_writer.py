@@ -12,7 +12,7 @@ from quadid.errors import LogError
 from quadid.types import FloatArray
 from quadid.window import Recording
 from quadid_replay.csv_reader import GROUPS
-from quadid_replay.writing import Source, as_recording, open_for_writing, union_rows
+from quadid_replay.writing import Source, open_for_writing, recording_of, union_rows
 
 _ROWS = 4096
 
@@ -27,7 +27,7 @@ def write_csv(file: str | Path | BinaryIO, source: Source) -> None:
     Raises:
         LogError: nothing to write, or a file that cannot be written.
     """
-    recording = as_recording(source)
+    recording = recording_of(source)
     if not recording.channels:
         raise LogError(f"{recording.name}: no channel to write", "at least one")
     layout = column_names(recording)

@@ -15,7 +15,7 @@ from quadid.types import FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.topic_writer import TopicWriter
-from quadid_replay.writing import Source, as_recording, in_time_order, union_rows
+from quadid_replay.writing import Source, in_time_order, recording_of, union_rows
 
 _Series = tuple[FloatArray, Callable[[int], tuple[str, str, bytes]]]
 _ABSENT = -1.0
@@ -34,7 +34,7 @@ def write_mcap(file: str | Path | BinaryIO, source: Source, epoch_ns: int = 0) -
     Raises:
         LogError: nothing to write, a file that cannot be written, or times before `epoch_ns` = 0.
     """
-    recording = as_recording(source)
+    recording = recording_of(source)
     with TopicWriter(file) as writer:
         write_recording(writer, recording, epoch_ns)
 

@@ -20,7 +20,7 @@ from quadid.window import Channel, Recording
 from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM
-from quadid_replay.writing import Source, as_recording, in_time_order, open_for_writing, union_rows
+from quadid_replay.writing import Source, in_time_order, open_for_writing, recording_of, union_rows
 
 dialect = extend_dialect(ardupilotmega)
 SYSTEM, COMPONENT = 1, 1
@@ -42,7 +42,7 @@ def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
     Raises:
         LogError: nothing to write, times that boot clocks cannot tell, or a file that cannot be written.
     """
-    recording = as_recording(source)
+    recording = recording_of(source)
     mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     stream = open_for_writing(file) if isinstance(file, str | Path) else file
     try:

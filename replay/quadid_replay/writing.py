@@ -10,34 +10,17 @@ import numpy as np
 
 from quadid.errors import LogError
 from quadid.types import FloatArray
-from quadid.window import CHANNELS, Channel, Recording, Window
+from quadid.window import Channel, Recording, Window, as_recording
 
 Source: TypeAlias = Recording | Window | Sequence[Window]
 """What can be written: a recording, or windows of one log."""
 
 
-def as_recording(source: Source) -> Recording:
-    """Returns a recording of the source; windows are strung together, rows without a measurement left out.
-
-    Raises:
-        LogError: no window, or windows that overlap in time.
-    """
+def recording_of(source: Source) -> Recording:
+    """The recording that a source is, or that its windows make; raises LogError as `as_recording`."""
     if isinstance(source, Recording):
         return source
-    windows = [source] if isinstance(source, Window) else list(source)
-    if not windows:
-        raise LogError("no window to write", "at least one")
-    if any(a.t[-1] >= b.t0 for a, b in zip(windows[:-1], windows[1:], strict=True)):
-        raise LogError("windows overlap in time", "windows of one log in rising order of time")
-    channels = {}
-    for name in CHANNELS:
-        parts = [(w.t, getattr(w, name)) for w in windows if getattr(w, name, None) is not None]
-        if parts:
-            t, values = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-            measured = np.isfinite(values).all(axis=1)
-            if measured.any():
-                channels[name] = Channel(name, t[measured], values[measured], "window")
-    return Recording(windows[0].name, "window", channels, grid=windows[0].dt)
+    return as_recording([source] if isinstance(source, Window) else source)
 
 
 def in_time_order(times: Sequence[FloatArray]) -> Iterator[tuple[int, int]]:

@@ -11,6 +11,7 @@ from mcap_ros2._dynamic import generate_dynamic
 from quadid_node.chooser import Chooser
 from quadid_node.convert import Decoder, best_ranks
 from quadid_node.intake import SLICE, Intake
+from quadid_node.pace import MEMORY
 from quadid_node.presets import Input, source
 from quadid_replay import write_mcap
 from quadid_replay.mcap_messages import TYPES
@@ -119,6 +120,21 @@ def test_messages_without_a_stamp_are_named_as_such(messages: list[Message]) -> 
     reader = decoder(entry, Chooser(best_ranks(INPUTS)))
     assert flat(reader.take(imu)) == []
     assert "5 messages have no time" in reader.trouble
+    reader.pace.look(0.9 * MEMORY, 0.0, 0)
+    assert "5 messages have no time" in reader.trouble
+    reader.pace.look(1.1 * MEMORY, MEMORY, 1)
+    assert reader.trouble == "", "all that came since had one"
+
+
+def test_messages_that_cannot_be_read_are_named_as_long_as_they_come(messages: list[Message]) -> None:
+    entry = next(e for e in INPUTS if e.topic == "imu")
+    reader = decoder(entry, Chooser(best_ranks(INPUTS)))
+    for now in (0.0, 0.9 * MEMORY, 1.8 * MEMORY):
+        reader.pace.look(now, now - 0.1, 1)
+        assert flat(reader.take([b"no message"])) == []
+        assert reader.trouble == f"{reader.failed} messages could not be read"
+    reader.pace.look(3.0 * MEMORY, 2.9 * MEMORY, 1)
+    assert (reader.failed, reader.trouble) == (3, "")
 
 
 @pytest.mark.parametrize("kind", sorted(SIZES))

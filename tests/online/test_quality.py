@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.inspection import inspect
+from quadid.inspection.findings import Verdict
 from quadid.model.layout import Layout
 from quadid.model.thrust import ThrustModel
-from quadid.online.quality import Quality, judge
+from quadid.online.grid_buffer import Cut
+from quadid.online.quality import Quality, judge, mistake
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 from tests.faults.evidence import Happened
@@ -27,7 +30,7 @@ def thrust_of(b: float) -> ThrustModel:
 
 
 def verdict(window: Window, known: bool = True) -> Quality:
-    return judge([window], PELICAN, thrust_of(B), known)
+    return judge(Cut((window,), len(window) * window.dt, 0), PELICAN, thrust_of(B), known)
 
 
 def changed(window: Window, name: str, values: np.ndarray) -> Window:
@@ -124,3 +127,20 @@ def test_an_attitude_in_a_world_with_z_up_is_named() -> None:
     fault = verdict(changed(window, "attitude", in_enu)).fault
     assert "its world has z up" in fault
     assert "PX4 has FRD and NED" in fault
+
+
+def test_a_wrong_order_of_rotors_is_named_where_their_readings_are_quick_enough() -> None:
+    """The rule is that of logs: slower readings miss the motion that orders are told apart by."""
+    made = flight(30.0, 3)
+    window = made.window.slice(0, 500)
+    swapped = changed(window, "rotor_speed", window.rotor_speed[:, [1, 0, 2, 3]])
+    for every in (1, 2):
+        cut = Cut((swapped,), 10.0, 0, spacing=float(every))
+        named = mistake(cut, PELICAN, known=False)
+        assert named.startswith("motor order:") == (every == 1)
+        rotors = made.recording.channels["rotor_speed"]
+        slow = replace(rotors, t=rotors.t[::every], values=rotors.values[::every][:, [1, 0, 2, 3]])
+        log = inspect(replace(made.recording, channels={**made.recording.channels, "rotor_speed": slow}), PELICAN)
+        (check,) = [c for c in log.checks if c.name == "motor_order"]
+        assert (check.verdict is Verdict.ERROR) == (every == 1)
+    assert mistake(Cut((swapped,), 10.0, 0), PELICAN, known=True) == ""
