@@ -36,6 +36,8 @@ class OpenLoop:
 
     Attributes:
         window: the data.
+        padded: the data with one row more, which the simulation rolls into and nothing is compared with.
+        known: rows at which each channel was measured.
         longest: samples of a run.
         rows: where runs start, shape (starts,).
     """
@@ -43,9 +45,9 @@ class OpenLoop:
     def __init__(self, window: Window, vehicle: Vehicle, longest: int, every: int = 1) -> None:
         """Finds the starts; raises WindowError when rotor columns do not match the vehicle."""
         self.window, self.longest = window, longest
-        self._known = _finite(window)
-        self._rollout = Rollout(_padded(window), vehicle)
-        self.rows = np.flatnonzero(self._known["gyro"][: max(len(window) - longest, 0)])[::every]
+        self.known, self.padded = _finite(window), _padded(window)
+        self._rollout = Rollout(self.padded, vehicle)
+        self.rows = np.flatnonzero(self.known["gyro"][: max(len(window) - longest, 0)])[::every]
 
     def counted(self, rows: IndexArray, at: IndexArray) -> BoolArray:
         """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
@@ -53,10 +55,10 @@ class OpenLoop:
         A quantity counts where it was measured at the target and the start was known well enough: a velocity needs
         attitude and velocity at the start, a position its own start too.
         """
-        attitude = self._known["attitude"][rows]
-        velocity = attitude & self._known["velocity"][rows]
-        position = velocity & self._known["position"][rows]
-        starts = (position, velocity, attitude, self._known["gyro"][rows])
+        attitude = self.known["attitude"][rows]
+        velocity = attitude & self.known["velocity"][rows]
+        position = velocity & self.known["position"][rows]
+        starts = (position, velocity, attitude, self.known["gyro"][rows])
         valid, target = self._rollout.valid, rows[:, None] + at
         out = np.zeros((*target.shape, 4), dtype=bool)
         for i, (place, started) in enumerate(zip(_PLACES, starts, strict=True)):
@@ -76,7 +78,7 @@ class OpenLoop:
             Rows, and predicted - measured of each quantity, shape (vectors, rows, at, 4, 3).  A rotation is its axis
             times twice the sine of half its angle.  What is not measured is NaN, what ran away infinite.
         """
-        states = initial_states(self.window, theta[0], self._known)
+        states = initial_states(self.window, theta[0], self.known)
         step = max(_CHUNK // len(theta), LANES)
         for first in range(0, len(self.rows), step):
             rows = self.rows[first : first + step]
@@ -161,7 +163,7 @@ def mean_of_known(errors: FloatArray) -> FloatArray:
 
 
 def _padded(window: Window) -> Window:
-    """The window as held, with one more row, which the simulation rolls into but nothing is compared with."""
+    """The window as held, with one row more."""
 
     def extended(values: FloatArray | None, fill: float | None = np.nan) -> FloatArray | None:
         if values is None:

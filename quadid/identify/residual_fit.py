@@ -4,8 +4,8 @@ Runs from measured states, up to half a second ahead, are linear enough in the c
 the errors of all runs give normal equations for every candidate term at once.  Terms are selected forwards by what each
 takes off the summed error with the others adjusted (orthogonal matching pursuit: Pati, Rezaiifar and Krishnaprasad
 1993, doi:10.1109/ACSSC.1993.342465), single signals first, then products of two as well; the equations are made anew
-where the fit has gone, and how many terms are worth having is decided on flights, or pieces of them, that were not
-fitted.  The physics never changes.
+where the fit has gone.  Flights, or pieces of them, that were not fitted decide how many terms are worth having: the
+fewest within a standard error of the best (Breiman and others 1984).  The physics never changes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 
 from quadid.identify.run_errors import STAGES, RunErrors
 from quadid.identify.schur_complement import eliminated
-from quadid.model.layout import Layout
+from quadid.identify.term_slopes import typical
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 PLAIN = (6, 15, 30)
@@ -29,19 +29,11 @@ PLAIN = (6, 15, 30)
 RICH = (60, 120, 200)
 """Numbers of terms that are tried with them."""
 SIZES = (0, *PLAIN, *RICH)
-RIDGE = 1e-3
-"""Curvature that holds coefficients of typical size back, relative to a mean error of one."""
-SIMPLER = 0.02
-"""Share of the error on data not fitted that more terms must take off; less ends the trials."""
-WORTH = 0.97
-"""Terms are kept when they bring the error on data not fitted below this share."""
+PRIOR_SECONDS = 1.0
+"""Data [s] with a mean error of one that hold as firmly as the prior of a coefficient, its typical size."""
 MOST_RUNS = 500
-"""Runs that terms are fitted and judged on; every n-th of more."""
-SELECT_RUNS = 250
-"""Runs that terms are selected by."""
-_BLOCK = 84
-"""Candidates whose slopes are taken at once: each of their runs evaluates all of them."""
-FOLDS = 3
+"""Runs that terms are selected, fitted and judged on; every n-th of more."""
+FOLDS = 6
 """Parts of the data, each predicted once by what the others taught."""
 _SHORTEST = 2.5
 """Shortest piece of a flight that is such a part [s]."""
@@ -98,17 +90,28 @@ def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
         return ResidualFit((), {})
     others = [[w for i, fold in enumerate(folds) if i != held for w in fold] for held in range(len(folds))]
     paths = zip(*(_path(rest, physical, candidates) for rest in others), strict=True)
-    errors: dict[int, float] = {}
+    errors: dict[int, FloatArray] = {}
+    best = 0
     for size, fits in zip(SIZES, paths, strict=True):
         shares = [_share(fold, physical, terms, STAGES[-1]) for fold, terms in zip(folds, fits, strict=True)]
-        errors[size] = float(np.mean(shares))
-        if size > SIZES[1] and errors[size] > (1.0 - SIMPLER) * errors[SIZES[SIZES.index(size) - 1]]:
-            break  # more terms predict no better
-    size = min(errors, key=lambda n: errors[n] * (1.0 + SIMPLER) ** SIZES.index(n))
-    if size == 0 or not errors[size] < WORTH * errors[0]:
-        return ResidualFit((), errors)
+        errors[size] = np.array(shares)
+        if size > SIZES[1] and _clearly_below(errors[best], errors[size]):
+            break  # more terms predict worse
+        best = min(errors, key=lambda n: float(np.mean(np.log(errors[n]))))
+    size = next(n for n in errors if n == best or not _clearly_below(errors[best], errors[n]))
+    unseen = {n: float(np.mean(e)) for n, e in errors.items()}
+    if size == 0:
+        return ResidualFit((), unseen)
     final = _path(windows, physical, candidates)
-    return ResidualFit(next(islice(final, SIZES.index(size), None)), errors)
+    return ResidualFit(next(islice(final, SIZES.index(size), None)), unseen)
+
+
+def _clearly_below(a: FloatArray, b: FloatArray) -> bool:
+    """Whether the errors `a` of all folds are below `b` by more than a standard error of their logarithmic ratio."""
+    if not np.isfinite(a).all() or not np.isfinite(b).all():  # a run went away
+        return bool(np.isfinite(a).all())
+    gain = np.log(b) - np.log(a)
+    return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
 
 
 def _folds(windows: Sequence[Window]) -> list[list[Window]]:
@@ -148,31 +151,20 @@ def _path(windows: Sequence[Window], physical: Vehicle, candidates: Terms) -> It
 
 def _share(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> float:
     """Mean error as a share of no change."""
+    return RunErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS).share()
+
+
+def _products(
+    windows: Sequence[Window], physical: Vehicle, terms: Terms, more: Terms, seconds: Sequence[float]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of the linear problem about `terms`, all in units of typical sizes: values, curvature, slope; and those sizes."""
     vehicle = physical.model_copy(update={"residual": terms})
-    return RunErrors(windows, vehicle, seconds, MOST_RUNS).share(Layout(vehicle).initial(vehicle))
-
-
-def _slopes(
-    windows: Sequence[Window], physical: Vehicle, terms: Terms, more: Terms, seconds: Sequence[float], runs: int
-) -> tuple[FloatArray, FloatArray]:
-    """Slopes (len(terms + more), M) of all runs along terms of typical size, and their errors (M,)."""
-    blocks = [terms] if terms else []
-    blocks += [more[i : i + _BLOCK] for i in range(0, len(more), _BLOCK)]
-    rows, errors = [], np.zeros(0)
-    for block in blocks:
-        wide = physical.model_copy(update={"residual": terms if block is terms else (*terms, *block)})
-        theta, sizes = Layout(wide).initial(wide), _typical(wide)
-        directions = np.zeros((len(block), len(theta)))
-        places = np.arange(len(block))
-        directions[places, len(theta) - len(block) + places] = sizes[len(sizes) - len(block) :]
-        slopes, errors = RunErrors(windows, wide, seconds, runs).slopes(theta, directions)
-        rows.append(slopes)
-    return np.concatenate(rows), errors
-
-
-def _typical(vehicle: Vehicle) -> FloatArray:
-    """Sizes at which the residual terms of a vehicle matter."""
-    return np.array([term.typical(vehicle.mass * GRAVITY, vehicle.arm) for term in vehicle.residual])
+    slopes, errors = RunErrors(windows, vehicle, seconds, MOST_RUNS).slopes((*terms, *more))
+    sizes = typical(vehicle, (*terms, *more))
+    values = np.array([t.value for t in (*terms, *more)]) / sizes
+    prior = PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)
+    curvature = (slopes @ slopes.T).astype(np.float64) + prior * np.eye(len(values))
+    return values, curvature, slopes @ errors + prior * values, sizes
 
 
 def _selected(
@@ -181,38 +173,33 @@ def _selected(
     """Adds candidates, with coefficients of zero, until there are `size` terms."""
     have = {(term.acts_on, term.product) for term in terms}
     more = tuple(c for c in candidates if (c.acts_on, c.product) not in have)
-    j, errors = _slopes(windows, physical, terms, more, seconds, SELECT_RUNS)
-    z = np.array([t.value for t in terms]) / _typical(physical.model_copy(update={"residual": terms}))
-    z = np.concatenate([z, np.zeros(len(more))])
-    chosen = _pursued(j @ j.T, j @ errors, z, list(range(len(terms))), size)
+    _, h, g, _ = _products(windows, physical, terms, more, seconds)
+    chosen = _pursued(h, g, list(range(len(terms))), size)
     return tuple((*terms, *more)[i] for i in chosen)
 
 
 def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> Terms:
     """Takes one step in all coefficients, as long a part of it as lowers the error."""
-    typical = _typical(physical.model_copy(update={"residual": terms}))
-    values = np.array([t.value for t in terms])
-    j, errors = _slopes(windows, physical, terms, (), seconds, MOST_RUNS)
-    h, g = j @ j.T + RIDGE * np.eye(len(terms)), j @ errors + RIDGE * values / typical
-    change = -np.linalg.solve(h, g) * typical
+    values, h, g, sizes = _products(windows, physical, terms, (), seconds)
+    change = -np.linalg.solve(h, g)
     before = _share(windows, physical, terms, seconds)
     for part in _STEPS:
-        moved = tuple(
-            term.model_copy(update={"value": float(v)}) for term, v in zip(terms, values + part * change, strict=True)
-        )
+        at = (values + part * change) * sizes
+        moved = tuple(t.model_copy(update={"value": float(v)}) for t, v in zip(terms, at, strict=True))
         if _share(windows, physical, moved, seconds) < before:
             return moved
     return terms
 
 
-def _pursued(h: FloatArray, g: FloatArray, z: FloatArray, chosen: list[int], size: int) -> list[int]:
+def _pursued(h: FloatArray, g: FloatArray, chosen: list[int], size: int) -> list[int]:
     """Adds the term that lowers the linear problem's error most, the others adjusted, until there are `size`."""
     chosen = list(chosen)
-    h, g = h + RIDGE * np.eye(len(z)), g + RIDGE * z
-    while len(chosen) < min(size, len(z)):
+    while len(chosen) < min(size, len(g)):
         left, share = eliminated(np.diag(h)[:, None, None], h[:, None, chosen], h[np.ix_(chosen, chosen)])
         slope = g - share[:, 0] @ g[chosen]
-        gain = slope**2 / np.maximum(left[:, 0, 0], RIDGE)
-        gain[chosen] = -np.inf
+        free = np.ones(len(g), dtype=bool)
+        free[chosen] = False
+        gain = np.where(free, slope**2, -np.inf)
+        gain[free] /= left[free, 0, 0]
         chosen.append(int(np.argmax(gain)))
     return chosen

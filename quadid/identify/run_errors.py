@@ -1,7 +1,7 @@
 """Errors of runs from measured states, as a share of what predicting no change would miss by in the same flight.
 
-The error that a prediction is judged by: Euclidean, a tenth to half a second after a measured state.  Its slopes serve
-whoever makes it small.
+The error that a prediction is judged by: Euclidean, a tenth to half a second after a measured state.  Its slopes along
+residual terms serve whoever makes it small.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ import numpy as np
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
-from quadid.types import FloatArray, IndexArray
+from quadid.identify.term_slopes import term_slopes
+from quadid.model.layout import Layout
+from quadid.residual import ResidualTerm
+from quadid.types import FloatArray, IndexArray, SingleArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -22,8 +25,6 @@ _NEAR = 0.05
 """Errors below this share of no change weigh as if they were as large; keeps the weights finite."""
 _CALM = 0.1
 """A flight counts as if no change missed by at least this share of what it misses by in all flights."""
-_STEP = 1e-3
-"""Share of a direction by which slopes are differenced."""
 
 
 class RunErrors:
@@ -34,7 +35,7 @@ class RunErrors:
 
         Args:
             windows: flights, on one grid.
-            vehicle: geometry and mass.
+            vehicle: physics, with residual terms or without.
             seconds: times after the start at which errors count.
             most: runs at most; of longer logs every n-th.
 
@@ -45,6 +46,7 @@ class RunErrors:
         self.at = np.unique(np.maximum(np.round(np.array(seconds) / dt).astype(int), 1))
         longest = int(self.at[-1])
         every = max(-(-sum(len(w) for w in windows) // most), 1)
+        self._vehicle, self._theta = vehicle, Layout(vehicle).initial(vehicle)
         self._loops = [loop for w in windows if len((loop := OpenLoop(w, vehicle, longest, every)).rows)]
         if not self._loops:
             raise NotIdentifiableError(
@@ -54,34 +56,32 @@ class RunErrors:
         self._scales = _scales(self._loops, self.at)
         self._counts = np.sum([loop.counted(loop.rows, self.at).sum(axis=0) for loop in self._loops], axis=0)
 
-    def share(self, theta: FloatArray) -> float:
-        """Mean error of the full vector `theta` (size,) as a share of no change; infinite where a run went away."""
+    def share(self) -> float:
+        """Mean error as a share of no change; infinite where a run went away."""
         shares = [
-            lengths(loop.misses(theta[None], self.at)[0]) / scale
+            lengths(loop.misses(self._theta[None], self.at)[0]) / scale
             for loop, scale in zip(self._loops, self._scales, strict=True)
         ]
         return float(np.mean(mean_of_known(np.concatenate(shares))[self._counts > 0]))
 
-    def slopes(self, theta: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Slopes (P, M) along `directions` (P, size) and errors (M,), both weighted so that squares sum up the errors.
+    def slopes(self, candidates: tuple[ResidualTerm, ...]) -> tuple[SingleArray, FloatArray]:
+        """Slopes (P, M) along candidates in units of their sizes, and errors (M,), weighted so that squares sum errors.
 
         An error weighs by its own inverse, so that squares stand for lengths (Weiszfeld); runs that went away are left
         out.
         """
-        p = len(directions)
-        ends = np.concatenate([theta[None], theta + _STEP * directions])
-        slopes, errors = [np.zeros((p, 0))], [np.zeros(0)]
+        slopes, errors = [], []
         for loop, scale in zip(self._loops, self._scales, strict=True):
-            misses = loop.misses(ends, self.at)
-            usable = np.asarray(np.isfinite(misses).all(axis=(0, 4)))
-            share = lengths(misses[0]) / scale
-            weight = np.where(usable, 1.0 / np.maximum(share, _NEAR), 0.0) / np.maximum(self._counts, 1)
-            root = (np.sqrt(weight) / scale)[..., None]
-            with np.errstate(invalid="ignore"):
-                slope = (misses[1:] - misses[0]) / _STEP
-            slopes.append((np.where(usable[..., None], slope, 0.0) * root).reshape(p, -1))
-            errors.append((np.where(usable[..., None], misses[0], 0.0) * root).ravel())
-        return np.concatenate(slopes, axis=1), np.concatenate(errors)
+            misses = loop.misses(self._theta[None], self.at)[0]
+            slope = term_slopes(loop, self._vehicle, candidates, self.at)
+            usable = np.isfinite(misses).all(axis=3) & np.isfinite(slope).all(axis=(3, 4))
+            weight = np.where(usable, 1.0 / np.maximum(lengths(misses) / scale, _NEAR), 0.0)
+            root = (np.sqrt(weight / np.maximum(self._counts, 1)) / scale)[..., None]
+            errors.append((np.where(usable[..., None], misses, 0.0) * root).ravel())
+            slope[~usable] = 0.0
+            slope *= root[..., None]
+            slopes.append(slope.reshape(-1, len(candidates)))
+        return np.concatenate(slopes).T, np.concatenate(errors)
 
 
 def _scales(loops: Sequence[OpenLoop], at: IndexArray) -> list[FloatArray]:

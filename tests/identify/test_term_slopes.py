@@ -1,0 +1,47 @@
+"""Slopes along residual terms are those of the simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadid.flight import fly
+from quadid.identify.open_loop import OpenLoop
+from quadid.identify.residual_fit import candidate_terms
+from quadid.identify.term_slopes import term_slopes, typical
+from quadid.model.layout import Layout
+from quadid.residual import ResidualTerm
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+from quadid.window import Window
+from tests.identify.flights import PELICAN
+
+AT = np.array([5, 25])
+SHARE = 1e-3
+"""Of a typical size, for differences."""
+FOUND = (ResidualTerm(acts_on="moment_x", product=("p",), value=-0.02),)
+"""What was learnt before: it answers to the state, so later slopes depend on it."""
+
+
+@pytest.fixture(scope="module")
+def window() -> Window:
+    return fly(PELICAN, seconds=6.0, seed=3, extras=("velocity", "position")).window
+
+
+def misses(window: Window, terms: tuple[ResidualTerm, ...]) -> FloatArray:
+    vehicle = PELICAN.model_copy(update={"residual": terms})
+    return OpenLoop(window, vehicle, int(AT[-1]), 10).misses(Layout(vehicle).initial(vehicle)[None], AT)[0]
+
+
+@pytest.mark.parametrize("found", [(), FOUND])
+def test_they_are_differences_of_the_simulation(window: Window, found: tuple[ResidualTerm, ...]) -> None:
+    candidates = candidate_terms()[::37]
+    assert {c.acts_on for c in candidates} > {"force_x", "moment_x"}
+    vehicle: Vehicle = PELICAN.model_copy(update={"residual": found})
+    slopes = term_slopes(OpenLoop(window, vehicle, int(AT[-1]), 10), vehicle, candidates, AT)
+    before, sizes = misses(window, found), typical(vehicle, candidates)
+    for i, term in enumerate(candidates):
+        moved = (*found, term.model_copy(update={"value": SHARE * float(sizes[i])}))
+        expected = (misses(window, moved) - before) / SHARE
+        off = np.linalg.norm(slopes[..., i] - expected) / np.linalg.norm(expected)
+        assert off < 0.1, term  # the simulation extrapolates the mean of a product over a step; slopes know it
