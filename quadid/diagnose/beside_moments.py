@@ -27,6 +27,7 @@ from quadid.identify.quick_motion import MOST_SEGMENTS, quick_motion
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
@@ -42,12 +43,15 @@ class Held:
     Attributes:
         parameters: by name, as an identification gives them.
         vehicle: with these values.
-        regardless: names of those that quick motion shows without any cause too.
+        windows, short: the data, and their short segments.
+        theta: nominal values of the selected model among neutral ones.
     """
 
     parameters: Mapping[str, Parameter]
     vehicle: Vehicle
-    regardless: frozenset[str]
+    windows: Sequence[Window]
+    short: Shooting
+    theta: FloatArray
 
     def on(self, shooting: Shooting) -> Shooting:
         """The same problem with what is held."""
@@ -57,6 +61,14 @@ class Held:
         """Parameters with those held in their place, and no trust in what quick motion does not show."""
         told = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
         return tuple(self.parameters.get(p.name, p) for p in told)
+
+    def regardless(self) -> set[str]:
+        """Names of those that quick motion shows without any cause too."""
+        alone = quick_motion(self.windows, self.short, self.theta, NOMINAL_NAMES)
+        if alone is None:
+            return set()
+        told = dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
+        return {n for n, p in self.parameters.items() if abs(np.log(told[n] / p.value)) <= SPREAD_LIMIT}
 
     @property
     def sentence(self) -> str:
@@ -89,11 +101,8 @@ def held_by_quick_motion(windows: Sequence[Window], short: Shooting, model: Mode
         return None
     neutral = short.layout.initial(short.vehicle)
     neutral[short.free(NOMINAL_NAMES).index] = model.theta[short.free(NOMINAL_NAMES).index]
-    alone = quick_motion(windows, short, neutral, NOMINAL_NAMES)
-    told = {} if alone is None else dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
-    same = frozenset(n for n, p in shown.items() if n in told and abs(np.log(told[n] / p.value)) <= SPREAD_LIMIT)
     # Together: torque is b times a square over an inertia, and one may be known only relative to another.
-    return Held(shown, _holding(short.vehicle, shown), same)
+    return Held(shown, _holding(short.vehicle, shown), windows, short, neutral)
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:

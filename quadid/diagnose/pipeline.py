@@ -157,8 +157,9 @@ def _nominal_parameters(
     spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
     if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
         spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
+    safe = held.regardless() if held and spoilt else set()
     for names, why in spoilt.items():
-        open_to_it = set(names) - (held.regardless if held else set())
+        open_to_it = set(names) - safe
         if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
             nominal = unreliable(nominal, lost)
             reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")
