@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.flight import fly
+from quadid.flight import Flight, fly
 from quadid.identify.open_loop import OpenLoop
 from quadid.identify.residual_fit import candidate_terms
 from quadid.identify.term_slopes import term_slopes, typical
@@ -25,12 +25,13 @@ FOUND = (ResidualTerm(acts_on="moment_x", product=("p",), value=-0.02),)
 
 @pytest.fixture(scope="module")
 def window() -> Window:
-    return fly(PELICAN, seconds=6.0, seed=3, extras=("velocity", "position")).window
+    flight = fly(PELICAN, seconds=6.0, seed=3, extras=("velocity", "position"))
+    return flight.window
 
 
 def misses(window: Window, terms: tuple[ResidualTerm, ...]) -> FloatArray:
     vehicle = PELICAN.model_copy(update={"residual": terms})
-    return OpenLoop(window, vehicle, int(AT[-1]), 10).misses(Layout(vehicle).initial(vehicle)[None], AT)[0]
+    return np.asarray(OpenLoop(window, vehicle, int(AT[-1]), 10).misses(Layout(vehicle).initial(vehicle)[None], AT)[0])
 
 
 @pytest.mark.parametrize("found", [(), FOUND])
