@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.flight import Flight, fly
+from quadid.flight import fly
 from quadid.identify.open_loop import OpenLoop
 from quadid.identify.residual_fit import candidate_terms
 from quadid.identify.term_slopes import term_slopes, typical
