@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
 from quadid.sanitise import one_line
-from quadid.workflow.loading import Log, load
+from quadid.workflow.loading import Log, check_conventions, on_grid, open_recording, require_gyro
+from quadid.workflow.parts import parse_cut
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
+    from quadid.window import Recording
 
 Row = dict[str, Any]
 EARLIEST = 946_684_800.0
@@ -54,13 +60,19 @@ def identify_one(job: Job) -> Row:
     begin = time.perf_counter()
     row = blank(job)
     try:
-        log = _opened(job)
-        row |= _seen(log)
+        vehicle, recording = _opened(job)
+        cut = parse_cut(job.path)
+        checked = check_conventions(recording, vehicle, cut)
+        row |= _seen(recording, vehicle, checked.doubts)
+        require_gyro(recording)
+        log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
+        row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
         row |= {"status": "done", "reason": "", **_identified(job, log)}
     except NotIdentifiableError as error:
         row |= {"status": "refused", "reason": _line(error)}
     except (QuadidError, OSError) as error:
-        row |= {"status": "unreadable", "reason": _line(error)}
+        status = "refused" if row["trims"] else "unreadable"  # what shows its trim has been read
+        row |= {"status": status, "reason": _line(error)}
     except Exception as error:  # noqa: BLE001 - one log's defect is reported in its row and must not stop the rest
         row |= {"status": "failed", "reason": f"{type(error).__name__}: {_line(error)}"}
     return {**row, "took": time.perf_counter() - begin, "worker": os.getpid()}
@@ -76,32 +88,31 @@ def blank(job: Job) -> Row:
     }  # fmt: skip
 
 
-def _opened(job: Job) -> Log:
+def _opened(job: Job) -> tuple[Vehicle, Recording]:
     from quadid.vehicle import Vehicle
 
     vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
     if Path(job.path).stat().st_size == 0:
         raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
-    return load(job.path, vehicle, rate=job.rate)
+    return vehicle, open_recording(Path(job.path), columns=vehicle.columns)
 
 
-def _seen(log: Log) -> Row:
-    """What a flight shows whether or not its parameters can be identified; its trim where it flew steadily."""
+def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
+    """What a flight shows whether or not anything can be fitted to it; its trim where it flew steadily."""
     from quadid.health.stored import flight_to_dict
     from quadid.health.trims import flight_trim
 
     row: Row = {
-        "vehicle": log.vehicle.name,
-        "sha256": log.recording.sha256,
-        "format": log.recording.format,
-        "seconds": log.grid.seconds_used,
-        "warnings": log.warnings,
-        **_when(log),
+        "vehicle": vehicle.name,
+        "sha256": recording.sha256,
+        "format": recording.format,
+        "warnings": [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)],
+        **_when(recording),
     }
     try:
-        trim = flight_trim(log.recording, log.vehicle)
+        trim = flight_trim(recording, vehicle)
     except NotIdentifiableError as error:
-        return row | {"warnings": [*log.warnings, f"no trim: {error.found}"]}
+        return row | {"warnings": [*row["warnings"], f"no trim: {error.found}"]}
     return row | {"trims": [{"trim": json.dumps(flight_to_dict(trim))}]}
 
 
@@ -122,9 +133,9 @@ def _identified(job: Job, log: Log) -> Row:
     return row | (_diagnosed(job, log) if job.diagnose else {})
 
 
-def _when(log: Log) -> Row:
+def _when(recording: Recording) -> Row:
     """Date of the flight, where the log's clock knows dates."""
-    first = min((float(c.t[0]) for c in log.recording.channels.values() if len(c.t)), default=0.0)
+    first = min((float(c.t[0]) for c in recording.channels.values() if len(c.t)), default=0.0)
     return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
 
 

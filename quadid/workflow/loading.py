@@ -133,13 +133,18 @@ def load(
     described = as_vehicle(vehicle)
     cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
     recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
+    require_gyro(recording)
+    return _read(cut.path.resolve(), recording, described, rate, cut)
+
+
+def require_gyro(recording: Recording) -> None:
+    """Raises LogError where a log has no gyro: nothing can be fitted to it."""
     if "gyro" not in recording.channels:
         unused = next((f"; {note}" for note in recording.warnings if note.startswith("columns not used")), "")
         raise LogError(
             f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
             "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
         )  # fmt: skip
-    return _read(cut.path.resolve(), recording, described, rate, cut)
 
 
 def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
@@ -156,8 +161,14 @@ def write_recording(path: str | Path, recording: Recording) -> Path:
 
 
 def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> Log:
-    """A log checked and on the grid; of one that also stands on the ground, what is in the air."""
-    doubts, flown = check_conventions(recording, vehicle, cut) if cut.checked else Checked()
+    """A log checked and on the grid."""
+    checked = check_conventions(recording, vehicle, cut) if cut.checked else Checked()
+    return on_grid(path, recording, vehicle, rate, cut, checked)
+
+
+def on_grid(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut, checked: Checked) -> Log:
+    """A checked log on the grid; of one that also stands on the ground, what is in the air."""
+    doubts, flown = checked
     windows, report = gridded(recording, vehicle, rate, cut, flown)
     left_out = [left_on_ground(names_of(cut, flown))] if flown else []
     return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quadid_replay import write_csv
 
 from quadid.health import flight_trim
 from quadid.health.stored import flight_to_dict
@@ -13,6 +15,7 @@ from quadid.report.fleet_page import fleet_page, fleet_verdict
 from quadid.report.fleet_summary import summarise
 from quadid.report.page import render
 from quadid.vehicle import Vehicle
+from quadid.workflow.fleet import Job, identify_one
 from quadid.workflow.fleet_health import BASELINE, FEWEST, health_trend
 from studies.health.flights import Wrong, hover
 
@@ -59,3 +62,15 @@ def test_a_vehicle_with_few_flights_has_no_trend() -> None:
         flown = flight_trim(hover(PELICAN_X, seed=k), PELICAN_X)
         trims.append({"log": str(k), "trim": json.dumps(flight_to_dict(flown))})
     assert health_trend(logs, trims, {"a": PELICAN_X.to_yaml()}) == []
+
+
+def test_a_log_without_a_gyro_has_its_place_in_the_trend(tmp_path: Path) -> None:
+    file, text = tmp_path / "a.csv", PELICAN_X.to_yaml()
+    write_csv(file, hover(PELICAN_X, Wrong({3: 0.25}, {3: 0.25}), seed=5))
+    row = identify_one(Job(str(file), "a/last.mcap", "a", text, file.stat().st_size, 0, "", 50.0, 1, False))
+    assert (row["status"], row["reason"][:22]) == ("refused", "a.csv: no gyro in the ")
+    logs, trims = fleet()
+    trims.append({"log": row["name"], **row["trims"][0]})
+    rows = health_trend([*logs, {**row, "started": 1.8e9}], trims, {"a": text})
+    assert (rows[-1]["log"], rows[-1]["verdict"]) == ("a/last.mcap", "changed")
+    assert "a/last.mcap" in render(fleet_page(summarise([*logs, row], [], []), [*logs, row], [], [], "Fleet", rows))
