@@ -110,7 +110,7 @@ def health(
         unchecked: use logs even when their units, frames or motors look wrong.
 
     Raises:
-        LogError: no log, one that cannot be read, or a flight that is in both lists.
+        LogError: no log, one that cannot be read, or a flight that is given twice.
         NotIdentifiableError: too little steady flight.
     """
     from quadid.health.changes import assess
@@ -123,8 +123,8 @@ def health(
         raise LogError(f"no {missing}", "one log or more of each", "name healthy flights with --baseline")
     warnings: list[str] = []
     opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
-    trims = [[flight_trim(recording, described) for recording in part] for part in opened]
     _distinct(*opened)
+    trims = [[flight_trim(recording, described) for recording in part] for part in opened]
     for trim in trims[0]:
         _check_flown(trim, trims[1])
     found = assess(trims[0], trims[1], described)
@@ -167,8 +167,25 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
 
 
 def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None:
-    """Raises LogError where one flight is in both lists: it would be compared with itself."""
-    known = {(one.sha256, one.name) for one in healthy if one.sha256}
-    for one in tested:
-        if (one.sha256, one.name) in known:
-            raise LogError(f"{one.name} is in question and in the baseline", "each flight once", "remove it from one")
+    """Raises LogError where a flight counts twice: it would be compared with itself, or narrow the spread."""
+    seen: list[tuple[str, Recording]] = []
+    for place, part in (("in question", tested), ("in the baseline", healthy)):
+        for one in part:
+            for before, other in seen:
+                if one.sha256 is not None and one.sha256 == other.sha256 and _overlap(one, other):
+                    copy = "is" if one.name == other.name else f"holds the bytes of {other.name}: the flight is"
+                    where = f"twice {place}" if place == before else f"{before} and {place}"
+                    raise LogError(f"{one.name} {copy} {where}", "each flight once", "leave one of the two out")
+            seen.append((place, one))
+
+
+def _overlap(one: Recording, other: Recording) -> bool:
+    """Whether two parts of a log share time."""
+    (a, b), (c, d) = _span(one), _span(other)
+    return a < d and c < b
+
+
+def _span(recording: Recording) -> tuple[float, float]:
+    """First and last time of any channel [s]."""
+    times = [t for c in recording.channels.values() if len(c.t) for t in (float(c.t[0]), float(c.t[-1]))]
+    return min(times), max(times)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+from quadid_replay import write_csv
 
 import quadid
 from quadid.errors import LogError
+from quadid.vehicle import Vehicle
+from studies.health.flights import hover
 
 HEALTHY = ("controller_067", "controller_068", "motor_144", "motor_145", "motor_146")
 """Healthy flights of airframe E9, both kinds of log."""
@@ -46,6 +50,24 @@ def test_a_healthy_flight_of_either_kind_is_unchanged(data_dir: Path) -> None:
 def test_a_flight_is_not_compared_with_itself(data_dir: Path) -> None:
     with pytest.raises(LogError, match="in question and in the baseline"):
         quadid.health(paths(data_dir, "motor_144"), paths(data_dir, *HEALTHY), vehicle="crazyflie")
+
+
+def test_a_flight_counts_once_whatever_its_file_is_called(data_dir: Path, tmp_path: Path) -> None:
+    first, second = paths(data_dir, "motor_144", "motor_145")
+    copy = shutil.copy(first, tmp_path / "copy.usd")
+    with pytest.raises(LogError, match=r"copy\.usd holds the bytes of motor_144\.usd: .* in question and in the base"):
+        quadid.health(first, [copy, second], vehicle="crazyflie")
+    with pytest.raises(LogError, match=r"motor_144\.usd is twice in the baseline"):
+        quadid.health(second, [first, first], vehicle="crazyflie")
+    with pytest.raises(LogError, match=r"motor_144\.usd is twice in the baseline"):
+        quadid.health(second, [f"{first}@3:14", f"{first}@12:23"], vehicle="crazyflie")
+
+
+def test_parts_of_a_flight_are_compared(tmp_path: Path) -> None:
+    pelican = Vehicle.shipped("pelican_x")
+    write_csv(tmp_path / "a.csv", hover(pelican, seconds=60.0))
+    found = quadid.health(tmp_path / "a.csv@33:", tmp_path / "a.csv@:31", vehicle=pelican)
+    assert found.result["verdict"] == "unchanged"
 
 
 def test_one_baseline_is_said_to_be_few(data_dir: Path) -> None:
