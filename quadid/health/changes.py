@@ -24,7 +24,7 @@ HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
 _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
 _UNEXPLAINED = 1e-3
-"""An explanation that leaves a rest less probable than this explains nothing."""
+"""An explanation, be it that nothing changed, that leaves a rest less probable than this explains nothing."""
 _RIVALS = 3
 
 
@@ -89,7 +89,8 @@ class Health:
         verdict: unchanged, changed or unknown.
         changes: the most probable explanation; without confidence where the verdict is unchanged.
         score: how far the flights are from healthy ones, in standard deviations of these.
-        p_value: chance that a healthy flight looks as changed.
+        p_value: chance that a healthy flight looks as changed; where the verdict is unknown, that one is as far from
+            what explains best.
         trim: of the flights in question, shape (4,), see `trims.AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.
@@ -139,14 +140,15 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     far = distance(change, deviation, healthy.freedom)
     p_value = p_unchanged(change, healthy, len(flights), vehicle)
     found = compare(exact(change), healthy, len(flights), hypotheses(vehicle, shares, healthy.mean))
-    rest = exact(change) - found[0].hypothesis.effect @ found[0].value
-    explained = p_healthy(rest, deviation, healthy.freedom) > _UNEXPLAINED
-    verdict = "unknown" if not explained else "changed" if p_value < SIGNIFICANT else "unchanged"
+    named = p_value < SIGNIFICANT
+    rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
+    p_rest = p_healthy(rest, deviation, healthy.freedom)
+    verdict = "unknown" if p_rest < _UNEXPLAINED else "changed" if named else "unchanged"
     changes = _changes(found, vehicle, verdict == "changed")
     score = float(np.sqrt((far**2).sum()))
     return Health(
-        verdict, () if verdict == "unknown" else changes, score, p_value, trim, far, healthy, tuple(flights),
-        tuple(baseline),
+        verdict, () if verdict == "unknown" else changes, score, p_rest if verdict == "unknown" else p_value, trim, far,
+        healthy, tuple(flights), tuple(baseline),
     )  # fmt: skip
 
 

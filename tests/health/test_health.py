@@ -56,6 +56,13 @@ def test_two_weak_rotors_are_both_named() -> None:
     assert list(named(found)) == ["weak_rotor 1", "weak_rotor 2"]
 
 
+def test_a_flight_far_from_its_only_baseline_in_every_trim_is_not_called_unchanged() -> None:
+    baseline = flight_trim(hover(PELICAN_X, seed=1), PELICAN_X)
+    another = baseline._replace(mean=baseline.mean + [0.02, 0.03, 0.11, 0.54])
+    found = assess([another], [baseline], PELICAN_X)
+    assert (found.verdict, found.changes) == ("unknown", ())
+
+
 def test_thrust_and_drag_may_be_lost_in_different_shares() -> None:
     found = judged(PELICAN_X, Wrong({4: 0.2}, {4: 0.05}), seed=7)
     numbers = named(found)["weak_rotor 4"]
