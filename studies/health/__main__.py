@@ -1,6 +1,6 @@
 """Health of recorded and simulated vehicles, into a result page.
 
-python -m studies.health --out docs/results [--parts recorded limits features simulated]
+python -m studies.health --out docs/results [--parts recorded limits features fleet simulated]
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
-from studies.health import features, limits, recorded, simulated
+from studies.health import features, fleet, limits, recorded, simulated
 from studies.page import put_section
 
-PARTS = ("recorded", "limits", "features", "simulated")
+PARTS = ("recorded", "limits", "features", "fleet", "simulated")
 TITLE = "Health: what changed in this vehicle"
 
 
@@ -24,13 +25,16 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--each", type=int, default=6, help="simulated cases of every kind")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
+    parser.add_argument("--report", type=Path, help="where to keep the fleet's page")
     chosen = parser.parse_args()
     page = chosen.out / "health.md"
-    judged = recorded.judge(recorded.read(chosen.data / "crazypad")) if set(chosen.parts) - {"simulated"} else []
+    flights = cache(lambda: recorded.read(chosen.data / "crazypad"))
+    judged = cache(lambda: recorded.judge(flights()))
     makers: dict[str, Callable[[], str]] = {
-        "recorded": lambda: _recorded(judged, chosen.out / "health-score.png"),
-        "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged)}",
-        "features": lambda: f"## What else the logs hold, and why it is not used\n{features.text(judged)}",
+        "recorded": lambda: _recorded(judged(), chosen.out / "health-score.png"),
+        "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged())}",
+        "features": lambda: f"## What else the logs hold, and why it is not used\n{features.text(judged())}",
+        "fleet": lambda: _fleet(flights(), chosen.data / "crazypad", chosen.report),
         "simulated": lambda: _simulated(chosen.each),
     }
     for part in chosen.parts:
@@ -52,13 +56,21 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
     )
 
 
+def _fleet(flights: Sequence[recorded.Flown], data: Path, report: Path | None) -> str:
+    return (
+        "## Trend of a fleet\n`quadid fleet`, called by `make health`: the first five flights are the baseline, the "
+        "others follow by millimetres cut.\n\n" + fleet.text(flights, data, report)
+    )
+
+
 def _simulated(each: int) -> str:
     return (
         f"## Simulated flights\n`make health`, seed {simulated.SEED}; Pelican (plus and X frame) of "
         f"{simulated.SECONDS:.0f} s, {simulated.BASELINES} baseline flights each, in closed loop (`quadid.flight`) and "
         "by the balance of a hover. Between flights, rotor thrust varies by 1 %, the battery by 0.7 mm, the load by "
         f"1 % (1 sigma).\n\n{simulated.table(each)}\n\nA rotor that lost only thrust and a weight at its hub have "
-        "the same trims; the likelier weight is named."
+        "the same trims; the likelier weight is named. Drag torque alone moves the yaw trim alone, as much for every "
+        "rotor: the change is found, the rotor is a guess (one right in four)."
     )
 
 

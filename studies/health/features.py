@@ -1,4 +1,5 @@
-"""What else the recorded flights hold, and why it is not used: vibration, control effort, sag, thrust in motion."""
+"""What else the recorded flights hold, and why it is not used: vibration, control effort, sag, thrust and turning in
+motion."""
 
 from __future__ import annotations
 
@@ -23,6 +24,8 @@ _BAND = (1.5, 15.0)
 """Motion that motors follow and position control does not make alone [Hz]."""
 _LAG = 0.06
 """From command to accelerometer [s], motor and filters: it explains the healthy flights best."""
+_GYRO_LAG = 0.04
+"""The same to the gyro."""
 
 
 class Feature(NamedTuple):
@@ -78,6 +81,18 @@ def thrust_in_motion(recording: Recording) -> float:
     return float(np.log(max(each[2] / each.mean(), 0.05)))
 
 
+def turning(recording: Recording) -> float:
+    """Angular acceleration per roll and pitch command within `_BAND`: a weight on an arm has inertia."""
+    gyro, rotors = recording.channels["gyro"], rotor_signal(recording, CRAZYFLIE)
+    step = float(np.median(np.diff(gyro.t)))
+    band = butter(3, _BAND, "band", fs=1.0 / step, output="sos")
+    torque = linear(rotors.t, rotors.values**2 @ trim_directions(CRAZYFLIE)[:2].T, gyro.t - _GYRO_LAG)
+    inside = _steady(gyro.t, recording)
+    x = sosfiltfilt(band, np.cumsum(torque - torque.mean(axis=0), axis=0) * step, axis=0)[inside]
+    y = sosfiltfilt(band, gyro.values[:, :2], axis=0)[inside]
+    return float(np.log((x * y).sum() / (x * x).sum()))
+
+
 GYRO = Feature("roll and pitch rate above 25 Hz", "gyro", lambda one: vibration(one, "gyro", slice(0, 2)))
 FEATURES = (
     GYRO,
@@ -86,6 +101,7 @@ FEATURES = (
     Feature("roll and pitch command above 25 Hz", "position", effort),
     Feature("battery's sag per command", "battery", sag),
     Feature("M3's thrust per command in motion", "position", thrust_in_motion),
+    Feature("roll and pitch acceleration per command", "gyro", turning),
 )
 GROUPS: tuple[tuple[str, Callable[[Flown], bool]], ...] = (
     ("cuts below 3 mm, tape", lambda f: f.condition == "tape" or (f.condition == "cut" and f.total < LARGE)),
@@ -119,7 +135,8 @@ def outside(feature: Feature, flights: Sequence[Flown]) -> dict[str, bool]:
 
 def text(judged: Sequence[Judged]) -> str:
     """The features as Markdown: how many flights are outside of what healthy ones show."""
-    flights = [j.flown for j in judged]
+    compared = ("healthy", lambda f: f.condition == "healthy"), *GROUPS
+    flights = [j.flown for j in judged if any(chosen(j.flown) for _, chosen in compared)]
     none = {j.flown.file for j in untraced(judged)}
     hints: set[str] = set()
     lines = [
@@ -142,7 +159,7 @@ def text(judged: Sequence[Judged]) -> str:
 
 _WHY = """
 
-Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. None is used:
-propellers with unlike blades shake, alike or small cuts no more than healthy ones, and on an X frame each rotor shakes
-roll and pitch alike. As evidence of a propeller, not a weight, shaking would mend {} of the wrong answers. Of the {}
-large cuts that fly like healthy flights, {} are outside in any row."""
+Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. Propellers with
+unlike blades shake, others no more than healthy ones, and every rotor of an X frame shakes roll and pitch alike. As
+evidence of a propeller, shaking would mend {} of the wrong answers. Of the {} large cuts that fly like healthy flights,
+{} are outside in any row. A weight's inertia is lost in the spread of acceleration per command."""

@@ -178,12 +178,14 @@ def text(judged: Sequence[Judged]) -> str:
         "| single cuts | wanted | this comparison | at best | wanted is reached in | measured (chance of as few) |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
+    reached = {}
     for what, share, chosen, right, column in ROWS:
         mine = [j for j in single if chosen(j)]
         flown, wanted = [j.flown for j in mine], ceil(share * len(mine))
         ours = _counted(flown, partial(_answer, answers, column))
         best = _counted(flown, lambda airframe, size: limits.told(airframe, limits.loss(size)))
-        told = (_range(best, ".1f", ".0f"), f"{100.0 * np.mean(best >= wanted):.0f} %")
+        reached[what] = float(np.mean(best >= wanted))
+        told = (_range(best, ".1f", ".0f"), f"{100.0 * reached[what]:.0f} %")
         told = told if column == "first" else ("–", "–")
         count = sum(right(j) for j in mine)
         few = f"{count} of {len(mine)} ({100.0 * np.mean(ours <= count):.0f} %)"
@@ -196,16 +198,15 @@ def text(judged: Sequence[Judged]) -> str:
     ]  # fmt: skip
     for airframe in AIRFRAMES:
         for kind in ("controller", "motor"):
-            drawn = limits.orders(airframe, kind)
-            lines.append(
-                f"| {airframe} {kind} | {_range(drawn, '.2f', '.2f')} | {100.0 * np.mean(drawn >= WANTED):.0f} % |"
-            )
+            name, drawn = f"{airframe} {kind}", limits.orders(airframe, kind)
+            reached[name] = float(np.mean(drawn >= WANTED))
+            lines.append(f"| {name} | {_range(drawn, '.2f', '.2f')} | {100.0 * reached[name]:.0f} % |")
     spreads = [
         f"{name} {_shown(one.deviation)} (same propeller {_shown(_again(judged, name))})"
         for name, one in limits.healthy.items()
     ]
     lines += ["", f"Spread of roll, pitch, yaw and effort of healthy flights [%]: {'; '.join(spreads)}."]
-    return "\n".join([*lines, "", _look_alikes(limits), "", _kinds(judged), "", _doubles(judged), "", _outside(judged)])
+    return "\n".join([*lines, "", _look_alikes(limits), "", _doubles(judged), "", _not_reached(judged, reached)])
 
 
 def _look_alikes(limits: Limits) -> str:
@@ -220,16 +221,6 @@ def _look_alikes(limits: Limits) -> str:
         f"A weight of {100.0 * WEIGHT:.0f} % at a hub and a loss of that rotor differ only in yaw: separated in "
         f"{ours} of draws for {' and '.join(AIRFRAMES)}, in {best} if weights were as likely as cuts. Equal losses of "
         "two neighbours have the trims of a weight between them."
-    )
-
-
-def _kinds(judged: Sequence[Judged]) -> str:
-    """Right answers to propeller or weight, either apart."""
-    cut = [kind_right(j) for j in judged if j.flown.condition == "cut" and j.flown.total >= LARGE]
-    glued = [kind_right(j) for j in judged if "glued" in j.flown.weight]
-    return (
-        f"Propeller or weight: right for {sum(cut)} of {len(cut)} cuts and {sum(glued)} of {len(glued)} weights; "
-        f"always answering a propeller, {len(cut)} of {len(cut) + len(glued)}."
     )
 
 
@@ -258,15 +249,25 @@ def untraced(judged: Sequence[Judged]) -> list[Judged]:
     return [j for j in judged if is_single(j, LARGE, 99.0) and j.health.p_value > 0.5]
 
 
-def _outside(judged: Sequence[Judged]) -> str:
-    """Flights that no spread accounts for: cuts that fly as healthy ones, weights that move the yaw trim."""
+def _not_reached(judged: Sequence[Judged], reached: Mapping[str, float]) -> str:
+    """What forbids the rows that are not reached, or that nothing does, and what was tried."""
     single, uncut = [j for j in judged if is_single(j, LARGE, 99.0)], untraced(judged)
-    weights = [j for j in judged if "glued" in j.flown.weight and abs(j.health.distance[2]) > 3.0]
-    cuts = [f"{j.flown.file} ({j.flown.total:g} mm)" for j in uncut]
-    yawed = [j.flown.file for j in weights]
+    cut = [kind_right(j) for j in judged if j.flown.condition == "cut" and j.flown.total >= LARGE]
+    glued = [j for j in judged if "glued" in j.flown.weight]
+    flat = " and ".join(f"{j.flown.file} ({j.flown.total:g} mm)" for j in uncut)
+    yawed = " and ".join(j.flown.file for j in glued if abs(j.health.distance[2]) > 3.0)
+    small, order_ = (100.0 * (1.0 - reached[name]) for name in ("rotor named first, 1 to 2.5 mm", "E8 motor"))
     return (
-        f"Outliers: {' and '.join(cuts)} fly like healthy flights, which leaves {len(single) - len(uncut)} of "
-        f"{len(single)}; {' and '.join(yawed)} carry a weight but yaw like a cut."
+        "### Rows not reached\n"
+        f"* One propeller, 3 mm or more: the spread does not forbid it. {flat} fly like healthy flights in every "
+        f"channel, which leaves {len(single) - len(uncut)} of {len(single)}.\n"
+        f"* One propeller, 1 to 2.5 mm: the spread forbids it in {small:.0f} % of draws, to any test of the trims.\n"
+        f"* Propeller or weight: the spread does not forbid it. Right are {sum(cut)} of {len(cut)} cuts and "
+        f"{sum(map(kind_right, glued))} of {len(glued)} weights, of which {yawed} yaw like a cut. Always answering a "
+        f"propeller would reach {len(cut)} of {len(cut) + len(glued)} and tell nothing.\n"
+        f"* Order of E8's motor logs: missed in {order_:.0f} % of draws.\n\n"
+        "Tried in vain: what the next table holds; the likeliest kind of change before the likeliest change; angular "
+        "acceleration beside velocity; a rotor that keeps its thrust as an explanation (one false alarm)."
     )
 
 

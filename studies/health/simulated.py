@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +65,10 @@ def cases(each: int) -> Iterator[Case]:
         yield Case("weight, 5 to 20 %", mass=float(rng.uniform(0.05, 0.2)), place=polar(0.08, 0.21))
     for _ in range(each):
         yield Case("battery moved 5 to 12 mm", shift=polar(0.005, 0.012))
+    for sign, what in ((1.0, "less"), (-1.0, "more")):
+        for n in range(each):
+            size = sign * float(rng.uniform(0.1, 0.3))
+            yield Case(f"one rotor, thrust kept, 10 to 30 % {what} drag", {n % 4 + 1: 0.0}, {n % 4 + 1: size})
 
 
 def flown(vehicle: Vehicle, case: Case, seed: int, profile: str) -> Recording:
@@ -101,8 +106,19 @@ def right(case: Case, effects: list[tuple[str, int]]) -> bool:
     return names == {"cg_offset"} if case.shift != (0.0, 0.0) else not names
 
 
-def judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, float]:
-    """Whether case `k` is called changed and rightly answered, and the errors of its losses of thrust and drag."""
+class Outcome(NamedTuple):
+    """Whether a case is called changed, rightly answered, wrongly with confidence; errors of its losses of thrust
+    and drag torque, NaN where none is named."""
+
+    changed: bool
+    right: bool
+    misled: bool
+    loss: float
+    drag_loss: float
+
+
+def judged(case: Case, k: int, simulate: Simulator) -> Outcome:
+    """What is answered to case `k`."""
     vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
     profile = ("hover", "gentle", "excited")[k % 3]
 
@@ -119,21 +135,25 @@ def judged(case: Case, k: int, simulate: Simulator) -> tuple[bool, bool, float, 
         (j,) = case.losses
         errors = [abs(values["loss"] - case.losses[j]), abs(values["drag_loss"] - case.drag_losses[j])]
     hidden = bool(case.losses) or case.mass > 0.0 or case.shift != (0.0, 0.0)
-    return changed, right(case, named) if changed else not hidden, errors[0], errors[1]
+    good = right(case, named) if changed else not hidden
+    return Outcome(changed, good, not good and any(c.confident for c in found.changes), *errors)
 
 
 def table(each: int = 6) -> str:
     """The campaign as Markdown."""
-    done: dict[str, dict[str, list[tuple[bool, bool, float, float]]]] = {}
+    done: dict[str, dict[str, list[Outcome]]] = {}
     for k, case in enumerate(cases(each)):
         for name, simulate in SIMULATORS.items():
             rows = done.setdefault(case.group, {}).setdefault(name, [])
             rows.append(judged(case, k, simulate))
     head = "; ".join(SIMULATORS)
-    lines = [f"| hidden (flights) | changed, right: {head} | error of loss, of drag loss [%] |", "|---|---|---|"]
+    lines = [
+        f"| hidden (flights) | changed, right, wrong with confidence: {head} | error of loss, of drag loss [%] |",
+        "|---|---|---|",
+    ]
     for group, by in done.items():
-        cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(rows).T)[:2]) for rows in by.values()]
-        errors = np.array(by["closed loop"]).T[2:]
+        cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(rows).T)[:3]) for rows in by.values()]
+        errors = np.array(by["closed loop"]).T[3:]
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
         cells.append(", ".join(sizes) or "–")
         lines.append(f"| {group} ({len(errors.T)}) | {'; '.join(cells[:-1])} | {cells[-1]} |")

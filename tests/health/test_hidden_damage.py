@@ -22,14 +22,20 @@ HIDDEN = [
 @pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("number", range(len(HIDDEN)))
 def test_hidden_damage_is_named_in_both_simulators(simulator: str, number: int) -> None:
-    changed, right, loss, drag = judged(HIDDEN[number], 3 * number + 1, SIMULATORS[simulator])
-    assert changed
-    assert right
+    found = judged(HIDDEN[number], 3 * number + 1, SIMULATORS[simulator])
+    assert found.changed
+    assert found.right
     if len(HIDDEN[number].losses) == 1:
-        assert loss < 0.05
-        assert drag < 0.08
+        assert found.loss < 0.05
+        assert found.drag_loss < 0.08
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS)
+@pytest.mark.parametrize("size", [0.3, -0.3])
+def test_drag_torque_alone_is_a_change_though_its_trims_name_no_rotor(simulator: str, size: float) -> None:
+    assert judged(Case("thrust kept", {3: 0.0}, {3: size}), 3, SIMULATORS[simulator]).changed
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_healthy_pairs_are_unchanged_in_both_simulators(simulator: str) -> None:
-    assert not any(judged(Case("healthy"), 100 + k, SIMULATORS[simulator])[0] for k in range(4))
+    assert not any(judged(Case("healthy"), 100 + k, SIMULATORS[simulator]).changed for k in range(4))
