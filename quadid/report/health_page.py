@@ -65,11 +65,11 @@ def health_verdict(result: JsonDict) -> Verdict:
         details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
         return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
     if verdict == "unknown":
-        steps = (
+        checks = (
             "Check that all flights are of one vehicle, and their motors logged in one way.",
             "Look the vehicle over; compare with `quadid diagnose`, which fits the motion.",
         )
-        return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), steps)
+        return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), checks)
     sure = [c for c in changes if c["confident"]] or changes[:1]
     rest = [c for c in changes if c not in sure]
     headline = f"The vehicle has changed: {'; '.join(change_words(c) for c in sure)}."

@@ -172,7 +172,7 @@ def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None
     for place, part in (("in question", tested), ("in the baseline", healthy)):
         for one in part:
             for before, other in seen:
-                if one.sha256 is not None and one.sha256 == other.sha256 and _overlap(one, other):
+                if one.sha256 and one.sha256 == other.sha256 and _overlap(one, other):
                     copy = "is" if one.name == other.name else f"holds the bytes of {other.name}: the flight is"
                     where = f"twice {place}" if place == before else f"{before} and {place}"
                     raise LogError(f"{one.name} {copy} {where}", "each flight once", "leave one of the two out")
