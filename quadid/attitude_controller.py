@@ -203,37 +203,3 @@ def stabilise_rows(
     for k in range(reference.shape[0]):
         write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
         stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
-
-
-def stabiliser_step(
-    gains: Mapping[str, float],
-    mixer: FloatArray,
-    reference: FloatArray,
-    attitude: FloatArray,
-    rate: FloatArray,
-    integral: FloatArray,
-    dt: float,
-) -> tuple[FloatArray, FloatArray]:
-    """One step of the stabiliser as a pure function.
-
-    Args:
-        gains: by name, see `GAIN_UNITS`.
-        mixer: `mixer_matrix`.
-        reference: roll, pitch, yaw [rad], throttle 0..1.
-        attitude: measured unit quaternion, body to world, scalar first.
-        rate: measured body rates [rad/s].
-        integral: integral torques before the step [N m], shape (3,); zeros to start.
-        dt: time since the last step [s].
-
-    Returns:
-        Commanded rotor speeds [rad/s], shape (rotors,), and the integral torques after the step.
-    """
-    matrix = np.empty((3, 3))
-    w, x, y, z = (float(c) for c in attitude)
-    write_rotation(w, x, y, z, matrix)
-    after = np.array(integral, dtype=np.float64)
-    command = np.empty(len(mixer))
-    stabilise(
-        pack_gains(gains), mixer, np.asarray(reference, float), matrix, np.asarray(rate, float), dt, after, command
-    )
-    return command, after

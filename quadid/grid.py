@@ -227,6 +227,3 @@ def _nothing_left(
         f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",
         f"at least {needed:.3g} s", "log at a steady rate, or ask for a lower --rate",
     )  # fmt: skip
-
-
-__all__ = ["GridReport", "Gridded", "grid_recording", "to_windows"]

@@ -3,7 +3,6 @@
 from quadid.callable_room import make_callable
 from quadid.diagnose.pipeline import diagnose as diagnose
 from quadid.diagnose.result import Diagnosis as Diagnosis
-from quadid.diagnose.result import Verdict as Verdict
 from quadid.diagnose.selection import Search as Search
 
 make_callable(__name__)

@@ -8,21 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from quadid.effects.kinds import Effect, EffectParameter
-from quadid.effects.table import NEVER, TABLE
+from quadid.effects.kinds import Effect as Effect
+from quadid.effects.kinds import EffectParameter as EffectParameter
+from quadid.effects.table import NEVER as NEVER
+from quadid.effects.table import TABLE
 from quadid.errors import ParameterError, nearest
-
-__all__ = [
-    "EFFECTS",
-    "NEVER",
-    "Effect",
-    "EffectParameter",
-    "effect_of",
-    "known_keys",
-    "parameter_of",
-    "rotor_drag_losses",
-    "rotor_losses",
-]
 
 EFFECTS: dict[str, Effect] = {e.name: e for e in TABLE}
 """Every effect by name; `docs/effects.md` explains each."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from quadid.attitude_controller import mixer_matrix, pack_gains
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight.airframe import STATES
 from quadid.flight.loop import Plan, Track
@@ -17,7 +18,7 @@ from quadid.flight.profiles import Segment, band_noise, scripted, stick_profile
 from quadid.flight.record import Flight, Flown, as_recording, true_states, write_window
 from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, prepare
-from quadid.flight.stabiliser import default_gains, mixer_matrix, pack_gains
+from quadid.flight.stabiliser import default_gains
 from quadid.flight.truth import TruthParameters
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.attitude_controller import stabilise
 from quadid.flight.airframe_constants import Air, Body, Oddity
 from quadid.flight.jit import kernel
 from quadid.flight.loop import (
@@ -24,7 +25,6 @@ from quadid.flight.loop import (
 )
 from quadid.flight.pilot import Pilot, fly_by_hand
 from quadid.flight.rotors import Drive, advance
-from quadid.flight.stabiliser import stabilise
 from quadid.types import FloatArray
 
 FLEW, CRASHED = 0, 1

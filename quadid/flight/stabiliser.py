@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.attitude_controller import GAIN_NAMES as GAIN_NAMES
-from quadid.attitude_controller import GAIN_UNITS as GAIN_UNITS
-from quadid.attitude_controller import mixer_matrix as mixer_matrix
-from quadid.attitude_controller import pack_gains as pack_gains
-from quadid.attitude_controller import stabilise as stabilise
-from quadid.attitude_controller import stabiliser_step as stabiliser_step
 from quadid.flight.truth import TruthParameters
 from quadid.vehicle import Vehicle
 

@@ -4,10 +4,11 @@ health = assess(trims of flights, trims of healthy flights, vehicle)
 """
 
 from quadid.callable_room import make_callable
-from quadid.health.changes import Change, Health, assess
-from quadid.health.spread import Healthy, healthy_spread
-from quadid.health.trims import AXES, FlightTrim, flight_trim
-
-__all__ = ["AXES", "Change", "FlightTrim", "Health", "Healthy", "assess", "flight_trim", "healthy_spread"]
+from quadid.health.changes import Health as Health
+from quadid.health.changes import assess as assess
+from quadid.health.spread import Healthy as Healthy
+from quadid.health.spread import healthy_spread as healthy_spread
+from quadid.health.trims import FlightTrim as FlightTrim
+from quadid.health.trims import flight_trim as flight_trim
 
 make_callable(__name__)

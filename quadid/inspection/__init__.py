@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from quadid.inspection.airborne import Spans, flying_spans, proposed_cuts
+from quadid.inspection.airborne import Spans
+from quadid.inspection.airborne import flying_spans as flying_spans
+from quadid.inspection.airborne import proposed_cuts as proposed_cuts
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
-from quadid.inspection.findings import FATAL, ChannelFacts, Check, Inspection, Missing, Outlook, Verdict
+from quadid.inspection.findings import FATAL as FATAL
+from quadid.inspection.findings import Check as Check
+from quadid.inspection.findings import Inspection as Inspection
+from quadid.inspection.findings import Verdict as Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
@@ -15,19 +20,6 @@ from quadid.inspection.timing import channel_facts, timing_checks
 from quadid.mounting import in_body_axes
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
-
-__all__ = [
-    "FATAL",
-    "ChannelFacts",
-    "Check",
-    "Inspection",
-    "Missing",
-    "Outlook",
-    "Verdict",
-    "flying_spans",
-    "inspect",
-    "proposed_cuts",
-]
 
 
 def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:

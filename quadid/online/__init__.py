@@ -20,34 +20,16 @@ What stands between samples and the parameter topic, in this order; each says wh
     active_set          a person approves where that is wanted; what predicts worse than its predecessor is taken back
 """
 
-from quadid.online.gate import GateSettings
-from quadid.online.jobs import Job, JobReply
-from quadid.online.records import (
-    Diagnosed,
-    Event,
-    OnlineSet,
-    Phase,
-    Publish,
-    SessionStatus,
-    SetState,
-)
-from quadid.online.session import Session
-from quadid.online.settings import SessionSettings
-from quadid.online.window_fit import FitReply, FitRequest
-
-__all__ = [
-    "Diagnosed",
-    "Event",
-    "FitReply",
-    "FitRequest",
-    "GateSettings",
-    "Job",
-    "JobReply",
-    "OnlineSet",
-    "Phase",
-    "Publish",
-    "Session",
-    "SessionSettings",
-    "SessionStatus",
-    "SetState",
-]
+from quadid.online.gate import GateSettings as GateSettings
+from quadid.online.jobs import Job as Job
+from quadid.online.jobs import JobReply as JobReply
+from quadid.online.records import Diagnosed as Diagnosed
+from quadid.online.records import Event as Event
+from quadid.online.records import OnlineSet as OnlineSet
+from quadid.online.records import Phase as Phase
+from quadid.online.records import Publish as Publish
+from quadid.online.records import SetState as SetState
+from quadid.online.session import Session as Session
+from quadid.online.settings import SessionSettings as SessionSettings
+from quadid.online.window_fit import FitReply as FitReply
+from quadid.online.window_fit import FitRequest as FitRequest

@@ -6,20 +6,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from quadid.attitude_controller import GAIN_NAMES, mixer_matrix, pack_gains, stabilise_rows
 from quadid.errors import ParameterError
-from quadid.flight import (
-    GAIN_NAMES,
-    TruthParameters,
-    default_gains,
-    fly,
-    mixer_matrix,
-    pack_gains,
-    stabiliser_step,
-)
+from quadid.flight import TruthParameters, default_gains, fly
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import Stabiliser
 
 NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
+
+
+def steps(
+    gains: dict[str, float], mixer: FloatArray, reference: FloatArray, attitude: FloatArray, rate: FloatArray,
+    integral: FloatArray, dt: float,
+) -> FloatArray:  # fmt: skip
+    """Rotor speeds (n, rotors) of n steps in a row from integral torques (3,)."""
+    command = np.empty((len(reference), len(mixer)))
+    after = np.array(integral, dtype=np.float64)
+    stabilise_rows(pack_gains(gains), mixer, reference, attitude, rate, np.full(len(reference), dt), after, command)
+    return command
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -43,26 +48,10 @@ def test_logged_sensors_and_references_give_the_logged_commands() -> None:
     at = flight.vehicle.rotor_positions
     forward = np.vstack([-b * at[:, 1], b * at[:, 0], d * flight.vehicle.spins])
     # the integral torques before the first row: what its command holds beyond the proportional part
-    first, _ = stabiliser_step(gains, mixer, flight.references[0], w.attitude[0], w.gyro[0], np.zeros(3), 0.02)
-    integral = forward @ (w.rotor_speed[0] ** 2 - first**2)
-    worst = 0.0
-    for k in range(len(w)):
-        command, integral = stabiliser_step(
-            gains, mixer, flight.references[k], w.attitude[k], w.gyro[k], integral, w.dt
-        )
-        worst = max(worst, float(np.abs(command - w.rotor_speed[k]).max()))
-    assert worst < 1e-6
-
-
-def test_step_is_pure() -> None:
-    vehicle = Vehicle.shipped("pelican")
-    gains, integral = default_gains(vehicle), np.array([0.01, -0.02, 0.001])
-    arguments = (np.array([0.1, 0.0, 0.2, 0.3]), np.array([1.0, 0, 0, 0]), np.array([0.1, 0.2, 0.3]))
-    one = stabiliser_step(gains, mixer_matrix(vehicle, gains), *arguments, integral, 0.02)
-    two = stabiliser_step(gains, mixer_matrix(vehicle, gains), *arguments, integral, 0.02)
-    np.testing.assert_array_equal(one[0], two[0])
-    np.testing.assert_array_equal(one[1], two[1])
-    np.testing.assert_array_equal(integral, [0.01, -0.02, 0.001])
+    first = steps(gains, mixer, flight.references[:1], w.attitude[:1], w.gyro[:1], np.zeros(3), 0.02)
+    integral = forward @ (w.rotor_speed[0] ** 2 - first[0] ** 2)
+    commands = steps(gains, mixer, flight.references, w.attitude, w.gyro, integral, w.dt)
+    assert np.abs(commands - w.rotor_speed).max() < 1e-6
 
 
 @pytest.mark.parametrize(("axis", "gain"), [(0, "roll_rate_p"), (1, "pitch_rate_p"), (2, "yaw_rate_p")])
@@ -74,7 +63,7 @@ def test_torque_opposes_the_error(axis: int, gain: str) -> None:
     turn[axis] = 0.05
     q = Rotation.from_rotvec(turn).as_quat()[[3, 0, 1, 2]]
     mixer = mixer_matrix(vehicle, gains)
-    command, _ = stabiliser_step(gains, mixer, np.array([0, 0, 0, 0.3]), q, np.zeros(3), np.zeros(3), 0.02)
+    (command,) = steps(gains, mixer, np.array([[0, 0, 0, 0.3]]), q[None], np.zeros((1, 3)), np.zeros(3), 0.02)
     b, d, at = gains["thrust_coefficient"], gains["drag_coefficient"], vehicle.rotor_positions
     torque = np.vstack([-b * at[:, 1], b * at[:, 0], d * vehicle.spins]) @ command**2
     expected = np.zeros(3)
