@@ -2,7 +2,7 @@
 
 A cause is worth what is lost without it, all others refitted, in the segments that decided.  With validation logs the
 parameters stay as fitted there, and values that belong to a flight (`per_log`) are carried over; without such logs
-ten-second blocks of the training log are left out in turn.  Causes no larger than on any vehicle come last.
+tenths of the training log are left out in turn.  Causes no larger than on any vehicle come last.
 
 What all of them gain is stated as an identification of the same flights states errors, and the verdict goes by that:
 runs of one second, in the noise that the identification estimated, from the parameters that the identification found

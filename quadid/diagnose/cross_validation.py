@@ -1,6 +1,6 @@
 """Comparison of models on blocks of data that the fit did not see.
 
-Segments are grouped into blocks of about 10 s.  For each block the parameters are those fitted to all other blocks (one
+Segments are grouped into ten blocks of time.  For each block the parameters are those fitted to all other blocks (one
 Gauss-Newton step from the common optimum, exact for the linearised problem), so a model is charged for every parameter
 that only fits noise; the paired differences between two models, one a block, carry their own standard error whatever
 the correlation inside a block.
@@ -22,15 +22,13 @@ from quadid.identify.score import INFINITE
 from quadid.identify.shooting import Linearised
 from quadid.types import FloatArray, IndexArray
 
-BLOCK_SECONDS = 10.0
-"""Fifteen times the memory of the attitude's noise: blocks are all but independent, and minutes hold enough of them."""
-FEWEST_BLOCKS = 10
-"""With fewer the error of a gain is hardly known: to a quarter with ten."""
+BLOCKS = 10
+"""With so many the error of a gain is known to a quarter, and each is many times the memory of the noise."""
 
 
 def block_labels(lin: Linearised) -> IndexArray:
-    """Block number of each segment, shape (segments,): stretches of 10 s, shorter if there would be fewer than ten."""
-    length = min(BLOCK_SECONDS, max(lin.spacing * len(lin.time) / FEWEST_BLOCKS, 2.0 * lin.spacing))
+    """Block number of each segment, shape (segments,): stretches of a tenth of all data, none over two flights."""
+    length = max(lin.spacing * len(lin.time) / BLOCKS, 2.0 * lin.spacing)
     _, first, window = np.unique(lin.window, return_index=True, return_inverse=True)
     number = np.floor((lin.time - lin.time[first][window] + 1e-9) / length)
     return np.unique(np.stack([window, number]), axis=1, return_inverse=True)[1].reshape(-1)

@@ -10,7 +10,7 @@ import numpy as np
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import Identified, stated_errors, worths
 from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
-from quadid.diagnose.cross_validation import FEWEST_BLOCKS
+from quadid.diagnose.cross_validation import BLOCKS
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, free_names, refit, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
@@ -48,9 +48,7 @@ SHARE_TO_NAME = 0.8
 SHARE_ALONE = 0.9
 """… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
 LEAST_STRUCTURE = 0.01
-"""Structure below this share of the noise is not worth a word …"""
-LEAST_OF_EXPLAINED = 1e-3
-"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
+"""Structure below this share of the noise is not worth a word."""
 
 
 def diagnose(
@@ -201,7 +199,7 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     flexible = flexible_fit(windows, short, *begun)
     short = short.with_noise(flexible.noise)
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
-    schedule = [*(s for s in schedule if s.count >= FEWEST_BLOCKS), short]
+    schedule = [*(s for s in schedule if s.count >= BLOCKS), short]
     listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
     listed = [c for c in listed if c.effect not in vehicle.effects]
     return _Begun(schedule, first.theta, flexible.theta, listed)
@@ -263,8 +261,8 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
         unnamed: deviance that causes which are not what their names say take away; it counts as left.
     """
     explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
-    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
-    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
+    structure = left.deviance + unnamed
+    structure = structure if structure > LEAST_STRUCTURE * model.rows else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:

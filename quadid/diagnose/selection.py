@@ -24,8 +24,6 @@ ALIKE = 0.8
 """… and so are causes that should regain this share of what is lost when another one leaves."""
 MOST_REFITS = 7
 """Causes refitted on one model in a round: where the model misses much, predictions promise without end."""
-MOST_ROUNDS = 24
-"""Moves after which the search ends: where the catalogue lacks the cause, stand-ins take turns for long."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def select(
     stage = Stage.begin(schedule, theta, known)
     rounds: list[Round] = []
     seen = {_key(stage.shooting, stage.model)}
-    while len(rounds) < MOST_ROUNDS:
+    while True:  # no model is visited twice
         report("search", len(rounds) / (len(rounds) + 2.0))
         where = stage
         rounds.append(_round(where, listed, seen))

@@ -26,7 +26,7 @@ SHOWN = 1
 """Answers that one cell of the table tells."""
 IDLE = re.compile(r"\| [^|]+ \|( (– )? ?\|){3}")
 """A row in which nothing changes."""
-NAMES = re.compile(r"\*\*\+|: [−+]\w|confident →")
+NAMES = re.compile(r"\*\*\+|: [−+]\w|: first |confident →")
 """What a row has in which a name or a verdict changes."""
 
 
@@ -118,7 +118,8 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
 {len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
 
 The number of a campaign case is its seed. Unchanged, the diagnosis is right on
-{sum(bool(a.right) for a in right)} of the {len(right)} with known answer.
+{sum(bool(a.right) for a in right)} of the {len(right)} with known answer; of recorded flights
+no identified number must exclude what is known.
 Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 
 {REMOVED.read_text(encoding="utf-8").strip()}

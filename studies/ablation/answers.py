@@ -14,6 +14,7 @@ from quadid.errors import QuadidError
 from studies.ablation.corpus import Flight, Given, load
 from studies.ablation.memory import Memory
 from studies.ablation.variants import Variant
+from studies.foreign.numbers import of_set
 
 SAME = 0.01
 """Relative change of the error on unseen data below which two answers with equal names count as equal."""
@@ -29,7 +30,8 @@ class Answer:
         flight: its name; variant: what was changed in the method.
         verdict: of the diagnosis, or ``refused``.
         listed: all findings, in order; named: the confident ones.
-        right: whether that is what was hidden; None where nobody knows.
+        right: whether that is what was hidden, or, of recorded flights, no number called identified excludes what is
+            known of the vehicle; None where nobody knows.
         nominal, extended: error on unseen data; fits: linearisations asked for.
         intervals: of the numbers found, 95 %.
         follows: what the rest follows most, and where.
@@ -50,11 +52,14 @@ class Answer:
     def difference(self, other: Answer) -> str:
         """What an answer has that this one has not, in words; empty where nothing differs.
 
-        Names come before the verdict, that before the error on unseen data, and that before intervals and the rest.
+        Names come before the first of them and the verdict, these before the error on unseen data, and that before
+        intervals and the rest.
         """
         gone, come = (sorted(set(a.listed) - set(b.listed)) for a, b in ((self, other), (other, self)))
         if gone or come:
             return ", ".join([*(f"−{n}" for n in gone), *(f"+{n}" for n in come)])
+        if self.listed[:1] != other.listed[:1]:
+            return f"first {self.listed[0]} → {other.listed[0]}"
         if (self.verdict, set(self.named)) != (other.verdict, set(other.named)):
             return f"{self.verdict}, {len(self.named)} confident → {other.verdict}, {len(other.named)}"
         if abs(self.extended - other.extended) > SAME * max(self.extended, other.extended):
@@ -63,6 +68,8 @@ class Answer:
             width, new = high - low, other.intervals[name][1] - other.intervals[name][0]
             if abs(new - width) > WIDTH * max(width, new):
                 return f"interval of {name} {width:.2g} → {new:.2g}"
+        if self.right != other.right:
+            return f"numbers {'wrong → right' if other.right else 'right → wrong'}"
         if self.follows != other.follows:
             return f"rest follows “{self.follows}” → “{other.follows}”"
         return ""
@@ -82,8 +89,11 @@ def ask(flight: Flight, given: Given, variant: str, memory: Memory) -> Answer:
     # Of one effect that is found twice, as weak rotors are, the second one counts.
     intervals = {f"{f.effect}.{p.name}": p.ci95 for f in found.findings for p in f.parameters}
     follows = next((f"{f.signal} at {f.site.name}" for f in found.remainder.followed), "")
+    right = _right(flight, found.verdict.value, listed, named)
+    if flight.known is not None:
+        right = all(n.inside for n in of_set("", flight.known, {"": found.to_dict()}) if n.identified)
     return Answer(
-        flight.name, variant, found.verdict.value, listed, named, _right(flight, found.verdict.value, listed, named),
+        flight.name, variant, found.verdict.value, listed, named, right,
         found.validation.nominal, found.validation.extended, memory.asked, intervals, follows,
     )  # fmt: skip
 

@@ -14,6 +14,7 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 from quadid.workflow.loading import load_vehicle
 from studies.campaign import Case, cases, flown
+from studies.foreign.sets import SETS, FlightSet
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
 SCALED = (
@@ -22,8 +23,9 @@ SCALED = (
 )  # fmt: skip
 """Flights on which numbers are halved and doubled too: one of each kind, which compute fast."""
 FLIGHTS = (
-    *SCALED, "outside 7003", "single 1083", "single 8005", "look_alike 15", "outside 1029", "clutter 2005",
-    "cases case_012", "cases_hub case_002", "cases_hub case_006", "iris",
+    *SCALED, "outside 7002", "outside 7003", "outside 7007", "outside 7012", "outside 7021", "single 1055",
+    "single 1083", "single 8005", "look_alike 15", "outside 1029", "clutter 2005", "clutter 2019", "cases case_012",
+    "cases_hub case_002", "cases_hub case_006", "iris", "arpl", "sitl square", "brushed rpm", "crazyflie",
 )  # fmt: skip
 """What a run takes where nothing else is asked for: besides those, flights that rules were once made for."""
 Given = tuple[list[Window], list[Window], Vehicle]
@@ -40,6 +42,7 @@ class Flight:
         train, held: logs below the data folder, each with `@from:to` where cut; vehicle: its file there.
         hidden: what a case hides; None where nobody knows.
         clutter: what may be named beside it, after it.
+        known: what is known of a recorded vehicle.
     """
 
     name: str
@@ -49,11 +52,12 @@ class Flight:
     vehicle: str = ""
     hidden: tuple[str, ...] | None = None
     clutter: tuple[str, ...] = ()
+    known: FlightSet | None = None
 
 
 _RECORDED = (
     ("iris", "iris/vehicle.yaml", "pitch_yaw.csv", "sideways.csv"),
-    ("sitl square", "ardupilot_sitl/quad_sq.yaml", "quad_sq.bin@20:100", "quad_sq.bin@100:160"),
+    ("sitl square", "ardupilot_sitl/quad_sq.yaml", "quad_sq.bin@20:70", "quad_sq.bin@100:140"),
     ("sitl x", "ardupilot_sitl/sitl_x.yaml", "x.bin@20:100", "x.bin@100:160"),
     ("brushed rpm", "brushed/vehicle.yaml", "jana00.csv", "jana02.csv"),
     ("brushed pwm", "brushed/vehicle_pwm.yaml", "jana00_pwm.csv", "jana02_pwm.csv"),
@@ -70,7 +74,8 @@ def _recorded() -> list[Flight]:
     for name, vehicle, train, held in _RECORDED:
         folder = vehicle.split("/")[0]
         logs = [tuple(f"{folder}/{log}" for log in names.split()) for names in (train, held)]
-        out.append(Flight(name, None, logs[0], logs[1], vehicle))
+        known = next((s for s in SETS.values() if s.vehicle == vehicle and s.truth), None)
+        out.append(Flight(name, None, logs[0], logs[1], vehicle, known=known))
     return out
 
 

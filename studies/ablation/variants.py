@@ -163,11 +163,11 @@ RULES: dict[str, dict[str, Any]] = {
 }
 """Rules that are functions, and what stands in their place."""
 OUT: dict[str, Any] = {
-    "UNTIDY": 0.0, "FEWEST_BLOCKS": 1, "STEP_SIGMA": 0.0, "TIME_SIGMA": 0.0, "FALSE_ALARM": 1.0, "RELEVANT": 0.0,
+    "UNTIDY": 0.0, "BLOCKS": 2, "STEP_SIGMA": 0.0, "TIME_SIGMA": 0.0, "FALSE_ALARM": 1.0, "RELEVANT": 0.0,
     "NOISE_FELL": 0.0, "SHARE_TO_NAME": 0.0, "SHARE_ALONE": SHARE_TO_NAME,
-    "LEAST_STRUCTURE": 0.0, "LEAST_OF_EXPLAINED": 0.0, "LIKELY_SENSOR": math.inf, "WRONG_SIGN": 0.0, "ERRORS": 0.0,
-    "WAVES": 0, "ALARM": math.inf, "_RIDGE": 0.0, "BLOCK_SECONDS": math.inf,
+    "LEAST_STRUCTURE": 0.0, "LIKELY_SENSOR": math.inf, "WRONG_SIGN": 0.0, "ERRORS": 0.0,
+    "WAVES": 0, "ALARM": math.inf, "_RIDGE": 0.0,
     "CHANGE_SHARE": 0.0, "LINEAR_MISFIT": math.inf, "CLEAN_MISFIT": LINEAR_MISFIT, "NEAR": 1.0, "ALIKE": 1.0,
-    "MOST_REFITS": 1000, "MOST_ROUNDS": 1000,
+    "MOST_REFITS": 1000,
 }  # fmt: skip
 """What stands for a number that is left out; numbers that have no such value are halved and doubled only."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from quadid.diagnose import log_evidence
-from quadid.diagnose.cross_validation import BLOCK_SECONDS
+from quadid.diagnose.cross_validation import BLOCKS
 from quadid.diagnose.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
 
@@ -32,7 +32,7 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
     [
         f"{100 * log_evidence.RELEVANT:.1f} % of the independent residuals",
         f"{log_evidence.FALSE_ALARM} divided by",
-        f"blocks of {BLOCK_SECONDS:.0f} s",
+        f"{BLOCKS} blocks of time",
         f"at least {100 * SHARE_TO_NAME:.0f} % of all structure",
     ],
 )

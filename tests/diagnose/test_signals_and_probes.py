@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.diagnose import residual_regressors
 from quadid.diagnose.residual_regressors import SITES, Follows, follows, signals, strongest
 from quadid.flight import draw_truth, fly
 from quadid.identify.segment_jacobian import Columns
@@ -113,3 +114,19 @@ def test_sites_move_what_they_say() -> None:
     moments = [s for s in SITES if s.name.startswith("moment")]
     assert [s.channels for s in moments] == [((i, 1), (3 + i, 2)) for i in range(3)]
     assert len({s.name for s in SITES}) == len(SITES) == 12
+
+
+def test_signals_that_double_one_another_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a flight that holds its heading, for one, its cosine is constant: without `_RIDGE` no inverse exists."""
+    problem = clean()
+    once = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
+
+    def doubled(part: Columns) -> dict[str, FloatArray]:
+        return {f"{name}{again}": s for again in ("", ", again") for name, s in signals(part).items()}
+
+    monkeypatch.setattr(residual_regressors, "signals", doubled)
+    twice = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
+    assert twice == pytest.approx(once, rel=0.01)
+    monkeypatch.setattr(residual_regressors, "_RIDGE", 0.0)
+    with pytest.raises(np.linalg.LinAlgError):
+        follows(problem.shooting, problem.nominal)
