@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,7 +19,7 @@ NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushle
 
 
 def steps(
-    gains: dict[str, float], mixer: FloatArray, reference: FloatArray, attitude: FloatArray, rate: FloatArray,
+    gains: Mapping[str, float], mixer: FloatArray, reference: FloatArray, attitude: FloatArray, rate: FloatArray,
     integral: FloatArray, dt: float,
 ) -> FloatArray:  # fmt: skip
     """Rotor speeds (n, rotors) of n steps in a row from integral torques (3,)."""
