@@ -29,8 +29,10 @@ SETTLES = 40.0
 """Velocity that nobody measures is integrated, and forgotten with this time constant [s]."""
 ASTRAY = 0.5
 """Standard deviation, an axis, of a velocity that was integrated [m/s]."""
-ROUNDS = 4
-"""Reweighted fits of a regression: outliers count less."""
+SETTLED = 0.01
+"""A reweighted regression is done when no coefficient moves by more than this share of its standard deviation,"""
+MOST_ROUNDS = 50
+"""... or after so many fits."""
 
 
 class Velocity:
@@ -117,16 +119,8 @@ def step_beside(
             what no regressor describes does not average out.
         astray: ways in which the regressors may all be off together, each by one standard deviation, shape (n, m, k).
     """
-    before, x = y[:split], x - x[:split].mean(axis=0)
-    past, slope = x[:split], np.zeros(x.shape[1])
-    for _ in range(ROUNDS):
-        left = before - past @ slope
-        level = median(left)
-        spread = max(1.4826 * median(np.abs(left - level)), least / 5.0)
-        weighted = past.T / np.maximum(np.abs(left - level) / (2.0 * spread), 1.0) / spread**2
-        covariance = np.linalg.inv(weighted @ past + np.diag(typical**-2.0))
-        slope = covariance @ (weighted @ (before - level))
-    left, far = y - x @ slope, x[split:].mean(axis=0)
+    slope, centre, covariance, spread = _reweighted(y[:split], x[:split], typical, least / 5.0)
+    left, far = y - x @ slope, x[split:].mean(axis=0) - centre
     left -= median(left[:split])
     size, count = median(left[split:]), len(y) - split
     if abs(size) < least or not np.all(np.sign(size) * left[split:] > 2.0 * spread):
@@ -138,3 +132,31 @@ def step_beside(
     if astray is not None:
         variance += float(np.sum((astray[split:].mean(axis=0) @ slope) ** 2))
     return abs(size) / math.sqrt(variance), size
+
+
+def _reweighted(
+    y: FloatArray, x: FloatArray, typical: FloatArray, least: float
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Regression with an intercept in which outliers count less (Huber), from that in which all count alike.
+
+    It goes on until it has settled: where most values are of one state, as in a long climb, all others are outliers at
+    first, and what few rounds leave of that looks like a step.
+
+    Returns:
+        Coefficients, shape (k,), weighted mean of the regressors, shape (k,), covariance (k, k), and scatter of the
+        residuals, no less than `least`.
+    """
+    slope, weight = np.zeros(x.shape[1]), np.ones(len(y))
+    for done in range(MOST_ROUNDS):
+        left = y - x @ slope
+        left -= median(left)
+        spread = max(1.4826 * median(np.abs(left)), least)
+        centre = weight @ x / weight.sum()
+        weighted = (x - centre).T * (weight / spread**2)
+        covariance = np.linalg.inv(weighted @ (x - centre) + np.diag(typical**-2.0))
+        before, slope = slope, covariance @ (weighted @ y)
+        if done and np.all(np.abs(slope - before) <= SETTLED * np.sqrt(np.diag(covariance))):
+            break
+        left = y - x @ slope
+        weight = 1.0 / np.maximum(np.abs(left - median(left)) / (2.0 * spread), 1.0)
+    return slope, centre, covariance, spread

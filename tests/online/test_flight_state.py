@@ -15,7 +15,7 @@ from quadid_replay import open_log
 from quadid.online.change_detection import CHUNK, ChangeDetector
 from quadid.online.change_supervisor import ChangeSupervisor, Seen
 from quadid.online.estimator import Estimator
-from quadid.online.flight_state import Velocity, step_beside
+from quadid.online.flight_state import FlightState, Velocity, step_beside
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.resampler import Resampler
 from quadid.online.rows import Rows
@@ -170,6 +170,24 @@ def test_a_step_that_a_regressor_explains_is_none_and_its_doubt_counts() -> None
     errors, size = step_beside(y - 0.2 * (np.arange(68) >= 60), x, sized, 60, 0.03)
     assert errors < 7.0, "the coefficient may be that much off"
     assert size == pytest.approx(-0.2, abs=0.1)
+
+
+@pytest.mark.parametrize("climb", [4.0, 5.0])
+def test_what_follows_a_long_climb_is_no_step_and_a_real_one_is_seen(climb: float) -> None:
+    """Nine seconds of one state, to which all others are outliers at first: their regression has to settle."""
+    state = FlightState(Vehicle.shipped("pelican"))
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        along = np.concatenate([rng.normal(-climb, 0.02, 19), rng.normal(0.0, 0.4, 18)])
+        flat = np.concatenate([np.zeros(19), rng.exponential(1.0, 18)])
+        speed = 440.0 + np.concatenate([np.zeros(19), rng.normal(0.0, 3.0, 18)])
+        drag = np.sqrt(flat + along**2) * along
+        x = np.column_stack([-1.0 / speed, along / GRAVITY, flat / GRAVITY, drag / GRAVITY])
+        y = x @ [0.0, 0.25, 0.008, 0.03] + rng.normal(0.0, 0.001, 37)
+        assert step_beside(y, x, state.typical, 33, 0.03)[0] < 2.0
+        errors, size = step_beside(y - 0.1 * (np.arange(37) >= 33), x, state.typical, 33, 0.03)
+        assert errors > 7.0
+        assert size == pytest.approx(-0.1, abs=0.02)
 
 
 def test_what_lasts_in_the_past_is_no_step_now() -> None:
