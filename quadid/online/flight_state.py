@@ -137,10 +137,10 @@ def step_beside(
 def _reweighted(
     y: FloatArray, x: FloatArray, typical: FloatArray, least: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Regression with an intercept in which outliers count less (Huber), from that in which all count alike.
+    """Regression with an intercept in which outliers count for next to nothing (Cauchy), however they lie.
 
-    It goes on until it has settled: where most values are of one state, as in a long climb, all others are outliers at
-    first, and what few rounds leave of that looks like a step.
+    It begins with all values counting alike, and goes on until it has settled.  Begun at zero slope, where most values
+    are of one state, as in a long climb, all others would be outliers, and what is left of that looks like a step.
 
     Returns:
         Coefficients, shape (k,), weighted mean of the regressors, shape (k,), covariance (k, k), and scatter of the
@@ -158,5 +158,5 @@ def _reweighted(
         if done and np.all(np.abs(slope - before) <= SETTLED * np.sqrt(np.diag(covariance))):
             break
         left = y - x @ slope
-        weight = 1.0 / np.maximum(np.abs(left - median(left)) / (2.0 * spread), 1.0)
+        weight = 1.0 / (1.0 + ((left - median(left)) / (2.0 * spread)) ** 2)
     return slope, centre, covariance, spread

@@ -21,8 +21,9 @@ LOOP = 0.0025
 """Time between two runs of the loop [s]."""
 SLOW = 20
 """Slow torque is what three running means over so many runs of the loop leave."""
-INTERVALS = (4, 5, 6, 7, 8, 9, 10)
-"""Between snapshots, in runs of the loop."""
+INTERVALS = ((4, 0), (5, 0), (6, 0), (7, 0), (8, 0), (8, 2), (9, 0), (10, 0))
+"""Between snapshots, and to a second one after each (0: none), in runs of the loop: ArduPilot's motor outputs are two
+runs newer than the rotor speeds of the same round of messages."""
 PARTS = ((30.0, 75.0), (75.0, 95.0), (95.0, 200.0))
 """Of the log [s]; the excited flight begins 41 s after its first row."""
 MOTION = {"gyro": 0.01, "accel": 0.01, "attitude": 0.02}
@@ -72,11 +73,18 @@ def _slow(torque: FloatArray) -> FloatArray:
     return torque[5 * SLOW : -5 * SLOW]
 
 
-def errors(torque: FloatArray, runs: int) -> list[float]:
-    """Size of slow torque by lines between snapshots over the true one, minus 1, by where the snapshots begin."""
+def errors(torque: FloatArray, runs: int, second: int = 0) -> list[float]:
+    """Size of slow torque by lines between snapshots over the true one, minus 1, by where the snapshots begin.
+
+    Args:
+        torque: of each run of the loop, shape (n,).
+        runs: between two snapshots.
+        second: runs to another snapshot after each; 0: none.
+    """
     true, out = _slow(torque), []
     for first in range(runs):
-        at = np.arange(first, len(torque), runs)
+        at = np.arange(first, len(torque) - second, runs)
+        at = np.union1d(at, at + second)
         seen = _slow(np.interp(np.arange(len(torque)), at, torque[at]))
         out.append(float(seen @ true / (true @ true)) - 1.0)
     return out
@@ -98,13 +106,14 @@ def main() -> None:
     print("|---|---|" + "---|" * len(PARTS))
     for name in ("x.bin", "quad_sq.bin"):
         output = loop_output(data / name)
-        for runs in INTERVALS:
+        for runs, second in INTERVALS:
             cells = []
             for a, b in PARTS:
                 part = output[round(a / LOOP) : round(b / LOOP)]
-                found = errors(part[:, 0], runs) + errors(part[:, 1], runs)
+                found = errors(part[:, 0], runs, second) + errors(part[:, 1], runs, second)
                 cells.append(f"{np.sqrt(np.mean(np.square(found))):.1%}")
-            print(f"| {name} | {runs * LOOP * 1e3:g} | " + " | ".join(cells) + " |", flush=True)
+            apart = f"{runs * LOOP * 1e3:g}" + (f", and {second * LOOP * 1e3:g} later" if second else "")
+            print(f"| {name} | {apart} | " + " | ".join(cells) + " |", flush=True)
 
 
 if __name__ == "__main__":
