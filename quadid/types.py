@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,3 +17,7 @@ IntArray: TypeAlias = NDArray[np.int64]
 """Numbers kept as such, as in a log or a file."""
 IndexArray: TypeAlias = NDArray[np.intp]
 """Places in another array."""
+JsonDict: TypeAlias = dict[str, Any]
+"""A result, or a part of one, as JSON holds it …"""
+Json: TypeAlias = Mapping[str, Any]
+"""… and one that is only read."""

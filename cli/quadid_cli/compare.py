@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from quadid.types import JsonDict
 from quadid.workflow.loading import GRID
 from quadid_cli import options
-
-JsonDict = dict[str, Any]
 
 
 def compare(

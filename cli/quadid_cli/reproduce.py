@@ -5,17 +5,17 @@ from __future__ import annotations
 import datetime
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from quadid.chi_square import Z95
+from quadid.types import JsonDict
 from quadid_cli.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
     from quadid.workflow.reproduction import Plan, Reproduced
 
-JsonDict = dict[str, Any]
 _SPENT = ("quasi_newton", "pso", "pso_polish")
 _FIGURES = "paper"
 """Folder of the pictures in the output folder."""

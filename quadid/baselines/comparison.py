@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from quadid.baselines.optimisers import NAMES as OPTIMISERS
 from quadid.baselines.optimisers import minimise
 from quadid.baselines.subspace import METHODS as SUBSPACE
 from quadid.errors import ParameterError, nearest
-from quadid.types import FloatArray
+from quadid.types import FloatArray, JsonDict
 
-JsonDict = dict[str, Any]
 Clock = Callable[[], float]
 
 METHODS = (

@@ -8,18 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from quadid.identify.fit import Fit
 from quadid.identify.prediction import HorizonScore
 from quadid.identify.score import SetScore
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
-from quadid.types import FloatArray
+from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
-
-JsonDict = dict[str, Any]
 
 NOTHING_NEW = 0.9
 """Share of the information that the prior brings, above which the data say nothing."""

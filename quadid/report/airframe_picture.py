@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
+from quadid.types import Json
 from quadid.vehicle import Vehicle
-
-JsonDict = Mapping[str, Any]
 
 _SIZE, _MARGIN = 420.0, 92.0
 _LARGEST = 30.0
@@ -18,7 +16,7 @@ _SHIFT = 6.0
 
 
 def airframe_picture(
-    vehicle: Vehicle, load: Sequence[float], baseline: Sequence[float], changes: Sequence[JsonDict]
+    vehicle: Vehicle, load: Sequence[float], baseline: Sequence[float], changes: Sequence[Json]
 ) -> str:
     """SVG of the airframe, nose up.
 
@@ -50,7 +48,7 @@ def airframe_picture(
     return str(Markup("").join(parts))
 
 
-def change_value(change: JsonDict, name: str) -> float:
+def change_value(change: Json, name: str) -> float:
     """A number of a change."""
     return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
 
@@ -61,7 +59,7 @@ def _line(x1: float, y1: float, x2: float, y2: float) -> str:
     return Markup('<line class="arm" x1="{:.0f}" y1="{:.0f}" x2="{:.0f}" y2="{:.0f}"/>').format(x1, y1, x2, y2)
 
 
-def _rotor(j: int, x: float, y: float, more: float, weak: JsonDict | None, centre: float) -> str:
+def _rotor(j: int, x: float, y: float, more: float, weak: Json | None, centre: float) -> str:
     """One rotor: its healthy disc, its disc now, its number, its load, and its loss where it is damaged."""
     from markupsafe import Markup
 
@@ -87,7 +85,7 @@ def _text(x: float, y: float, words: str, kind: str) -> str:
     return Markup('<text class="{}" x="{:.0f}" y="{:.0f}">{}</text>').format(kind, x, y, words)
 
 
-def _shift(changes: Sequence[JsonDict], centre: float, scale: float) -> Sequence[str]:
+def _shift(changes: Sequence[Json], centre: float, scale: float) -> Sequence[str]:
     """An arrow from the centre towards where the CG went, enlarged."""
     from markupsafe import Markup
 

@@ -15,8 +15,7 @@ from quadid.report.identify_page import noise_rows, parameter_row
 from quadid.report.page import number
 from quadid.report.residual_maps import ResidualMap, map_figure
 from quadid.report.verdict import Level, Verdict, percent
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 HELD_OUT = "held-out blocks"
 """What a diagnosis without validation logs measures its gain on."""
@@ -28,7 +27,7 @@ _LEVELS: dict[str, Level] = {
 }
 
 
-def diagnose_verdict(result: JsonDict) -> Verdict:
+def diagnose_verdict(result: Json) -> Verdict:
     """Judges a result of the form ``quadid.diagnose/1``."""
     large, small = _named(result)
     verdict = result["verdict"]
@@ -53,7 +52,7 @@ def diagnose_verdict(result: JsonDict) -> Verdict:
     return Verdict(level, headline, details, steps)
 
 
-def _change(errors: JsonDict, found: bool) -> str:
+def _change(errors: Json, found: bool) -> str:
     """What findings make of the error."""
     before, after = errors["mse_nominal"], errors["mse_extended"]
     if not found:
@@ -71,7 +70,7 @@ def _short(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
 
 
-def _named(result: JsonDict) -> tuple[list[str], list[str]]:
+def _named(result: Json) -> tuple[list[str], list[str]]:
     """Confident findings by name: those to do something about, and those no larger than on most vehicles."""
     sure = [f for f in result["findings"] if f["confident"]]
     large = [f["effect"].replace("_", " ") for f in sure if not f.get("ordinary")]
@@ -79,7 +78,7 @@ def _named(result: JsonDict) -> tuple[list[str], list[str]]:
     return large, small
 
 
-def _next_steps(result: JsonDict) -> tuple[str, ...]:
+def _next_steps(result: Json) -> tuple[str, ...]:
     sure = [f for f in result["findings"] if f["confident"] and not f.get("ordinary")]
     named = [f["effect"] for f in sure if f["effect"] in EFFECTS][:3]
     out = [
@@ -97,7 +96,7 @@ def _next_steps(result: JsonDict) -> tuple[str, ...]:
 
 
 def diagnosis_part(
-    result: JsonDict, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
+    result: Json, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
     maps: Mapping[str, ResidualMap] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """A diagnosis as part of a page: verdict, findings, pictures.
@@ -142,14 +141,14 @@ _REMARKS = {
 }
 
 
-def _advice(finding: JsonDict) -> str:
+def _advice(finding: Json) -> str:
     """What to do about a cause, and what sets it apart."""
     known = EFFECTS.get(finding["effect"])
     parts = [] if known is None or finding.get("ordinary") else [known.advice]
     return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
 
 
-def finding_part(finding: JsonDict, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
+def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
     """One cause: its picture, its gain with interval, the rejected alternatives.
 
     Args:
@@ -188,7 +187,7 @@ def _less(before: float | None, after: float | None) -> float | None:
     return None if before is None or after is None else before - after
 
 
-def _noise_sentence(gain: JsonDict, floor: float, name: str) -> str:
+def _noise_sentence(gain: Json, floor: float, name: str) -> str:
     """How much of the error is sensor noise that no model removes, without and with the cause."""
     shares = [min(floor / v, 1.0) if v else None for v in (gain["mse_before"], gain["mse_after"])]
     if None in shares:
@@ -199,7 +198,7 @@ def _noise_sentence(gain: JsonDict, floor: float, name: str) -> str:
     )
 
 
-def remaining(result: JsonDict, sets: Sequence[ScoredSet]) -> dict[str, Any]:
+def remaining(result: Json, sets: Sequence[ScoredSet]) -> dict[str, Any]:
     """What is left: by channel, and what it follows."""
     channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
     rows = [
@@ -219,8 +218,8 @@ def remaining(result: JsonDict, sets: Sequence[ScoredSet]) -> dict[str, Any]:
 
 
 def diagnose_page(
-    result: JsonDict, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[JsonDict],
-    provenance: Sequence[JsonDict], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
+    result: Json, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
+    provenance: Sequence[Json], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
     part = diagnosis_part(result, sets, maps=maps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from itertools import groupby
 from typing import Any
 
@@ -12,12 +11,11 @@ import numpy as np
 from quadid.report.manoeuvres.plan import half_width
 from quadid.report.page import render
 from quadid.report.parts import axis, figure, rows_of, section, trace
+from quadid.types import Json
 from quadid.window import Window
 
-JsonDict = Mapping[str, Any]
 
-
-def excite_html(result: JsonDict, window: Window) -> str:
+def excite_html(result: Json, window: Window) -> str:
     """The page.
 
     Args:
@@ -58,7 +56,7 @@ def excite_html(result: JsonDict, window: Window) -> str:
     })  # fmt: skip
 
 
-def _limits(result: JsonDict) -> list[list[str]]:
+def _limits(result: Json) -> list[list[str]]:
     room, e, peak = result["room"], result["envelope"], result["peak"]
     return [
         [
@@ -76,7 +74,7 @@ def _amplitude(axis: str, value: float) -> str:
     return f"{100.0 * value:.0f} %" if axis == "throttle" else f"{math.degrees(value):.1f}°"
 
 
-def _bars(result: JsonDict) -> dict[str, Any]:
+def _bars(result: Json) -> dict[str, Any]:
     names = [p["name"] for p in result["parameters"]]
     data = [
         {"role": role, "name": label, "type": "bar", "x": names,

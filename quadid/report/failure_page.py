@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -12,9 +12,8 @@ from quadid.inspection import Inspection
 from quadid.report.figures import WHOLE_POINTS, thinned
 from quadid.report.parts import axis, rows_of, section, short
 from quadid.report.verdict import Verdict
+from quadid.types import Json
 from quadid.window import CHANNELS, Channel, Recording
-
-JsonDict = Mapping[str, Any]
 
 MOST_FIGURES = 30
 _WORDS = {"ok": "fine", "warning": "doubtful", "error": "wrong", "unknown": "not checked"}
@@ -22,7 +21,7 @@ _WORDS = {"ok": "fine", "warning": "doubtful", "error": "wrong", "unknown": "not
 
 def failure_page(
     what: str, why: str, fix: str, logs: Sequence[tuple[Recording, Inspection | None]],
-    provenance: Sequence[JsonDict], allowed: str = "",
+    provenance: Sequence[Json], allowed: str = "",
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page.
 

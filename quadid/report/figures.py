@@ -11,8 +11,8 @@ import numpy as np
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import SetScore
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.parts import JsonDict, axis, figure, short, trace, upright
-from quadid.types import FloatArray, IndexArray
+from quadid.report.parts import axis, figure, short, trace, upright
+from quadid.types import FloatArray, IndexArray, JsonDict
 
 GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
     "rates": ("Body rates", (0, 1, 2)),

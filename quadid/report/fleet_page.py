@@ -16,8 +16,7 @@ from quadid.report.page import number
 from quadid.report.page import unit as unit_text
 from quadid.report.parts import axis, figure, level, rows_of, section, trace
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 MOST_UNITS = 12
 """Vehicles in one figure."""
@@ -28,8 +27,8 @@ MOST_ROWS = 200
 
 
 def fleet_page(
-    summary: JsonDict, logs: Sequence[JsonDict], parameters: Sequence[JsonDict], provenance: Sequence[JsonDict],
-    title: str, health: Sequence[JsonDict] = (),
+    summary: Json, logs: Sequence[Json], parameters: Sequence[Json], provenance: Sequence[Json],
+    title: str, health: Sequence[Json] = (),
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page from `quadid.report.fleet_summary.summarise` and the rows it was made from.
 
@@ -47,7 +46,7 @@ def fleet_page(
     }  # fmt: skip
 
 
-def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict:
+def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
     counts = summary["counts"]
     total, done = sum(counts.values()), counts.get("done", 0)
@@ -89,7 +88,7 @@ def fleet_verdict(summary: JsonDict, health: Sequence[JsonDict] = ()) -> Verdict
     return Verdict(level, headline, tuple(details), tuple(steps))
 
 
-def _when(logs: Sequence[JsonDict]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _when(logs: Sequence[Json]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Where each log lies on an axis of time, and that axis.
 
     Dates of files are mostly those of a copy: then flights are counted, in the order of their dates and names.
@@ -106,12 +105,12 @@ def _when(logs: Sequence[JsonDict]) -> tuple[dict[str, Any], dict[str, Any]]:
     return places, {**axis("flight"), **whole}
 
 
-def _counted(time: JsonDict) -> str:
+def _counted(time: Json) -> str:
     """A sentence where flights are counted."""
     return "" if time.get("type") == "date" else " Flights are counted in the order of their files' dates."
 
 
-def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any] | None:
+def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None:
     """Score of every flight over time, and what changed."""
     judged = [row for row in rows if not row["baseline"]]
     if not judged:
@@ -145,11 +144,11 @@ def _health(rows: Sequence[JsonDict], logs: Sequence[JsonDict]) -> dict[str, Any
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
 
 
-def _what_changed(row: JsonDict) -> str:
+def _what_changed(row: Json) -> str:
     return "; ".join(map(change_words, row["changes"])) or "by nothing that has a name"
 
 
-def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict[str, Any] | None:
+def _over_time(logs: Sequence[Json], parameters: Sequence[Json]) -> dict[str, Any] | None:
     started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
     when = _when(logs)
     rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
@@ -163,7 +162,7 @@ def _over_time(logs: Sequence[JsonDict], parameters: Sequence[JsonDict]) -> dict
 
 
 def _one_figure(
-    name: str, rows: Sequence[JsonDict], started: Mapping[str, tuple[float, str]], places: JsonDict, time: JsonDict
+    name: str, rows: Sequence[Json], started: Mapping[str, tuple[float, str]], places: Json, time: Json
 ) -> dict[str, Any] | None:  # fmt: skip
     mine = sorted((p for p in rows if p["parameter"] == name), key=lambda p: started[p["log"]][0])
     units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
@@ -201,7 +200,7 @@ def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Se
     return section(identifier, title, f"{intro}{more}".strip(), tables=[rows_of(head, rows[:MOST_ROWS])])
 
 
-def _units(summary: JsonDict) -> Any:
+def _units(summary: Json) -> Any:
     rows = [
         (unit["unit"], f"{unit['done']} of {unit['logs']}", p["parameter"], number(p["median"]), unit_text(p["unit"]),
          percent(p["spread"]), str(p["flights"]))
@@ -212,7 +211,7 @@ def _units(summary: JsonDict) -> Any:
     return _section("vehicles", "Vehicles", head, rows, "Spread: robust standard deviation over the median.")
 
 
-def _drifts(summary: JsonDict) -> Any:
+def _drifts(summary: Json) -> Any:
     rows = [
         (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
          f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
@@ -224,7 +223,7 @@ def _drifts(summary: JsonDict) -> Any:
     return _section("drift", "Drift", head, rows, intro)
 
 
-def _outliers(summary: JsonDict) -> Any:
+def _outliers(summary: Json) -> Any:
     rows = [
         (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
          number(o["deviations"], 2))
@@ -234,7 +233,7 @@ def _outliers(summary: JsonDict) -> Any:
     return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
 
 
-def _common(summary: JsonDict) -> Any:
+def _common(summary: Json) -> Any:
     rows = [
         (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
          f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
@@ -245,7 +244,7 @@ def _common(summary: JsonDict) -> Any:
     return _section("common", "What the simulation gets wrong, flight after flight", head, rows)
 
 
-def _unusable(summary: JsonDict) -> Any:
+def _unusable(summary: Json) -> Any:
     rows = [
         (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
         for r in summary["reasons"]
@@ -253,7 +252,7 @@ def _unusable(summary: JsonDict) -> Any:
     return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)
 
 
-def _logs(logs: Sequence[JsonDict]) -> Any:
+def _logs(logs: Sequence[Json]) -> Any:
     """Every log with its error and where its date comes from, the worst error first."""
     worst = sorted(logs, key=lambda log: -(log["mse_fitted"] if log["mse_fitted"] is not None else math.inf))
     rows = [

@@ -12,8 +12,7 @@ from scipy import stats
 
 from quadid.chi_square import Z95
 from quadid.report.verdict import ROUGH
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 FEWEST_FOR_DRIFT = 5
 """Flights on different days or hours that a drift takes at least."""
@@ -25,7 +24,7 @@ FAR = 4.5
 DAY = 86_400.0
 
 
-def summarise(logs: Sequence[JsonDict], parameters: Sequence[JsonDict], findings: Sequence[JsonDict]) -> dict[str, Any]:
+def summarise(logs: Sequence[Json], parameters: Sequence[Json], findings: Sequence[Json]) -> dict[str, Any]:
     """Sums up a fleet.
 
     Args:
@@ -51,9 +50,9 @@ def summarise(logs: Sequence[JsonDict], parameters: Sequence[JsonDict], findings
     }
 
 
-def _series(by_name: Mapping[str, JsonDict], parameters: Sequence[JsonDict]) -> dict[tuple[str, str], list[JsonDict]]:
+def _series(by_name: Mapping[str, Json], parameters: Sequence[Json]) -> dict[tuple[str, str], list[Json]]:
     """Identified values by vehicle and parameter, in the order of time."""
-    out: dict[tuple[str, str], list[JsonDict]] = defaultdict(list)
+    out: dict[tuple[str, str], list[Json]] = defaultdict(list)
     for row in parameters:
         log = by_name.get(row["log"])
         known = row["status"] == "identified" and row["low"] is not None and row["high"] is not None
@@ -64,7 +63,7 @@ def _series(by_name: Mapping[str, JsonDict], parameters: Sequence[JsonDict]) -> 
     return dict(sorted(out.items()))
 
 
-def _units(logs: Sequence[JsonDict], series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str, Any]]:
+def _units(logs: Sequence[Json], series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
     out = []
     for unit in sorted({log["unit"] for log in logs}):
         mine = [log for log in logs if log["unit"] == unit]
@@ -78,14 +77,14 @@ def _units(logs: Sequence[JsonDict], series: Mapping[tuple[str, str], list[JsonD
     return out
 
 
-def _centre(rows: Sequence[JsonDict]) -> dict[str, float]:
+def _centre(rows: Sequence[Json]) -> dict[str, float]:
     values = np.array([r["value"] for r in rows])
     middle = float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - middle)))
     return {"median": middle, "spread": spread / abs(middle) if middle else math.nan}
 
 
-def _drifts(series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str, Any]]:
+def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
     """Parameters that rise or fall with time: Kendall's tau decides, Theil and Sen's slope says how fast."""
     fit_for = {
         key: rows for key, rows in series.items()
@@ -107,7 +106,7 @@ def _drifts(series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str, 
     return sorted(out, key=lambda d: -abs(d["change"]))
 
 
-def _outliers(series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str, Any]]:
+def _outliers(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
     """Flights far from the vehicle's median, measured by the vehicle's spread and the flight's own interval."""
     out = []
     for (unit, name), rows in series.items():
@@ -126,9 +125,9 @@ def _outliers(series: Mapping[tuple[str, str], list[JsonDict]]) -> list[dict[str
     return sorted(out, key=lambda o: -abs(o["deviations"]))
 
 
-def _common(by_name: Mapping[str, JsonDict], findings: Sequence[JsonDict]) -> list[dict[str, Any]]:
+def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[dict[str, Any]]:
     diagnosed: Counter[str] = Counter(log["unit"] for log in by_name.values() if log["verdict"] is not None)
-    seen: dict[tuple[str, str], dict[str, JsonDict]] = defaultdict(dict)
+    seen: dict[tuple[str, str], dict[str, Json]] = defaultdict(dict)
     for row in findings:
         log = by_name.get(row["log"])
         if log is not None and row["confident"]:
@@ -145,7 +144,7 @@ def _common(by_name: Mapping[str, JsonDict], findings: Sequence[JsonDict]) -> li
     return sorted(out, key=lambda c: (-c["flights"], c["unit"], c["effect"]))
 
 
-def _reasons(logs: Sequence[JsonDict]) -> list[dict[str, Any]]:
+def _reasons(logs: Sequence[Json]) -> list[dict[str, Any]]:
     """Logs without a result by what kept them from one, most frequent first."""
     grouped: dict[tuple[str, str], list[str]] = defaultdict(list)
     for log in logs:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from quadid.health.comparison import LEAST_CHANCE
@@ -10,8 +10,7 @@ from quadid.report.airframe_picture import change_value
 from quadid.report.parts import axis, figure, rows_of, section
 from quadid.report.text_table import Cell, Column, TextTable
 from quadid.report.verdict import Level, Verdict
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 _LEVELS: dict[str, Level] = {"unchanged": "good", "changed": "poor", "unknown": "poor"}
 _WORDS = {
@@ -31,7 +30,7 @@ _STEPS = {
 }
 
 
-def change_words(change: JsonDict) -> str:
+def change_words(change: Json) -> str:
     """A change in a few words: ``rotor 3: 21 % less thrust``."""
     effect = change["effect"]
     if effect == "weak_rotor":
@@ -46,14 +45,14 @@ def change_words(change: JsonDict) -> str:
     )
 
 
-def rival_words(rival: JsonDict) -> str:
+def rival_words(rival: Json) -> str:
     """An explanation that lost, with its probability: ``rotor 3 and 4 (0.08)``."""
     names = " and ".join(_WORDS[effect] for effect in (rival["effect"], *rival.get("with", ())))
     rotors = " and ".join(map(str, rival.get("rotors", ())))
     return f"{names} {rotors}".rstrip() + f" ({rival['probability']:.2f})"
 
 
-def health_verdict(result: JsonDict) -> Verdict:
+def health_verdict(result: Json) -> Verdict:
     """Judges a result of the form ``quadid.health/1``."""
     verdict, changes = result["verdict"], result["changes"]
     n = len(result["baseline"])
@@ -85,12 +84,12 @@ def _chance(p_value: float) -> str:
     return f"below {3.0 * LEAST_CHANCE:.1g}" if p_value <= LEAST_CHANCE else f"{p_value:.2g}"
 
 
-def _step(change: JsonDict) -> str:
+def _step(change: Json) -> str:
     text = _STEPS[change["effect"]]
     return text.format(rotor=f"{change_value(change, 'rotor'):.0f}") if "{rotor}" in text else text
 
 
-def change_table(changes: Sequence[JsonDict]) -> TextTable:
+def change_table(changes: Sequence[Json]) -> TextTable:
     """What changed, with intervals and the explanations that lost."""
     columns = (
         Column("change"), Column("value"), Column("95 % interval"), Column("p", right=True, rank=1),
@@ -114,7 +113,7 @@ def change_table(changes: Sequence[JsonDict]) -> TextTable:
     return TextTable("What changed since the baseline flights", columns, tuple(rows))
 
 
-def trim_table(result: JsonDict) -> TextTable:
+def trim_table(result: Json) -> TextTable:
     """Each trim of the flights in question against the baseline."""
     columns = (
         Column("trim"), Column("now", right=True), Column("baseline", right=True), Column("spread", right=True, rank=1),
@@ -135,9 +134,7 @@ def trim_table(result: JsonDict) -> TextTable:
     return TextTable(title, columns, rows)
 
 
-def health_page(
-    result: JsonDict, picture: str, provenance: Sequence[JsonDict], history: Sequence[JsonDict] = ()
-) -> dict[str, Any]:
+def health_page(result: Json, picture: str, provenance: Sequence[Json], history: Sequence[Json] = ()) -> dict[str, Any]:
     """Builds the page.
 
     Args:
@@ -175,11 +172,11 @@ def health_page(
     }  # fmt: skip
 
 
-def _rivals(change: JsonDict) -> str:
+def _rivals(change: Json) -> str:
     return ", ".join(map(rival_words, change["alternatives"])) or "none"
 
 
-def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequence[str]) -> JsonDict:
+def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequence[str]) -> Json:
     """Every flight's trims in healthy spreads from the baseline's mean.
 
     Args:

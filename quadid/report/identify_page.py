@@ -16,14 +16,14 @@ from quadid.report.figures import MOST_LOGS, channel_figures, error_figure, para
 from quadid.report.parts import rows_of, section
 from quadid.report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth
 from quadid.report.words import parameter_name, status_words
+from quadid.types import Json
 
-JsonDict = Mapping[str, Any]
 FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
 
 
 def identify_page(
-    result: JsonDict, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[JsonDict],
-    provenance: Sequence[JsonDict], truth: Mapping[str, float] | None = None,
+    result: Json, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
+    provenance: Sequence[Json], truth: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page of an identification.
 
@@ -50,7 +50,7 @@ def identify_page(
     }
 
 
-def _subtitle(result: JsonDict) -> str:
+def _subtitle(result: Json) -> str:
     roles = [s["role"] for s in result["sets"]]
     fitted, held = roles.count("train"), roles.count("validate")
     text = f"{fitted} log{'s' * (fitted != 1)} fitted, {held or 'none'} held out for validation"
@@ -58,7 +58,7 @@ def _subtitle(result: JsonDict) -> str:
 
 
 def parameter_row(
-    parameter: JsonDict, truth: Mapping[str, float] | None = None, stuck: Sequence[str] = ()
+    parameter: Json, truth: Mapping[str, float] | None = None, stuck: Sequence[str] = ()
 ) -> dict[str, Any]:
     """A parameter with its margin, its reason, and the truth where known."""
     row = {
@@ -74,7 +74,7 @@ def parameter_row(
     return row
 
 
-def set_sections(entries: Sequence[JsonDict], sets: Sequence[ScoredSet]) -> list[dict[str, Any]]:
+def set_sections(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[dict[str, Any]]:
     """The logs of a result with their figures; the first few logs only get figures."""
     out, shown = [], min(len(sets), MOST_LOGS)
     for i, (entry, scored) in enumerate(zip(entries, sets, strict=True)):

@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from quadid.report.verdict import digits
+from quadid.types import Json
 
-JsonDict = Mapping[str, Any]
 
-
-def render(page: JsonDict) -> str:
+def render(page: Json) -> str:
     """Returns the HTML of a page.
 
     Args:
@@ -56,7 +55,7 @@ _EMPTY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def all_figures(page: JsonDict) -> dict[str, Any]:
+def all_figures(page: Json) -> dict[str, Any]:
     """Every figure of the page by its identifier."""
     found = [page.get("parameter_figure")]
     parts = [*page.get("sets", ()), *page.get("sections", ())]

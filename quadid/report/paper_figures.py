@@ -11,12 +11,11 @@ import numpy as np
 from quadid.identify.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
 from quadid.report.figures import LABELS, liveliest
 from quadid.report.parts import axis, trace
-from quadid.types import FloatArray
+from quadid.types import FloatArray, JsonDict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-JsonDict = dict[str, Any]
 
 GROUPS: dict[str, tuple[str, slice]] = {
     "angles": ("Euler angles", slice(0, 3)),

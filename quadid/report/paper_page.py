@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from quadid.report.paper_figures import FIGURES
 from quadid.report.paper_tables import all_tables, markdown
 from quadid.report.parts import rows_of, section
 from quadid.report.words import effects_words
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 TITLE = "The paper, reproduced"
 SHOWN = ("Table", "What the nominal model lacks")
@@ -20,7 +19,7 @@ SOURCE = (
 )
 
 
-def notes(result: JsonDict) -> dict[str, list[str]]:
+def notes(result: Json) -> dict[str, list[str]]:
     """Sentences for each table, by its title."""
     said = {
         "Table 1": _about_table_1(result),
@@ -31,7 +30,7 @@ def notes(result: JsonDict) -> dict[str, list[str]]:
     return {t.title: next((v for k, v in said.items() if t.title.startswith(k)), []) for t in all_tables(result)}
 
 
-def _about_table_1(result: JsonDict) -> list[str]:
+def _about_table_1(result: Json) -> list[str]:
     mse = result["mse_paper"]
     swarm = mse["pso"][0] / mse["quasi_newton"][0] - 1.0
     return [
@@ -46,7 +45,7 @@ def _about_table_1(result: JsonDict) -> list[str]:
     ]
 
 
-def _about_the_rest(result: JsonDict) -> list[str]:
+def _about_the_rest(result: Json) -> list[str]:
     mse = result["mse_paper"]
     return [
         "*True parameters*: the nominal model with the true values; its error on set 1 is "
@@ -57,7 +56,7 @@ def _about_the_rest(result: JsonDict) -> list[str]:
     ]
 
 
-def _about_prediction(result: JsonDict) -> list[str]:
+def _about_prediction(result: Json) -> list[str]:
     orders, mse = result["orders"], result["mse"]
     return [
         f"Prediction over 1 s on set 2 (1 = noise floor): quasi-Newton {mse['quasi_newton'][1]:.4g}, quadid nominal "
@@ -66,7 +65,7 @@ def _about_prediction(result: JsonDict) -> list[str]:
     ]
 
 
-def _about_parameters(result: JsonDict) -> list[str]:
+def _about_parameters(result: Json) -> list[str]:
     rows = result["parameters"].values()
     inside, wrong = (sum(p[key][0] <= p["truth"] <= p[key][1] for p in rows) for key in ("extended_ci95", "ci95"))
     return [
@@ -76,7 +75,7 @@ def _about_parameters(result: JsonDict) -> list[str]:
     ]
 
 
-def paper_markdown(result: JsonDict, figures: str) -> str:
+def paper_markdown(result: Json, figures: str) -> str:
     """The page as Markdown.
 
     Args:
@@ -104,7 +103,7 @@ def paper_markdown(result: JsonDict, figures: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def paper_sections(result: JsonDict, figures: Sequence[JsonDict]) -> dict[str, Any]:
+def paper_sections(result: Json, figures: Sequence[Json]) -> dict[str, Any]:
     """The page for `render`: tables, then interactive figures."""
     said = notes(result)
     sections = [

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
-
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 PAPER_MSE: dict[str, tuple[float, float, float]] = {
     "initial": (14.64, 16.81, 18.93),
@@ -56,7 +55,7 @@ def set_name(i: int) -> str:
     return f"set {i + 1} ({'training' if i == 0 else 'validation'})"
 
 
-def table_1(result: JsonDict) -> Table:
+def table_1(result: Json) -> Table:
     """The paper's Table 1 with our numbers beside it."""
     mse = result["mse_paper"]
     head = ["set (paper, here)", *(COLUMN_NAMES[n] for n in PAPER_MSE)]
@@ -72,14 +71,14 @@ def table_1(result: JsonDict) -> Table:
     return Table("Table 1: mean squared error of the closed-loop simulation", head, rows)
 
 
-def table_1_more(result: JsonDict) -> Table:
+def table_1_more(result: Json) -> Table:
     """The same error of models the paper does not have."""
     names = ("quasi_newton", "pso", "pso_polish", "identified", "true_nominal", "extended", "perfect")
     rows = [[set_name(i), *(text(result["mse_paper"][n][i]) for n in names)] for i in range(3)]
     return Table("Remaining error", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
 
 
-def table_segments(result: JsonDict) -> Table:
+def table_segments(result: Json) -> Table:
     """Prediction over 1 s in units of the noise, subspace models too."""
     names = (
         "initial", "quasi_newton", "pso", "pso_polish", "identified", "cva", "moesp", "extended", "perfect",
@@ -88,7 +87,7 @@ def table_segments(result: JsonDict) -> Table:
     return Table("Prediction over 1 s (1 = noise floor)", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
 
 
-def table_2(result: JsonDict) -> Table:
+def table_2(result: Json) -> Table:
     """The paper's Table 2, with what it lacks: the truth, intervals, status, spread over seeds."""
     head = [
         "parameter", "unit", "paper", "true here", "initial", "quasi-Newton", "PSO: median (range) of seeds",
@@ -111,7 +110,7 @@ def _interval(pair: Sequence[float]) -> str:
     return f"{text(pair[0])} … {text(pair[1])}"
 
 
-def table_correlations(result: JsonDict) -> Table:
+def table_correlations(result: Json) -> Table:
     """Correlation of the estimates: what the data can only tell together."""
     rows = [
         [name, *(f"{value:+.2f}" for value in row)]
@@ -120,7 +119,7 @@ def table_correlations(result: JsonDict) -> Table:
     return Table("Correlation of the estimates (nominal model, set 1)", ["", *NOMINAL_NAMES], rows)
 
 
-def table_findings(result: JsonDict) -> Table:
+def table_findings(result: Json) -> Table:
     """What the diagnosis found, beside what was flown."""
     rows = []
     for finding in result["findings"]:
@@ -134,7 +133,7 @@ def table_findings(result: JsonDict) -> Table:
     return Table("What the nominal model lacks (error on sets 2 and 3, 1 = noise floor)", head, rows)
 
 
-def all_tables(result: JsonDict) -> list[Table]:
+def all_tables(result: Json) -> list[Table]:
     """Every table in the order of the page."""
     makers = (table_1, table_1_more, table_segments, table_2, table_findings, table_correlations)
     return [maker(result) for maker in makers]

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.types import FloatArray
-
-JsonDict = dict[str, Any]
+from quadid.types import FloatArray, JsonDict
 
 
 def section(

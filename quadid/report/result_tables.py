@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from quadid.report.text_table import Cell, Column, TextTable, Tone
 from quadid.report.verdict import digits, percent, relative_halfwidth
 from quadid.report.words import parameter_name, status_words
+from quadid.types import Json
 
-JsonDict = Mapping[str, Any]
 _TONES: dict[str, Tone] = {"identified": "good", "ratio_only": "fair", "prior_dominated": "poor", "unreliable": "poor"}
 _RATES = ("p", "q", "r", "a_z")
 
@@ -20,7 +19,7 @@ def number(value: float | None, digits: int = 4) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
 
 
-def parameter_table(parameters: Sequence[JsonDict], truth: Mapping[str, float] | None = None) -> TextTable:
+def parameter_table(parameters: Sequence[Json], truth: Mapping[str, float] | None = None) -> TextTable:
     """Current and fitted values with intervals and status; the truth where a simulation knows it.
 
     Args:
@@ -47,7 +46,7 @@ def parameter_table(parameters: Sequence[JsonDict], truth: Mapping[str, float] |
     return TextTable("Parameters (± and interval: 95 %)", tuple(columns), tuple(rows))
 
 
-def set_table(sets: Sequence[JsonDict]) -> TextTable:
+def set_table(sets: Sequence[Json]) -> TextTable:
     """How well the simulation follows each log, with current and with fitted parameters."""
     columns = (
         Column("log"), Column("role"), Column("current", right=True), Column("fitted", right=True),
@@ -68,7 +67,7 @@ def set_table(sets: Sequence[JsonDict]) -> TextTable:
     return TextTable("Error over 1 s of simulation, in noise variances (1 = noise floor)", columns, tuple(rows))
 
 
-def horizon_table(result: JsonDict) -> TextTable:
+def horizon_table(result: Json) -> TextTable:
     """Open-loop prediction errors, pooled and for each file.
 
     Args:
@@ -103,7 +102,7 @@ def _error(value: float | None) -> str:
     return "ran away" if value == math.inf else number(value)
 
 
-def finding_table(findings: Sequence[JsonDict]) -> TextTable:
+def finding_table(findings: Sequence[Json]) -> TextTable:
     """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
     columns = (
         Column("cause"), Column("value"), Column("without", right=True), Column("with", right=True),
@@ -115,7 +114,7 @@ def finding_table(findings: Sequence[JsonDict]) -> TextTable:
     return TextTable(title, columns, tuple(rows))
 
 
-def _finding_rows(finding: JsonDict) -> list[tuple[str | Cell, ...]]:
+def _finding_rows(finding: Json) -> list[tuple[str | Cell, ...]]:
     rival = min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
     gain = finding["gain"]
     first: list[str | Cell] = [
@@ -131,7 +130,7 @@ def _finding_rows(finding: JsonDict) -> list[tuple[str | Cell, ...]]:
     return rows
 
 
-def _finding_value(p: JsonDict, before: str | Cell, after: str | Cell) -> tuple[str | Cell, ...]:
+def _finding_value(p: Json, before: str | Cell, after: str | Cell) -> tuple[str | Cell, ...]:
     low, high = p["ci95"] or (None, None)
     if p["name"] == "rotor":
         return f"rotor {p['value']:.0f}", before, after, ""

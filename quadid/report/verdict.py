@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from quadid.report.words import decided_before
+from quadid.types import Json
 
-JsonDict = Mapping[str, Any]
 Level = Literal["good", "fair", "poor"]
 
 NOISE_LEVEL = 1.3
@@ -56,7 +56,7 @@ class Verdict:
         return [self.headline, *self.details, *(f"Next: {step}" for step in self.next_steps)]
 
 
-def identify_verdict(result: JsonDict) -> Verdict:
+def identify_verdict(result: Json) -> Verdict:
     """Judges the result of ``quadid identify``.
 
     Green needs all parameters identified, errors at the noise floor, and `LEAST_SECONDS` of flight that was not fitted.
@@ -91,7 +91,7 @@ def identify_verdict(result: JsonDict) -> Verdict:
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
 
 
-def _lacking(sets: Sequence[JsonDict]) -> tuple[str, ...]:
+def _lacking(sets: Sequence[Json]) -> tuple[str, ...]:
     """What keeps a result from being proven."""
     unseen, seen = (
         [_number(s.get("seconds", LEAST_SECONDS)) for s in sets if s["role"] == role] for role in ("validate", "train")
@@ -105,7 +105,7 @@ def _lacking(sets: Sequence[JsonDict]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def score_verdict(result: JsonDict) -> Verdict:
+def score_verdict(result: Json) -> Verdict:
     """Judges the result of ``quadid score`` by its longest horizon.
 
     Args:
@@ -149,7 +149,7 @@ def _count(known: int, total: int) -> str:
     return f"{known} of {total} parameters" if known else f"None of {total} parameters"
 
 
-def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str, ...]:
+def _details(known: Sequence[Json], judged: Sequence[Json]) -> tuple[str, ...]:
     out = []
     if known:
         widest = max(known, key=relative_halfwidth)
@@ -165,13 +165,13 @@ def _details(known: Sequence[JsonDict], judged: Sequence[JsonDict]) -> tuple[str
     return tuple(out)
 
 
-def at_bounds(result: JsonDict) -> list[str]:
+def at_bounds(result: Json) -> list[str]:
     """Names of the parameters that a fit left on a bound, as its warnings tell."""
     names = [p["name"] for p in result["parameters"]]
     return [n for n in names if any(w.startswith(f"{n} = ") and "rests on its bound" in w for w in result["warnings"])]
 
 
-def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
+def _next_steps(result: Json, open_ones: Sequence[Json], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
     out = []
     rough = not ratio <= ROUGH
     if rough:
@@ -199,7 +199,7 @@ def _next_steps(result: JsonDict, open_ones: Sequence[JsonDict], stuck: Sequence
     return tuple(dict.fromkeys(out))
 
 
-def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
+def reason(parameter: Json, stuck: Sequence[str] = ()) -> str:
     """Says in one sentence what the data say about a parameter; `stuck` as of `at_bounds`."""
     name, status = parameter["name"], parameter["status"]
     if name in stuck:
@@ -224,7 +224,7 @@ def reason(parameter: JsonDict, stuck: Sequence[str] = ()) -> str:
     return f"Known to {percent(relative_halfwidth(parameter))}; {moved} by {percent(abs(change))}."
 
 
-def relative_halfwidth(parameter: JsonDict) -> float:
+def relative_halfwidth(parameter: Json) -> float:
     """Half of the 95 % interval relative to the value; infinite without an interval."""
     low, high = (_number(v) for v in parameter["ci95"])
     value = _number(parameter["value"])
@@ -242,7 +242,7 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
 
 
-def _within(parameter: JsonDict) -> bool:
+def _within(parameter: Json) -> bool:
     low, high = (_number(v) for v in parameter["ci95"])
     return low <= _number(parameter["initial"]) <= high
 
@@ -251,7 +251,7 @@ def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def digits(parameter: JsonDict) -> int:
+def digits(parameter: Json) -> int:
     """Digits that value and interval of a parameter need for two digits of the interval's half; from 4 to 9."""
     low, high = (_number(v) for v in parameter["ci95"])
     half, size = 0.5 * (high - low), abs(_number(parameter["value"]))

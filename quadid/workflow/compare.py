@@ -6,9 +6,10 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from quadid.errors import ParameterError, nearest
+from quadid.types import JsonDict
 from quadid.workflow.logs import Given, settled
 from quadid.workflow.progress import Advance, silent
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
     from quadid.window import Window
 
-JsonDict = dict[str, Any]
 OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-JsonDict = Mapping[str, Any]
+from quadid.types import Json
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,9 @@ class Plan:
 
     vehicle: str
     seconds: float
-    segments: Sequence[JsonDict]
-    sweeps: Sequence[JsonDict]
-    envelope: JsonDict
+    segments: Sequence[Json]
+    sweeps: Sequence[Json]
+    envelope: Json
     promise: Mapping[str, float]
     promise_sweeps: Mapping[str, float]
 

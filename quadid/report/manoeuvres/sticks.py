@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from itertools import groupby
 
-from quadid.report.manoeuvres.plan import JsonDict, Plan
+from quadid.report.manoeuvres.plan import Plan
+from quadid.types import Json
 
 PEAK = math.sqrt(2.0)
 """Of a swing over its rms."""
@@ -34,7 +35,7 @@ def _counted(texts: list[str]) -> list[tuple[str, int]]:
     return [(text, len(list(same))) for text, same in groupby(texts)]
 
 
-def _block(block: list[JsonDict]) -> str:
+def _block(block: list[Json]) -> str:
     first = block[0]
     moves = ", ".join(_move(s) for s in block)
     return (
@@ -43,7 +44,7 @@ def _block(block: list[JsonDict]) -> str:
     )
 
 
-def _move(segment: JsonDict) -> str:
+def _move(segment: Json) -> str:
     size = PEAK * float(segment["amplitude"])
     if segment["axis"] == "throttle":
         return f"throttle {100.0 * size:.0f} % about hover"
