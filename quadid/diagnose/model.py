@@ -49,11 +49,6 @@ class Model(Polished):
         """Independent residuals."""
         return self.lin.total_rows
 
-    @property
-    def reduced_chi_square(self) -> float:
-        """Deviance per independent residual; 1 at the noise floor."""
-        return self.lin.reduced_chi_square
-
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""

@@ -108,7 +108,7 @@ def diagnose(
     ]  # fmt: skip
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     prediction = None
-    if predict and model.reduced_chi_square > POOR:
+    if predict and model.lin.reduced_chi_square > POOR:
         report("prediction", 0.0)
         try:
             prediction = learn_prediction(windows, physical, validation)
@@ -215,11 +215,11 @@ def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
 def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[list[Shooting], Search]:
     """Selects causes, and again when they show the noise to be less; with the schedule under the noise that is left."""
     schedule, search = begun.schedule, select(begun.schedule, begun.nominal, begun.listed, report)
-    if search.model.reduced_chi_square > LINEAR_MISFIT:
+    if search.model.lin.reduced_chi_square > LINEAR_MISFIT:
         # One by one led nowhere; from everything at once it may.
         general = from_everything(schedule[-1], begun.flexible, begun.listed)
         other = select(schedule, begun.nominal, begun.listed, report, general)
-        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.reduced_chi_square))
+        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.lin.reduced_chi_square))
     while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance

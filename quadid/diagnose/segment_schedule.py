@@ -53,7 +53,7 @@ class Stage:
     @property
     def follows(self) -> bool:
         """Whether segments are not too long for the model to decide on them."""
-        return self.model.reduced_chi_square < (CLEAN_MISFIT if is_long(self.shooting) else LINEAR_MISFIT)
+        return self.model.lin.reduced_chi_square < (CLEAN_MISFIT if is_long(self.shooting) else LINEAR_MISFIT)
 
     def at(self, rung: int) -> Stage:
         """On another rung, the model refitted there."""

@@ -32,7 +32,7 @@ def begun(problem: Problem) -> Stage:
 def test_a_model_that_follows_decides_on_segments_of_usual_length() -> None:
     stage = begun(clean())
     assert stage.shooting.seconds == USUAL_SECONDS
-    assert stage.model.reduced_chi_square < CLEAN_MISFIT
+    assert stage.model.lin.reduced_chi_square < CLEAN_MISFIT
     assert stage.continued() is stage, "there is nowhere to go"
 
 
@@ -43,7 +43,7 @@ def test_one_that_does_not_begins_on_shorter_ones_and_the_true_cause_leads_back(
     named = extend(stage.shooting, stage.model, cause(late(), "motor_lag"), iterations=12)
     again = Stage(stage.schedule, stage.rung, named).continued()
     assert again.shooting.seconds == USUAL_SECONDS
-    assert again.model.reduced_chi_square < LINEAR_MISFIT
+    assert again.model.lin.reduced_chi_square < LINEAR_MISFIT
     assert [c.label for c in again.model.causes] == ["motor_lag"]
 
 
@@ -55,7 +55,7 @@ def test_where_airspeed_must_be_found_the_longest_segments_that_are_followed_dec
     assert named.finds_velocity
     longest = Stage(stage.schedule, stage.rung, named).continued()
     assert longest.shooting.seconds == SECONDS[0]
-    assert longest.model.reduced_chi_square < CLEAN_MISFIT
+    assert longest.model.lin.reduced_chi_square < CLEAN_MISFIT
 
 
 @pytest.mark.parametrize(("problem", "there"), [(clean, True), (late, False)])
