@@ -49,12 +49,13 @@ class MavlinkDecoder:
         self._row: list[float] = []
         self._row_time = math.nan
 
-    def samples(self, message: Any, received: float) -> Iterator[Sample]:
+    def samples(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Sample]:
         """Yields the samples that may be used now.
 
         Args:
             message: decoded message of the vehicle.
-            received: when it came [s, any clock that runs on].
+            received: when it was read [s, any clock that runs on].
+            earliest: it came after this [s, same clock]; default: when it was read.
         """
         name = message.get_type()
         self.counts[name] += 1
@@ -68,7 +69,8 @@ class MavlinkDecoder:
             return
         clock = self._boot_clock
         boot = boot_stamp(float(boot_seconds(message)), name == "SERVO_OUTPUT_RAW", clock.newest)
-        placed = clock.unstamped(readings, received) if boot is None else clock.stamped(readings, boot, received)
+        came = received if earliest is None else earliest
+        placed = clock.unstamped(readings, came) if boot is None else clock.stamped(readings, boot, received)
         for waited, t in placed:
             if t is not None:
                 for reading in waited:

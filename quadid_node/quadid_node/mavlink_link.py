@@ -96,7 +96,7 @@ class MavlinkLink:
         self._only, self._target = system, 0
         self._beat, self._tell, self._listed, self._measured = -1e9, -1e9, -1e9, clock()
         self._list_due = False
-        self._begin = clock()
+        self._begin = self._empty = clock()
         self._before: dict[str, int] = {}
         self._rates: dict[str, float] = {}
         self._requests = Requests()
@@ -108,12 +108,12 @@ class MavlinkLink:
 
     def receive(self) -> Iterator[Sample]:
         """Yields the samples that have arrived; answers what was asked of us."""
-        now = self._clock()
+        now = last = self._clock()
         if int(now) != self._budget_second:
             self._budget_second, self._budget = int(now), FRAMES_A_SECOND
         for message in self._wire.receive(_WANTED, self._budget, None if self._key else self._count):
             self._budget -= 1
-            kind = message.get_type()
+            last, kind = self._clock(), message.get_type()
             if self._is_vehicle(message) and not self._source.take(self._wire.source, now):
                 continue
             if kind == "HEARTBEAT":
@@ -123,7 +123,9 @@ class MavlinkLink:
             elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"):
                 self._on_parameter(kind, message)
             elif self._is_vehicle(message):
-                yield from self._decoder.samples(message, now)
+                yield from self._decoder.samples(message, last, self._empty)
+        if self._wire.drained:
+            self._empty = last
 
     def _count(self, frame: bytes) -> None:
         """Without a key every frame of the vehicle's ids is looked at: two senders have two rows of numbers."""

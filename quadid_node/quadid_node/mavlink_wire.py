@@ -162,6 +162,7 @@ class Wire:
         dropped: bytes dropped unread because too many came.
         source: of the frame yielded last: UDP address, None on other links.
         signed: whether a signed frame came, believed or not.
+        drained: whether nothing was left unread when messages were looked for last.
     """
 
     def __init__(
@@ -203,6 +204,7 @@ class Wire:
         self.source: Any = None
         self.peers = Peers()
         self.signed = False
+        self.drained = True
 
     @property
     def memory_problem(self) -> str:
@@ -219,10 +221,11 @@ class Wire:
             most: frames to decode at most; what comes beyond is read and dropped.
             count: gets every frame, whether wanted and believable or not.
         """
-        decoded = 0
+        decoded, self.drained = 0, False
         for _ in range(READS_AT_ONCE):
             data = self._read()
             if not data:
+                self.drained = True
                 break
             if decoded >= most:
                 self.dropped += len(data)

@@ -2,8 +2,9 @@
 
 An autopilot writes its messages in order, so a message without a stamp was written between the stamped ones before and
 after it.  The link only shows how long after the earlier one it came; nothing older than that one counts, so neither a
-slow drift of the receiver's clock nor a simulation that runs faster than time moves it.  Messages of one moment come
-one after the other, and a slow or shared link draws them out: each of them shows how late the link is by then.
+slow drift of the receiver's clock nor a simulation that runs faster than time moves it.  Who reads late knows only
+after when a message came, and that counts: no lag of his moves it into the next round.  Messages of one moment come one
+after the other, and a slow or shared link draws them out: each of them shows how late the link is by then.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class BootClock(Generic[T]):
         Args:
             item: the message.
             time: its stamp [s], unwrapped.
-            received: when it came [s], on any clock.
+            received: when it came at the latest [s], on any clock.
         """
         if self.newest is not None and self.newest - FARTHEST <= time <= self.newest:
             if time >= self.newest - MOMENT:
@@ -54,7 +55,7 @@ class BootClock(Generic[T]):
         return [*placed, Placed(item, time)]
 
     def unstamped(self, item: T, received: float) -> list[Placed[T]]:
-        """Takes a message without a stamp; returns messages that have waited too long for a stamped one."""
+        """Takes a message without a stamp, which came after `received` [s]; returns those that waited too long."""
         early = self._release(None) if len(self._waiting) >= MOST_WAITING else []
         self._waiting.append((item, max(0.0, received - self._newest_received)))
         return early
