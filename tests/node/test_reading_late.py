@@ -47,7 +47,7 @@ def test_a_flight_whose_bytes_are_read_late_keeps_its_rounds(every: float, data_
     came = frames.received - frames.received[0]
     decoder, coder, times = MavlinkDecoder(4, wall=lambda: 0.0), dialect.MAVLink(None), []
     decoder.order.ardupilot = True
-    for k in np.flatnonzero((came > 50.0) & (came < 60.0) & (frames.system == 1)):
+    for k in np.flatnonzero((came > 50.0) & (came < 60.0) & (frames.system == 1)).tolist():
         message, read = coder.decode(bytearray(frames.frame(k))), every * np.ceil(came[k] / every)
         times += [s.t for s in decoder.samples(message, read, read - every) if s.channel == "rotor_speed"]
     assert len(times) > 490
