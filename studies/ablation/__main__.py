@@ -22,11 +22,9 @@ from studies.ablation.variants import Variant, variants
 
 REMOVED = Path(__file__).with_name("removed.md")
 """What went because of such runs, in words."""
-SHOWN = 1
-"""Answers that one cell of the table tells."""
-IDLE = re.compile(r"\| [^|]+ \|( (– )? ?\|){3}")
+IDLE = re.compile(r"\* [^:]+: ")
 """A row in which nothing changes."""
-NAMES = re.compile(r"\*\*\+|: [−+]\w|: first |confident →")
+NAMES = re.compile(r"\*\*[−+]|: [−+]\w|: first |confident →")
 """What a row has in which a name or a verdict changes."""
 
 
@@ -37,13 +35,14 @@ def told(answer: Answer) -> None:
 
 
 def row(subject: str, chosen: Sequence[Variant], answers: Mapping[str, Sequence[Answer]]) -> str:
-    """One line of the table: what changes under each change of one rule or number."""
+    """One line of the page: what changes under each change of one rule or number."""
     base = answers["base"]
     cells = {}
     for variant in (v for v in chosen if v.subject == subject):
         how = variant.name.removeprefix(subject).strip().removeprefix("without " + subject) or "out"
         cells[how] = _cell(base, answers[variant.name])
-    return f"| {subject} | {' | '.join(cells.get(how, '') for how in ('out', '× 0.5', '× 2'))} |"
+    scaled = [f"{how}: {cells[how]}" for how in ("× 0.5", "× 2") if cells.get(how)]
+    return f"* {subject}: {'; '.join([cells['out'], *scaled] if cells.get('out') else scaled)}"
 
 
 def _cell(base: Sequence[Answer], answers: Sequence[Answer]) -> str:
@@ -53,11 +52,12 @@ def _cell(base: Sequence[Answer], answers: Sequence[Answer]) -> str:
     better = sum(a.right is True and b.right is False for b, a in pairs)
     worse = sum(a.right is False and b.right is True for b, a in pairs)
     fits = sum(a.fits for a in answers) / max(sum(b.fits for b in base), 1)
-    told = [f"**+{better} −{worse}**"] if better or worse else []
-    told += [f"{b.flight}: {b.difference(a)}" for b, a in sorted(pairs, key=_weight)[:SHOWN]]
-    told += [f"and {len(pairs) - SHOWN} more"] if len(pairs) > SHOWN else []
-    told += [f"fits × {fits:.2f}"] if abs(fits - 1.0) > 0.03 else []
-    return "; ".join(told) or "–"
+    signed = " ".join(f"{sign}{n}" for sign, n in (("+", better), ("−", worse)) if n)
+    told = [f"**{signed}**"] if signed else []
+    for b, a in sorted(pairs, key=_weight)[:1]:
+        told.append(f"{b.flight}{f' (of {len(pairs)})' if len(pairs) > 1 else ''}: {b.difference(a)}")
+    told += [f"fits ×{fits:.2f}"] if abs(fits - 1.0) > 0.03 else []
+    return "; ".join(told)
 
 
 def _weight(pair: tuple[Answer, Answer]) -> tuple[bool, bool]:
@@ -97,7 +97,7 @@ def main() -> None:
 
 def _sorted(rows: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
     """Subjects of rows in which nothing changes, of rows without another name or verdict, and the other rows."""
-    subject = {row: row.split(" | ")[0].removeprefix("| ") for row in rows}
+    subject = {row: row.split(": ")[0].removeprefix("* ") for row in rows}
     moving = [row for row in rows if not IDLE.fullmatch(row)]
     telling = [row for row in moving if NAMES.search(row)]
     slight = [subject[row] for row in moving if row not in telling]
@@ -105,17 +105,18 @@ def _sorted(rows: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
 
 
 def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespace) -> str:
-    """The result page: rows that change something as a table, the others by name."""
-    default = options.flights == ",".join(FLIGHTS)
-    command = "make ablation" if default else f"python -m studies.ablation --flights '{options.flights}'"
-    command += f" --only '{options.only}'" if options.only else ""
+    """The result page: rows that change something, the others by name."""
+    left_out = [name for name in FLIGHTS if name not in options.flights.split(",")]
+    missing = f" without {', '.join(left_out)}" if left_out else ""
+    missing += f" --only '{options.only}'" if options.only else ""
     sizes = str(measured()).splitlines()[:3]
     right = [a for a in base if a.right is not None]
     idle, slight, telling = _sorted(rows)
+    scaled = len({a.flight for a in base} & set(SCALED))
     return (
         f"""# Diagnosis: ablation of rules and constants
 
-{len(base)} flights, {datetime.date.today().isoformat()}, `{command}`
+{len(base)} flights, {datetime.date.today().isoformat()}, `make ablation`{missing}
 
 The number of a campaign case is its seed. Unchanged, the diagnosis is right on
 {sum(bool(a.right) for a in right)} of the {len(right)} with known answer; of recorded flights
@@ -130,10 +131,10 @@ No change of: {", ".join(idle)}.
 Only errors, intervals or effort change (more than 3 % of linearisations): {", ".join(slight)}.
 
 +n −n: cases that become right or wrong; one difference is quoted: causes (− no longer, + newly listed), verdict, error
-on unseen data (> 1 %). Fits: linearisations (> 3 %); –: no change. Halves and doubles: {len(SCALED)} flights.
+on unseen data (> 1 %). Fits: linearisations (> 3 %). Halves and doubles: {scaled} flights.
 
-| changed | without | × 0.5 | × 2 |
-|---|---|---|---|
+Without …
+
 """
         + "\n".join(telling)
         + "\n"
