@@ -118,22 +118,19 @@ def page(rows: Sequence[str], base: Sequence[Answer], options: argparse.Namespac
 
 {len(base)} flights, {datetime.date.today().isoformat()}, `make ablation`{missing}
 
-The number of a campaign case is its seed. Unchanged, the diagnosis is right on
-{sum(bool(a.right) for a in right)} of the {len(right)} with known answer; of recorded flights
-no identified number must exclude what is known.
+Numbers of campaign cases are seeds. Unchanged, {sum(bool(a.right) for a in right)} of the {len(right)} with known
+answer are right; of recorded flights: no identified number excludes what is known.
 Size: {"; ".join(line.split(":")[0] for line in sizes)}.
 
 {REMOVED.read_text(encoding="utf-8").strip()}
 
-## Each rule removed, each constant removed, halved and doubled
+## Without each rule and constant
 No change of: {", ".join(idle)}.
 
-Only errors, intervals or effort change (more than 3 % of linearisations): {", ".join(slight)}.
+Only errors, intervals or effort change: {", ".join(slight)}.
 
-+n −n: cases that become right or wrong; one difference is quoted: causes (− no longer, + newly listed), verdict, error
-on unseen data (> 1 %). Fits: linearisations (> 3 %). Halves and doubles: {scaled} flights.
-
-Without …
++n −n: cases that become right or wrong; one difference is quoted: causes (− gone, + new), verdict, error (> 1 %). Fits:
+linearisations (> 3 %). Halves and doubles: {scaled} flights.
 
 """
         + "\n".join(telling)
