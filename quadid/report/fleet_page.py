@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -55,13 +56,15 @@ def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     rough = summary["rough"]
     fit = done - rough
     level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
-    headline = f"{done} of {total} logs gave parameters."
+    gave = f"{done} of {total} logs gave parameters."
+    headline = f"{len(changed)} of {len(last)} vehicles have changed." if changed else gave
     words = (
-        ("refused", "cannot support an answer"),
+        ("refused", "cannot support a fit"),
         ("unreadable", "cannot be read or used"),
         ("failed", "stopped this program"),
     )
     details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
+    details += [gave] if changed else []
     details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
     if rough:
         what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
@@ -73,7 +76,7 @@ def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     ]
     steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
     if changed:
-        steps.append(f"How sure that is: `quadid health {changed[0]['log']}` against its first flights.")
+        steps.append(f"How sure that is: `quadid health {shlex.quote(changed[0]['log'])}` against its first flights.")
     if summary["drifts"]:
         steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
     if summary["outliers"]:
@@ -115,33 +118,40 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
     judged = [row for row in rows if not row["baseline"]]
     if not judged:
         return None
-    units = sorted({row["unit"] for row in judged})[:MOST_UNITS]
+    by_unit: dict[str, list[Json]] = {}
+    for row in judged:
+        by_unit.setdefault(row["unit"], []).append(row)
     places, time = _when(logs)
     data = []
-    for i, unit in enumerate(units):
-        own = [row for row in judged if row["unit"] == unit]
+    for i, (unit, own) in enumerate(sorted(by_unit.items())[:MOST_UNITS]):
         score = np.array([row["score"] for row in own])
-        line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=[row["log"] for row in own])
+        text = [f"{row['log']}: {row['verdict']}" for row in own]
+        line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=text)
         data.append({**line, "x": [places[row["log"]] for row in own]})
     layout = {
         "xaxis": time, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
         "showlegend": True, "shapes": [level(HEALTHY_SCORE)],
     }  # fmt: skip
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
-    changed = [
-        (row["unit"], row["log"], number(row["score"], 2), _what_changed(row))
-        for row in judged
-        if row["verdict"] != "unchanged"
-    ]
-    table = rows_of(("Vehicle", "Flight", "Score", "Changed"), changed[-MOST_ROWS:])
-    count = {unit: sum(row["baseline"] for row in rows if row["unit"] == unit) for unit in units}
-    most = "up to " * (len(set(count.values())) > 1) + str(max(count.values()))
+    changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
+    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS])
+    count = Counter(row["unit"] for row in rows if row["baseline"]).values()
+    most = "up to " * (len(set(count)) > 1) + str(max(count))
     intro = (
         f"Each flight against the first {most} of its vehicle, which are assumed healthy. 99 of 100 healthy flights "
         f"are below {HEALTHY_SCORE:.1f}, the line."
         f"{_counted(time)}"
     )
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
+
+
+def _changes_of(own: Sequence[Json]) -> tuple[str, ...]:
+    """How many flights of a vehicle have changed, the first and last of them, and what had at the last; or nothing."""
+    changed = [row for row in own if row["verdict"] != "unchanged"]
+    if not changed:
+        return ()
+    first, last = changed[0], changed[-1]
+    return last["unit"], f"{len(changed)} of {len(own)}", first["log"], last["log"], _what_changed(last)
 
 
 def _what_changed(row: Json) -> str:
