@@ -59,7 +59,8 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
 def _fleet(flights: Sequence[recorded.Flown], data: Path, report: Path | None) -> str:
     return (
         "## Trend of a fleet\n`quadid fleet`, called by `make health`: the first five flights are the baseline, the "
-        "others follow by millimetres cut.\n\n" + fleet.text(flights, data, report)
+        "others follow by millimetres cut; order: Spearman correlation of score and cut.\n\n"
+        + fleet.text(flights, data, report)
     )
 
 

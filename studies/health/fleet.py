@@ -45,6 +45,7 @@ def text(flights: Sequence[Flown], data: Path, report: Path | None = None) -> st
     """
     with TemporaryDirectory() as place:
         logs, out = Path(place) / "logs", Path(place) / "out"
+        out.mkdir()
         for name, airframe, rotors in SERIES:
             (logs / name).mkdir(parents=True)
             for k, flown in enumerate(in_order(flights, airframe, rotors)):
@@ -57,7 +58,7 @@ def text(flights: Sequence[Flown], data: Path, report: Path | None = None) -> st
             shutil.copy(out / "fleet.html", report)
     millimetres = {f.file: f.total for f in flights}
     lines = [
-        "| vehicle | flights (baseline) | changed: below 3 mm, above | first, all from [mm] | order (Spearman) |",
+        "| vehicle | flights (baseline) | changed: healthy, below 3 mm, from 3 mm | first, all from [mm] | order |",
         "|---|---|---|---|---|",
     ]
     for name, *_ in SERIES:
@@ -70,8 +71,8 @@ def _line(name: str, rows: Sequence[Mapping[str, Any]]) -> str:
     judged = [row for row in rows if not row["baseline"]]
     changed = [row["verdict"] != "unchanged" for row in judged]
     cells = []
-    for large in (False, True):
-        part = [c for c, row in zip(changed, judged, strict=True) if (row["mm"] >= LARGE) == large]
+    for low, high in ((0.0, 0.1), (0.1, LARGE), (LARGE, 99.0)):
+        part = [c for c, row in zip(changed, judged, strict=True) if low <= row["mm"] < high]
         cells.append(f"{sum(part)} of {len(part)}")
     missed = [row["mm"] for c, row in zip(changed, judged, strict=True) if not c]
     first = next((f"{row['mm']:g}" for c, row in zip(changed, judged, strict=True) if c), "none")
