@@ -48,7 +48,9 @@ SHARE_TO_NAME = 0.8
 SHARE_ALONE = 0.9
 """… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
 LEAST_STRUCTURE = 0.01
-"""Structure below this share of the noise is not worth a word."""
+"""Structure below this share of the noise is not worth a word …"""
+LEAST_OF_EXPLAINED = 1e-3
+"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
 
 
 def diagnose(
@@ -261,8 +263,8 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
         unnamed: deviance that causes which are not what their names say take away; it counts as left.
     """
     explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
-    structure = left.deviance + unnamed
-    structure = structure if structure > LEAST_STRUCTURE * model.rows else 0.0
+    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
+    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
     if not model.causes:
         return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
     if not structure:

@@ -100,7 +100,7 @@ def verdict(explained: float, left: float, causes: int) -> Verdict:
         (0.0, 0.005 * ROWS, 0, Verdict.NOTHING_FOUND),
         (0.0, 0.05 * ROWS, 0, Verdict.UNKNOWN),
         (1e4, 0.0, 1, Verdict.EXPLAINED),
-        (1e8, 0.9e5, 1, Verdict.PARTLY_EXPLAINED),
+        (1e8, 0.9e5, 1, Verdict.EXPLAINED),
         (1e4, 0.1e4, 1, Verdict.PARTLY_EXPLAINED),
         (1e4, 0.12e4, 1, Verdict.UNKNOWN),
         (1e4, 0.24e4, 2, Verdict.PARTLY_EXPLAINED),
