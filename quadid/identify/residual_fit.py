@@ -93,7 +93,7 @@ def fit_residual(windows: Sequence[Window], vehicle: Vehicle) -> ResidualFit:
     errors: dict[int, FloatArray] = {}
     best = 0
     for size, fits in zip(SIZES, paths, strict=True):
-        shares = [_share(fold, physical, terms, STAGES[-1]) for fold, terms in zip(folds, fits, strict=True)]
+        shares = [_runs(fold, physical, terms, STAGES[-1]).share() for fold, terms in zip(folds, fits, strict=True)]
         errors[size] = np.array(shares)
         if size > SIZES[1] and _clearly_below(errors[best], errors[size]):
             break  # more terms predict worse
@@ -149,22 +149,24 @@ def _path(windows: Sequence[Window], physical: Vehicle, candidates: Terms) -> It
         yield terms
 
 
-def _share(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> float:
-    """Mean error as a share of no change."""
-    return RunErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS).share()
+def _runs(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> RunErrors:
+    return RunErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS)
 
 
 def _products(
-    windows: Sequence[Window], physical: Vehicle, terms: Terms, more: Terms, seconds: Sequence[float]
+    runs: RunErrors, physical: Vehicle, terms: Terms, prior: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of the linear problem about `terms`, all in units of typical sizes: values, curvature, slope; and those sizes."""
-    vehicle = physical.model_copy(update={"residual": terms})
-    slopes, errors = RunErrors(windows, vehicle, seconds, MOST_RUNS).slopes((*terms, *more))
-    sizes = typical(vehicle, (*terms, *more))
-    values = np.array([t.value for t in (*terms, *more)]) / sizes
-    prior = PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)
+    """Of the linear problem of `terms`, all in units of typical sizes: values, curvature, slope; and those sizes."""
+    slopes, errors = runs.slopes(terms)
+    sizes = typical(physical, terms)
+    values = np.array([t.value for t in terms]) / sizes
     curvature = (slopes @ slopes.T).astype(np.float64) + prior * np.eye(len(values))
     return values, curvature, slopes @ errors + prior * values, sizes
+
+
+def _prior(windows: Sequence[Window]) -> float:
+    """Curvature of the prior of a coefficient of typical size, beside that of the mean error."""
+    return PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)
 
 
 def _selected(
@@ -173,20 +175,20 @@ def _selected(
     """Adds candidates, with coefficients of zero, until there are `size` terms."""
     have = {(term.acts_on, term.product) for term in terms}
     more = tuple(c for c in candidates if (c.acts_on, c.product) not in have)
-    _, h, g, _ = _products(windows, physical, terms, more, seconds)
+    _, h, g, _ = _products(_runs(windows, physical, terms, seconds), physical, (*terms, *more), _prior(windows))
     chosen = _pursued(h, g, list(range(len(terms))), size)
     return tuple((*terms, *more)[i] for i in chosen)
 
 
 def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> Terms:
     """Takes one step in all coefficients, as long a part of it as lowers the error."""
-    values, h, g, sizes = _products(windows, physical, terms, (), seconds)
+    runs = _runs(windows, physical, terms, seconds)
+    values, h, g, sizes = _products(runs, physical, terms, _prior(windows))
     change = -np.linalg.solve(h, g)
-    before = _share(windows, physical, terms, seconds)
     for part in _STEPS:
         at = (values + part * change) * sizes
         moved = tuple(t.model_copy(update={"value": float(v)}) for t, v in zip(terms, at, strict=True))
-        if _share(windows, physical, moved, seconds) < before:
+        if _runs(windows, physical, moved, seconds).share() < runs.share():
             return moved
     return terms
 

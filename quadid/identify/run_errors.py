@@ -7,6 +7,7 @@ residual terms serve whoever makes it small.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -56,12 +57,14 @@ class RunErrors:
         self._scales = _scales(self._loops, self.at)
         self._counts = np.sum([loop.counted(loop.rows, self.at).sum(axis=0) for loop in self._loops], axis=0)
 
+    @cached_property
+    def _misses(self) -> list[FloatArray]:
+        """What the runs of each loop miss by, shape (starts, at, 4, 3)."""
+        return [loop.misses(self._theta[None], self.at)[0] for loop in self._loops]
+
     def share(self) -> float:
         """Mean error as a share of no change; infinite where a run went away."""
-        shares = [
-            lengths(loop.misses(self._theta[None], self.at)[0]) / scale
-            for loop, scale in zip(self._loops, self._scales, strict=True)
-        ]
+        shares = [lengths(misses) / scale for misses, scale in zip(self._misses, self._scales, strict=True)]
         return float(np.mean(mean_of_known(np.concatenate(shares))[self._counts > 0]))
 
     def slopes(self, candidates: tuple[ResidualTerm, ...]) -> tuple[SingleArray, FloatArray]:
@@ -71,10 +74,9 @@ class RunErrors:
         out.
         """
         slopes, errors = [], []
-        for loop, scale in zip(self._loops, self._scales, strict=True):
-            misses = loop.misses(self._theta[None], self.at)[0]
+        for loop, misses, scale in zip(self._loops, self._misses, self._scales, strict=True):
             slope = term_slopes(loop, self._vehicle, candidates, self.at)
-            usable = np.isfinite(misses).all(axis=3) & np.isfinite(slope).all(axis=(3, 4))
+            usable = np.asarray(np.isfinite(misses).all(axis=3) & np.isfinite(slope).all(axis=(3, 4)))
             weight = np.where(usable, 1.0 / np.maximum(lengths(misses) / scale, _NEAR), 0.0)
             root = (np.sqrt(weight / np.maximum(self._counts, 1)) / scale)[..., None]
             errors.append((np.where(usable[..., None], misses, 0.0) * root).ravel())

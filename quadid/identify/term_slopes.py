@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.identify.open_loop import OpenLoop, initial_states
-from quadid.model.layout import Layout
+from quadid.model.layout import Layout, residual_terms
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
-from quadid.residual import MOST_FACTORS, SIGNALS, TARGETS, ResidualTerm
+from quadid.residual import SIGNALS, TARGETS, ResidualTerm
 from quadid.turning import turn
 from quadid.types import FloatArray, IndexArray, SingleArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -47,9 +47,8 @@ def term_slopes(loop: OpenLoop, vehicle: Vehicle, candidates: tuple[ResidualTerm
     Returns:
         Shape (starts, at, 4, 3, candidates), single precision; quantities as `OpenLoop.parts` orders them.
     """
-    signals = {"": len(SIGNALS), **{name: i for i, name in enumerate(SIGNALS)}}
-    factors = np.array([[signals[n] for n in (*c.product, *[""] * MOST_FACTORS)][:MOST_FACTORS] for c in candidates])
-    acting = [[i for i, c in enumerate(candidates) if c.acts_on == target] for target in TARGETS]
+    numbers = residual_terms(vehicle.model_copy(update={"residual": candidates}))
+    acting = [np.flatnonzero(numbers[:, 0] == target) for target in range(len(TARGETS))]
     sizes = typical(vehicle, candidates)
     one_step = _OneStep(loop, vehicle)
     state = initial_states(loop.window, one_step.theta[0], loop.known)[loop.rows]
@@ -57,8 +56,8 @@ def term_slopes(loop: OpenLoop, vehicle: Vehicle, candidates: tuple[ResidualTerm
     out: list[SingleArray] = []
     for i in range(int(at[-1])):
         state, onward, force, found = one_step.answers(loop.rows + i, state)
-        values = np.column_stack([found, np.ones(len(found))])
-        products = (sizes * np.prod(values[:, factors], axis=2)).astype(np.float32)
+        values = np.column_stack([np.ones(len(found)), found])
+        products = (sizes * np.prod(values[:, numbers[:, 1:]], axis=2)).astype(np.float32)
         slope = onward @ slope
         for target, columns in enumerate(acting):
             slope[:, :, columns] += force[:, :, target, None] * products[:, None, columns]
