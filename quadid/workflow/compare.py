@@ -44,9 +44,9 @@ def compare(
     """Runs every method and scores what it found; the result has the form ``quadid.compare/1``.
 
     Args:
-        logs: a log or several to fit, from `load`.
+        logs: a log or several to fit, as paths or from `load`.
         validate: flights that are scored only.
-        vehicle: initial guess, bounds, known effects; default the one that the first log was loaded with.
+        vehicle: initial guess, bounds, known effects; default that of the first loaded log.
         methods: names; all by default.
         seeds: one run of each random method a seed.
         budget: simulations of the data a run may spend.

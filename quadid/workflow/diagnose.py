@@ -164,9 +164,9 @@ def diagnose(
     """Names what the simulation gets wrong, extends the model by it, and measures the gain on unseen data.
 
     Args:
-        logs: a log or several to diagnose, from `load`.
+        logs: a log or several to diagnose, as paths or from `load`.
         validate: flights to measure the gain on; without any, held-out blocks of `logs` serve.
-        vehicle: nominal vehicle; default the one that the first log was loaded with.
+        vehicle: nominal vehicle; default that of the first loaded log.
         seed: of all random numbers.
         advance: told how far it is.
 

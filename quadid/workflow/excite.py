@@ -13,7 +13,7 @@ import numpy as np
 from quadid.errors import ParameterError
 from quadid.workflow.files import file_name, write_text
 from quadid.workflow.loading import as_vehicle
-from quadid.workflow.logs import Given, listed
+from quadid.workflow.logs import Given, read
 from quadid.workflow.progress import Advance, silent
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def propose(
     """Proposes the manoeuvre that shrinks the intervals most, within tilt and rate limits.
 
     Args:
-        logs: flights so far, from `load`.
+        logs: flights so far, as paths or from `load`.
         vehicle: what is believed before them.
         seconds: length of the manoeuvre [s].
         tilt: largest tilt [degrees].
@@ -145,9 +145,10 @@ def propose(
 
     check_limits(seconds, tilt, rate_limit, battery)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
-    given = [log.of(vehicle) for log in listed(logs)]
+    described = as_vehicle(vehicle)
+    given = read(logs, described)
     windows = [w for log in given for w in log.windows]
-    believed, known, noise = knowledge(as_vehicle(vehicle), windows, seed, advance)
+    believed, known, noise = knowledge(described, windows, seed, advance)
     proposal = chosen(Simulator(believed, noise, seed), known, limits, seconds, advance)
     plan = _plan(believed.name, proposal, tilt, height, battery)
     result = {

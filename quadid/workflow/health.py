@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.workflow.loading import Log, as_vehicle, check_conventions, open_recording
+from quadid.workflow.loading import Log, check_conventions, open_recording
+from quadid.workflow.logs import Flight, Given, listed, vehicle_of
 from quadid.workflow.parts import parse_cut
 from quadid.workflow.reporting import LIBRARY, Reported, provenance
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 LEAST_THRUST = 0.25
 """No vehicle flies on less of its baseline's thrust per command, whatever it dropped and however new its propellers."""
-Flight = str | Path | Log
-"""A log: its path, with a span if wanted, or as `quadid.load` returns it."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -94,8 +93,8 @@ class HealthOutcome(Reported):
 
 
 def health(
-    logs: Flight | Sequence[Flight], baseline: Flight | Sequence[Flight], *, vehicle: str | Path | Vehicle,
-    preset: str = "auto", unchecked: bool = False,
+    logs: Given, baseline: Given, *, vehicle: str | Path | Vehicle | None = None, preset: str = "auto",
+    unchecked: bool = False,
 ) -> HealthOutcome:  # fmt: skip
     """Compares flights with healthy flights of the same vehicle: which rotor, mass, centre of gravity, thrust.
 
@@ -103,9 +102,10 @@ def health(
     vehicle, all `logs` one that may have changed; how far healthy flights differ is estimated from the baseline.
 
     Args:
-        logs: a flight or several in question.
+        logs: a flight or several in question, as paths or from `load`.
         baseline: a healthy flight or, much better, several.
-        vehicle: a shipped name, a YAML file or a `Vehicle`; geometry counts, its parameters may be poorly known.
+        vehicle: a shipped name, a YAML file or a `Vehicle`; geometry counts, its parameters may be poorly known;
+            default that of the first loaded log.
         preset: topic names of ROS logs.
         unchecked: use logs even when their units, frames or motors look wrong.
 
@@ -116,11 +116,11 @@ def health(
     from quadid.health.changes import assess
     from quadid.health.trims import flight_trim
 
-    described = as_vehicle(vehicle)
-    tested, healthy = _several(logs), _several(baseline)
+    tested, healthy = listed(logs), listed(baseline)
     if not tested or not healthy:
         missing = "flight in question" if not tested else "baseline flight"
         raise LogError(f"no {missing}", "one log or more of each", "name healthy flights with --baseline")
+    described = vehicle_of([*tested, *healthy], vehicle)
     warnings: list[str] = []
     opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
     _distinct(*opened)
@@ -148,10 +148,6 @@ def _check_flown(trim: FlightTrim, healthy: Sequence[FlightTrim]) -> None:
             f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: not a flight",
             "flights", "use a flight; a hover is enough",
         )  # fmt: skip
-
-
-def _several(given: Flight | Sequence[Flight]) -> list[Flight]:
-    return [given] if isinstance(given, str | Path | Log) else list(given)
 
 
 def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warnings: list[str]) -> Recording:

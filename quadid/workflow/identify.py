@@ -144,9 +144,9 @@ def identify(
     """Fits the parameters to logs, and scores the fit on them and on others.
 
     Args:
-        logs: a log or several, from `load`.
+        logs: a log or several, as paths or from `load`.
         validate: flights that are scored only.
-        vehicle: initial guess and known effects; default the one that the first log was loaded with.
+        vehicle: initial guess and known effects; default that of the first loaded log.
         optimizer: one of `OPTIMIZERS`.
         seed: of all random numbers.
         advance: told how far the fit is.

@@ -57,8 +57,8 @@ def score(
     """Open-loop prediction error after h samples: every sample starts one run from the measured state.
 
     Args:
-        logs: a log or several, from `load`.
-        vehicle: whose values are scored as they are; default the one that the first log was loaded with.
+        logs: a log or several, as paths or from `load`.
+        vehicle: whose values are scored as they are; default that of the first loaded log.
         horizons: samples of the grid after the start of each run.
         rate: of the grid [Hz]; None for each log's own, whatever it was loaded with.
 

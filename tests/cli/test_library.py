@@ -14,7 +14,7 @@ import pytest
 from quadid_replay import write_csv
 
 import quadid
-from quadid.errors import QuadidError
+from quadid.errors import QuadidError, VehicleError
 from quadid.jsonable import jsonable
 from tests.cli.conftest import Cli, Flights, one_line
 
@@ -123,6 +123,31 @@ def test_simulate_and_export_agree(inside: Cli, tmp_path: Path) -> None:
     assert same(run.data) == same(exported.result)
     for file in run.data["files"]:
         assert Path(file).read_text(encoding="utf-8") == exported.texts[Path(file).name]
+
+
+PATHS: dict[str, Callable[..., Any]] = {
+    "inspect": quadid.inspect,
+    "identify": quadid.identify,
+    "diagnose": quadid.diagnose,
+    "score": quadid.score,
+    "health": lambda path, **vehicle: quadid.health(path, baseline=f"{path}@0:15", **vehicle),
+}
+"""Functions about a log, called with its path."""
+
+
+@pytest.mark.parametrize("name", ["identify", "score"])
+def test_a_path_stands_for_the_loaded_log(name: str, logs: dict[str, str]) -> None:
+    given = PATHS[name](logs["good"], vehicle="pelican")
+    assert same(given.result) == same(PATHS[name](load(logs["good"])).result)
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_paths_are_refused_alike(name: str, logs: dict[str, str]) -> None:
+    with pytest.raises(QuadidError, match="no file .*no.csv"):
+        PATHS[name](logs["absent"], vehicle="pelican")
+    if name != "inspect":
+        with pytest.raises(VehicleError, match=r"no vehicle for .*quadid\.load\(path, vehicle="):
+            PATHS[name](logs["good"])
 
 
 def test_what_a_notebook_needs(logs: dict[str, str], tmp_path: Path) -> None:
