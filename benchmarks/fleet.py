@@ -37,7 +37,7 @@ from quadid.workflow.fleet import Job
 
 SECONDS = 10.0
 FLOWN = 10
-"""Different flights; more logs are copies of them."""
+"""Different flights; more logs are the same at another date."""
 
 
 class Run(NamedTuple):
@@ -146,11 +146,13 @@ def write_logs(folder: Path, count: int) -> None:
     for i in range(min(count, FLOWN)):
         path = folder / f"vehicle{i}" / "flight0.mcap"
         path.parent.mkdir(parents=True)
-        write_mcap(path, fly(pelican, seconds=SECONDS, seed=i).recording)
-        flown.append(path)
+        recording = fly(pelican, seconds=SECONDS, seed=i).recording
+        write_mcap(path, recording)
+        flown.append((path, recording))
     for i in range(len(flown), count):
-        source = flown[i % len(flown)]
-        os.link(source, source.with_name(f"flight{i // len(flown)}.mcap"))
+        path, recording = flown[i % len(flown)]
+        hours = i // len(flown)
+        write_mcap(path.with_name(f"flight{hours}.mcap"), recording, hours * 3600 * 10**9)
 
 
 def jobs_of(folder: Path) -> Sequence[Job]:

@@ -109,7 +109,7 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
     from quadid_cli import output
 
     logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
-    summary = summarise(logs, parameters, findings)
+    summary = summarise(logs, parameters, findings, found.copies)
     health = health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs})
     page = fleet_page(summary, logs, parameters, provenance([], output.command_line()), "Report of a fleet", health)
     files = [target / "fleet.sqlite", *store.write_parquet(target)]

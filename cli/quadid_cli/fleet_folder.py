@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,10 +20,11 @@ SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
 
 @dataclass(frozen=True)
 class Found:
-    """Logs of a folder as jobs, and the names of files that are no logs."""
+    """Logs of a folder as jobs, files that are no logs, and logs with the bytes of a job's (name of copy and job)."""
 
     jobs: tuple[Job, ...]
     others: tuple[str, ...]
+    copies: tuple[tuple[str, str], ...] = ()
 
 
 def find_jobs(
@@ -31,7 +33,8 @@ def find_jobs(
     """Lists all logs below `root`, recognised by content.
 
     The vehicle of a log is described by the nearest ``vehicle.yaml`` in its folder or above it, up to `root`, else by
-    `default`.  A vehicle of the fleet is a folder: logs of one folder belong to the same one.
+    `default`.  A vehicle of the fleet is a folder: logs of one folder belong to the same one.  Logs with the same bytes
+    are one flight, and one job.
 
     Args:
         root: folder of the fleet.
@@ -62,7 +65,26 @@ def find_jobs(
         ))  # fmt: skip
     if not jobs:
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
-    return Found(tuple(jobs), tuple(others))
+    copies = _copies(jobs)
+    return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(copies.items()))
+
+
+def _copies(jobs: Sequence[Job]) -> dict[str, str]:
+    """Logs with the bytes of another, and which: the file that was changed first, as a copy may have a later date."""
+    same_size: dict[int, list[Job]] = defaultdict(list)
+    for job in sorted(jobs, key=lambda job: (job.modified, job.name)):
+        same_size[job.size].append(job)
+    first: dict[bytes, str] = {}
+    out = {}
+    for job in (job for some in same_size.values() if len(some) > 1 for job in some if job.size):
+        try:
+            with open(job.path, "rb") as file:
+                digest = hashlib.file_digest(file, "sha256").digest()
+        except OSError:
+            continue  # its row says why it cannot be read
+        if first.setdefault(digest, job.name) != job.name:
+            out[job.name] = first[digest]
+    return dict(sorted(out.items()))
 
 
 def _files(root: Path, leave_out: Path | None) -> Iterator[Path]:

@@ -66,6 +66,9 @@ def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
     details += [gave] if changed else []
     details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+    if copies := len(summary["copies"]):
+        told = "log is a copy of another and is" if copies == 1 else "logs are copies of others and are"
+        details.append(f"{copies} {told} not counted.")
     if rough:
         what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
         details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")

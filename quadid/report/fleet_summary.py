@@ -24,18 +24,21 @@ FAR = 4.5
 DAY = 86_400.0
 
 
-def summarise(logs: Sequence[Json], parameters: Sequence[Json], findings: Sequence[Json]) -> dict[str, Any]:
+def summarise(
+    logs: Sequence[Json], parameters: Sequence[Json], findings: Sequence[Json], copies: Sequence[tuple[str, str]] = ()
+) -> dict[str, Any]:
     """Sums up a fleet.
 
     Args:
         logs: rows with name, unit, status, reason, started [s since 1970], dated_by, mse_initial, mse_fitted, verdict.
         parameters: rows with log, parameter, unit, value, low, high (95 % interval), status.
         findings: rows with log, effect, confident, parameter, value.
+        copies: files that are not counted because they hold the bytes of a log, each with that log's name.
 
     Returns:
         ``counts`` by status, ``rough`` (logs that the simulation misses much of), ``units`` (each with its parameters:
         median, spread, flights), ``drifts``, ``outliers``, ``common`` (findings by number of flights), ``reasons``
-        (failures by reason).
+        (failures and copies by reason), ``copies``.
     """
     by_name = {log["name"]: log for log in logs}
     series = _series(by_name, parameters)
@@ -46,7 +49,8 @@ def summarise(logs: Sequence[Json], parameters: Sequence[Json], findings: Sequen
         "drifts": _drifts(series),
         "outliers": _outliers(series),
         "common": _common(by_name, findings),
-        "reasons": _reasons(logs),
+        "reasons": [*_reasons(logs), *_copied(copies)],
+        "copies": [{"log": log, "of": of} for log, of in copies],
     }
 
 
@@ -153,3 +157,14 @@ def _reasons(logs: Sequence[Json]) -> list[dict[str, Any]]:
             grouped[log["status"], reason].append(log["name"])
     ordered = sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))
     return [{"status": s, "reason": r, "logs": len(names), "names": names} for (s, r), names in ordered]
+
+
+def _copied(copies: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Copies in the form of logs without a result."""
+    grouped: dict[str, list[str]] = defaultdict(list)
+    for log, of in copies:
+        grouped[of].append(log)
+    return [
+        {"status": "copy", "reason": f"the bytes of {of}, which is counted once", "logs": len(names), "names": names}
+        for of, names in sorted(grouped.items())
+    ]

@@ -7,13 +7,12 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
 from quadid.sanitise import one_line
 from quadid.workflow.loading import Log, check_conventions, on_grid, open_recording, require_gyro
-from quadid.workflow.parts import parse_cut
+from quadid.workflow.parts import Cut, parse_cut
 
 if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
@@ -29,7 +28,7 @@ class Job:
     """One log to identify.
 
     Attributes:
-        path: absolute; every worker must see it there.
+        path: absolute, with a span if wanted; every worker must see it there.
         name: relative to the folder of the fleet.
         unit: which vehicle of the fleet it belongs to.
         vehicle: text of its vehicle file.
@@ -60,10 +59,10 @@ def identify_one(job: Job) -> Row:
     begin = time.perf_counter()
     row = blank(job)
     try:
-        vehicle, recording = _opened(job)
         cut = parse_cut(job.path)
+        vehicle, recording = _opened(job, cut)
         checked = check_conventions(recording, vehicle, cut)
-        row |= _seen(recording, vehicle, checked.doubts)
+        row |= _seen(cut.of(recording), vehicle, checked.doubts)
         require_gyro(recording)
         log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
         row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
@@ -88,13 +87,13 @@ def blank(job: Job) -> Row:
     }  # fmt: skip
 
 
-def _opened(job: Job) -> tuple[Vehicle, Recording]:
+def _opened(job: Job, cut: Cut) -> tuple[Vehicle, Recording]:
     from quadid.vehicle import Vehicle
 
     vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
-    if Path(job.path).stat().st_size == 0:
+    if cut.path.stat().st_size == 0:
         raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
-    return vehicle, open_recording(Path(job.path), columns=vehicle.columns)
+    return vehicle, open_recording(cut.path, columns=vehicle.columns)
 
 
 def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:

@@ -103,13 +103,47 @@ def test_a_second_run_does_only_what_is_new(
     shutil.copytree(folder, copy)
     shutil.copytree(out, own)
     (copy / "alpha" / "noise.ulg").unlink()
-    shutil.copy2(copy / "alpha" / "flight0.csv", copy / "alpha" / "new.csv")
+    write_csv(copy / "alpha" / "new.csv", fly(Vehicle.shipped("pelican"), seconds=15.0, seed=50).recording)
+    shutil.copy(copy / "alpha" / "flight0.csv", copy / "alpha" / "again.csv")
     run = quadid("fleet", copy, "--vehicle", "pelican", "--workers", "1", "--out", own, "--json", own / "r.json")
     assert run.code == 0, run.err
     result = json.loads((own / "r.json").read_text(encoding="utf-8"))
     assert (result["worked"], result["logs"]) == (1, 8)
     assert "1 of 8 logs worked on" in run.out
-    assert "noise.ulg" not in (own / "fleet.html").read_text(encoding="utf-8")
+    assert "1 log is a copy of another and is not counted." in run.out
+    assert "1 copy: the bytes of alpha/flight0.csv" in run.out
+    page = (own / "fleet.html").read_text(encoding="utf-8")
+    assert "noise.ulg" not in page
+    assert "alpha/again.csv" in page
+    b = next(p for p in result["units"][0]["parameters"] if p["parameter"] == "b")
+    assert (result["units"][0]["logs"], b["flights"]) == (6, 3)
+    assert result["copies"] == [{"log": "alpha/again.csv", "of": "alpha/flight0.csv"}]
+
+
+def test_a_copy_under_another_name_is_one_flight(folder: Path, tmp_path: Path) -> None:
+    """The file that was there first is counted, whatever it is called; empty files are no copies."""
+    for name, day in (("b.csv", 1), ("a.csv", 2), ("sub/c.csv", 3), ("d.bin", 4), ("e.bin", 5)):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"" if name.endswith(".bin") else (folder / "alpha" / "flight0.csv").read_bytes())
+        os.utime(path, ns=(day * DAY_NS, day * DAY_NS))
+    found = find_jobs(tmp_path, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False)
+    assert [job.name for job in found.jobs] == ["b.csv", "d.bin", "e.bin"]
+    assert found.copies == (("a.csv", "b.csv"), ("sub/c.csv", "b.csv"))
+
+
+def test_names_and_spans_are_read_as_by_every_command(folder: Path, tmp_path: Path) -> None:
+    """A span cuts fit and trim alike; a file whose name looks like one with a span is that file."""
+    text = Vehicle.shipped("pelican").to_yaml()
+    shutil.copy(folder / "alpha" / "flight0.csv", tmp_path / "flight.csv@2:4")
+    whole, job = (
+        identify_one(Job(path, "a", "a", text, 1, 0, "", 50.0, 1, False))
+        for path in (str(tmp_path / "flight.csv@2:4"), f"{folder}/alpha/flight0.csv@3:13")
+    )
+    assert (whole["status"], whole["seconds"]) == ("done", pytest.approx(15.0, abs=0.1))
+    assert (job["status"], job["seconds"]) == ("done", pytest.approx(10.0, abs=0.1))
+    spans = [json.loads(row["trims"][0]["trim"]) for row in (whole, job)]
+    assert spans[0] != spans[1]
 
 
 def test_outcomes_are_stored_as_they_come_so_that_a_killed_run_goes_on(folder: Path, tmp_path: Path) -> None:
