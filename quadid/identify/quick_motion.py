@@ -19,6 +19,8 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.priors import Prior, default_prior
 from quadid.identify.process_noise import AXES, LEAST_WHITE, likeliest
 from quadid.identify.shooting import Free, Linearised, Shooting
+from quadid.identify.torque_coherence import undecided
+from quadid.parameters import INERTIAS
 from quadid.types import FloatArray
 from quadid.window import Window
 
@@ -45,6 +47,7 @@ class QuickMotion:
         prior: on these.
         short: the same in segments as short as those of the first fit, whose motion is quicker still.
         prompt: scaled step of the parameters to where they are with nothing late, shape (P,).
+        undecided: what torque and motion that do not cohere leave open of scaled parameters, shape (P,).
         simulated: parameter vectors simulated for all of it.
     """
 
@@ -54,6 +57,7 @@ class QuickMotion:
     prior: Prior
     short: Polished
     prompt: FloatArray
+    undecided: FloatArray
     simulated: int
 
 
@@ -100,8 +104,10 @@ def quick_motion(
     neutral[shooting.free(late).index] = 0.0
     prompt = polish(shooting, neutral, told, states=found.states, iterations=8)
     step = np.where(np.isin(free.names, names), free.step(theta, prompt.theta), 0.0)
+    open_by = dict(zip(INERTIAS[:2], undecided(windows, short.vehicle, shooting.noise.white[:2]), strict=True))
+    unsure = np.array([open_by.get(n, 0.0) for n in free.names])
     simulated = (spent + quicker.iterations) * (len(free.entries) + 10) + prompt.iterations * (len(told.entries) + 10)
-    return QuickMotion(shooting, found, free, prior, quicker, step, simulated)
+    return QuickMotion(shooting, found, free, prior, quicker, step, unsure, simulated)
 
 
 def _late(window: Window) -> list[str]:
