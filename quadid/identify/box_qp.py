@@ -46,7 +46,8 @@ def least_within(h: FloatArray, g: FloatArray, low: FloatArray, high: FloatArray
             z[place[first]] = np.where(step[first] > 0.0, high[place[first]], low[place[first]])
             free[place[first]] = False
             continue
-        z[place] = wanted
+        # Rounding would leave some beyond their bounds, where there is less than no room and no step.
+        z[place] = np.clip(wanted, low[place], high[place])
         pull = -(h @ z + g)
         outward = np.where(free | (low == high), 0.0, np.where(z <= low, pull, -pull))
         best = int(np.argmax(outward))
