@@ -26,6 +26,8 @@ _SURE = 0.75
 _UNEXPLAINED = 1e-3
 """An explanation, be it that nothing changed, that leaves a rest less probable than this explains nothing."""
 _RIVALS = 3
+ENOUGH = 5
+"""Baseline flights that a verdict of no change needs, unless it would be the same with as many."""
 
 
 class Rival(NamedTuple):
@@ -87,10 +89,12 @@ class Health:
 
     Attributes:
         verdict: unchanged, changed or unknown.
-        changes: the most probable explanation; without confidence where the verdict is unchanged.
+        lacking: baseline flights that are lacking: with so many more that differ no more, this would be a change; the
+            verdict is unknown then.  Else 0.
+        changes: the most probable explanation; with confidence only where the verdict is changed.
         score: how far the flights are from healthy ones, in standard deviations of these.
-        p_value: chance that a healthy flight looks as changed; where the verdict is unknown, that one is as far from
-            what explains best.
+        p_value: chance that a healthy flight looks as changed; where nothing explains a change, that one is as far
+            from what explains best.
         trim: of the flights in question, shape (4,), see `trims.AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.
@@ -99,6 +103,7 @@ class Health:
     """
 
     verdict: str
+    lacking: int
     changes: tuple[Change, ...]
     score: float
     p_value: float
@@ -116,6 +121,7 @@ class Health:
         return {
             "schema": "quadid.health/1",
             "verdict": self.verdict,
+            "baseline_lacking": self.lacking,
             "changes": [change.to_dict() for change in self.changes],
             "score": self.score,
             "p_value": self.p_value,
@@ -143,13 +149,23 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     named = p_value < SIGNIFICANT
     rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
     p_rest = p_healthy(rest, deviation, healthy.freedom)
-    verdict = "unknown" if p_rest < _UNEXPLAINED else "changed" if named else "unchanged"
-    changes = _changes(found, vehicle, verdict == "changed")
+    unexplained = p_rest < _UNEXPLAINED
+    lacking = 0 if named or unexplained else _lacking(change, healthy, len(flights), vehicle)
+    verdict = "unknown" if unexplained or lacking else "changed" if named else "unchanged"
+    changes = () if unexplained else _changes(found, vehicle, verdict == "changed")
     score = float(np.sqrt((far**2).sum()))
     return Health(
-        verdict, () if verdict == "unknown" else changes, score, p_rest if verdict == "unknown" else p_value, trim, far,
-        healthy, tuple(flights), tuple(baseline),
+        verdict, lacking, changes, score, p_rest if unexplained else p_value, trim, far, healthy, tuple(flights),
+        tuple(baseline),
     )  # fmt: skip
+
+
+def _lacking(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> int:
+    """How many more baseline flights of the same spread would make this a change, up to `ENOUGH` in all; 0: none do."""
+    for count in range(healthy.flights + 1, ENOUGH + 1):
+        if p_unchanged(change, healthy.known_from(count), flights, vehicle) < SIGNIFICANT:
+            return count - healthy.flights
+    return 0
 
 
 def changes_of(

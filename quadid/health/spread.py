@@ -46,6 +46,10 @@ class Healthy(NamedTuple):
         """Standard deviation of the mean of `flights` new healthy flights from `mean`, shape (4,)."""
         return np.asarray(self.deviation * np.sqrt(1.0 / flights + 1.0 / self.flights))
 
+    def known_from(self, flights: int) -> Healthy:
+        """The same trim and spread as so many baseline flights would show them."""
+        return self._replace(flights=flights, freedom=_freedom(flights))
+
 
 def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
     """Mean and spread of healthy flights.
@@ -60,10 +64,17 @@ def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
     within = np.sqrt(sum((rows**2).sum(axis=0) for rows in inner) / max(parts, 1.0))
     prior = np.maximum(BETWEEN * within, LEAST)
     squares = ((means - centre) ** 2).sum(axis=0)
-    freedom = np.full(len(AXES), PRIOR_FLIGHTS)
-    variance = PRIOR_FLIGHTS * prior**2
+    freedom = _freedom(len(means))
+    variance = np.zeros(len(AXES))
     for group in map(list, _GROUPS):
-        freedom[group] = PRIOR_FLIGHTS + len(group) * (len(means) - 1)
         variance[group] = (PRIOR_FLIGHTS * np.mean(prior[group] ** 2) + squares[group].sum()) / freedom[group]
     shares = np.mean([flight.shares for flight in baseline], axis=0)
     return Healthy(centre, np.sqrt(variance), freedom, len(means), shares)
+
+
+def _freedom(flights: int) -> FloatArray:
+    """Degrees of freedom of each trim's variance, shape (4,)."""
+    out = np.zeros(len(AXES))
+    for group in map(list, _GROUPS):
+        out[group] = PRIOR_FLIGHTS + len(group) * (flights - 1)
+    return out

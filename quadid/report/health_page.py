@@ -18,7 +18,7 @@ _WORDS = {
     "weak_rotor": "rotor",
 }  # fmt: skip
 _INTROS = {
-    "changed": "", "unknown": "Nothing that has a name.",
+    "changed": "", "unknown": "Nothing that has a name.", "lacking": "Not known. If anything:",
     "unchanged": "Nothing beyond what healthy flights differ by. If anything:",
 }  # fmt: skip
 _STEPS = {
@@ -45,6 +45,11 @@ def change_words(change: Json) -> str:
     )
 
 
+def has_changed(result: Json) -> bool:
+    """Whether a result of the form ``quadid.health/1`` shows a change, be it one without a name."""
+    return result["verdict"] != "unchanged" and not result["baseline_lacking"]
+
+
 def rival_words(rival: Json) -> str:
     """An explanation that lost, with its probability: ``rotor 3 and 4 (0.08)``."""
     names = " and ".join(_WORDS[effect] for effect in (rival["effect"], *rival.get("with", ())))
@@ -59,8 +64,14 @@ def health_verdict(result: Json) -> Verdict:
     chance = f"Chance that a healthy flight looks as changed: {_chance(result['p_value'])}"
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
     details = [f"{chance} ({against})."]
+    suspects = ", ".join(change_words(c) for c in changes)
+    if more := result["baseline_lacking"]:
+        flights = "baseline flight does" if n == 1 else "baseline flights do"
+        headline = f"{n} {flights} not show whether the vehicle has changed."
+        details += [f"With {more} more, spread like these, it would be a change{f': {suspects}' if suspects else ''}."]
+        step = f"Record {more} healthy flight{'s' * (more != 1)} or more, and compare again."
+        return Verdict("fair", headline, tuple(details), (step,))
     if verdict == "unchanged":
-        suspects = ", ".join(change_words(c) for c in changes)
         details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
         return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
     if verdict == "unknown":
@@ -146,6 +157,7 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
     from dataclasses import asdict
 
     n, m = len(result["logs"]), len(result["baseline"])
+    intro = _INTROS["lacking" if result["baseline_lacking"] else result["verdict"]]
     caption = (
         "From above, nose up. Dashed: the command of each rotor in the baseline flights. Filled, with its change: now. "
         "Red: damaged; yellow: suspected."
@@ -164,7 +176,7 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
         "verdict": asdict(health_verdict(result)),
         "sections": [
             section("airframe", "Airframe", caption, picture=picture),
-            section("changes", "What changed", _INTROS[result["verdict"]], tables=changes),
+            section("changes", "What changed", intro, tables=changes),
             section("trim", "Trim", trims.title, history, [rows_of(head, rows)]),
         ],
         "warnings": result["warnings"],

@@ -1,6 +1,6 @@
 """Health of recorded and simulated vehicles, into a result page.
 
-python -m studies.health --out docs/results [--parts recorded limits features fleet simulated]
+python -m studies.health --out docs/results [--parts recorded few limits features fleet simulated]
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from studies.health import features, fleet, limits, recorded, simulated
+from studies.health import features, few, fleet, limits, recorded, simulated
 from studies.page import put_section
 
-PARTS = ("recorded", "limits", "features", "fleet", "simulated")
+PARTS = ("recorded", "few", "limits", "features", "fleet", "simulated")
 TITLE = "Health: what changed in this vehicle"
 
 
@@ -32,6 +32,7 @@ def main() -> None:
     judged = cache(lambda: recorded.judge(flights()))
     makers: dict[str, Callable[[], str]] = {
         "recorded": lambda: _recorded(judged(), chosen.out / "health-score.png"),
+        "few": lambda: _few(flights()),
         "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged())}",
         "features": lambda: f"## What else the logs hold, and why it is not used\n{features.text(judged())}",
         "fleet": lambda: _fleet(flights(), chosen.data / "crazypad", chosen.report),
@@ -53,6 +54,14 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
         f"flights of its airframe ({each}). Brackets: exact binomial 95 % intervals.\n\n"
         f"{recorded.table(judged)}\n\n"
         f"![Score against millimetres cut]({picture.name})"
+    )
+
+
+def _few(flights: Sequence[recorded.Flown]) -> str:
+    return (
+        "## Few baseline flights\nUp to ten choices of healthy flights; damaged: cuts from 3 mm and glued weights. "
+        "Unknown: with five baseline flights of the same spread it would be a change; before, that was unchanged.\n\n"
+        + few.text(flights)
     )
 
 

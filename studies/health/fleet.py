@@ -17,6 +17,7 @@ from typing import Any
 
 from scipy.stats import spearmanr
 
+from quadid.report.health_page import has_changed
 from studies.health.recorded import LARGE, Flown
 
 SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (
@@ -69,7 +70,7 @@ def text(flights: Sequence[Flown], data: Path, report: Path | None = None) -> st
 
 def _line(name: str, rows: Sequence[Mapping[str, Any]]) -> str:
     judged = [row for row in rows if not row["baseline"]]
-    changed = [row["verdict"] != "unchanged" for row in judged]
+    changed = [has_changed(row) for row in judged]
     cells = []
     for low, high in ((0.0, 0.1), (0.1, LARGE), (LARGE, 99.0)):
         part = [c for c, row in zip(changed, judged, strict=True) if low <= row["mm"] < high]

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import binomtest, spearmanr
 
 from quadid.health import FlightTrim, Health, assess, flight_trim
+from quadid.report.health_page import has_changed
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
 from quadid.workflow.loading import open_recording
@@ -57,8 +58,8 @@ class Judged:
 
     @property
     def changed(self) -> bool:
-        """Whether the verdict is other than unchanged."""
-        return self.health.verdict != "unchanged"
+        """Whether the flight shows a change, be it one without a name."""
+        return has_changed(self.health.to_dict())
 
     @property
     def named(self) -> list[int]:
@@ -106,9 +107,9 @@ def judge(flights: Sequence[Flown]) -> list[Judged]:
     return out
 
 
-def _large(one: Judged) -> bool:
-    cut = one.flown.condition == "cut" and one.flown.total >= LARGE
-    return cut or (one.flown.condition == "weight" and "glued" in one.flown.weight)
+def is_large(one: Flown) -> bool:
+    """Whether a flight's damage must be found: cuts from `LARGE` on, glued weights."""
+    return one.condition == "cut" and one.total >= LARGE or (one.condition == "weight" and "glued" in one.weight)
 
 
 def _small(one: Judged) -> bool:
@@ -129,7 +130,7 @@ def _share(of: Sequence[Judged], right: Callable[[Judged], bool]) -> str:
 
 
 def _balanced(judged: Sequence[Judged]) -> str:
-    large = [one.changed for one in judged if _large(one)]
+    large = [one.changed for one in judged if is_large(one.flown)]
     healthy = [not one.changed for one in judged if one.flown.condition == "healthy"]
     accuracy = 0.5 * (np.mean(large) + np.mean(healthy))
     alarms = len(healthy) - sum(healthy)
@@ -180,9 +181,9 @@ ROWS: tuple[Row, ...] = (
     ("two propellers, 3 mm or more each: both named", "≥ 85 %",
      lambda all_: _share([j for j in all_ if min(j.flown.cut[:2]) >= 3.0], lambda j: j.flown.rotors <= set(j.named))),
     ("propeller told from glued weight, all", "≥ 90 %",
-     lambda all_: _share([j for j in all_ if _large(j)], kind_right)),
+     lambda all_: _share([j for j in all_ if is_large(j.flown)], kind_right)),
     ("the same, of those found", "",
-     lambda all_: _share([j for j in all_ if _large(j) and j.changed], kind_right)),
+     lambda all_: _share([j for j in all_ if is_large(j.flown) and j.changed], kind_right)),
     ("Spearman correlation of score and mm cut (with healthy flights / cuts alone)", "≥ 0.9", _orders),
 )  # fmt: skip
 
@@ -196,7 +197,8 @@ def table(judged: Sequence[Judged]) -> str:
 
 def confusion(judged: Sequence[Judged]) -> str:
     """What was done against what is answered."""
-    answers = ("unchanged", "M1", "M2", "M3", "M4", "two rotors", "three rotors", "weight or CG", "effort", "unknown")
+    answers = ("unchanged", "M1", "M2", "M3", "M4", "two rotors", "three rotors", "weight or CG", "effort", "unknown",
+               "too few baseline flights")  # fmt: skip
     count: dict[str, dict[str, int]] = {}
     for one in judged:
         done = _done(one.flown)
@@ -217,7 +219,7 @@ def _done(flown: Flown) -> str:
 
 def _answer(one: Judged) -> str:
     if not one.changed:
-        return "unchanged"
+        return "too few baseline flights" if one.health.lacking else "unchanged"
     if one.health.verdict == "unknown":
         return "unknown"
     if one.named:

@@ -10,7 +10,7 @@ from quadid.health import Health, assess, flight_trim, healthy_spread
 from quadid.health.comparison import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
 from quadid.health.trims import trim_directions, trim_of_load
-from quadid.report.health_page import change_words
+from quadid.report.health_page import change_words, health_verdict
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command
 from quadid.window import Recording
@@ -61,6 +61,22 @@ def test_a_flight_far_from_its_only_baseline_in_every_trim_is_not_called_unchang
     another = baseline._replace(mean=baseline.mean + [0.02, 0.03, 0.11, 0.54])
     found = assess([another], [baseline], PELICAN_X)
     assert (found.verdict, found.changes) == ("unknown", ())
+
+
+def test_a_change_that_two_baseline_flights_cannot_show_is_not_called_unchanged() -> None:
+    """It is said how many more would, if they differ no more than these."""
+    small = Wrong({3: 0.06}, {3: 0.06})
+    few = judged(PELICAN_X, small, seed=1, baselines=2)
+    assert (few.verdict, few.lacking) == ("unknown", 2)
+    assert few.p_value > 0.01
+    more = few.healthy.known_from(2 + few.lacking)
+    assert p_unchanged(few.trim - few.healthy.mean, more, 1, PELICAN_X) < 0.01
+    assert not any(change.confident for change in few.changes)
+    verdict = health_verdict({**few.to_dict(), "baseline": ["a", "b"]})
+    assert (verdict.level, verdict.headline[:28]) == ("fair", "2 baseline flights do not sh")
+    assert "2 healthy flights or more" in verdict.next_steps[0]
+    healthy = judged(PELICAN_X, None, seed=1, baselines=2)
+    assert (healthy.verdict, healthy.lacking) == ("unchanged", 0)
 
 
 def test_thrust_and_drag_may_be_lost_in_different_shares() -> None:
