@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from quadid.health.changes import HEALTHY_SCORE
-from quadid.report.health_page import change_words
-from quadid.report.page import number
-from quadid.report.page import unit as unit_text
+from quadid.report.fleet_tables import MOST_ROWS, date, every_log, summary_sections
+from quadid.report.health_page import change_words, has_changed
 from quadid.report.parts import axis, figure, level, rows_of, section, trace
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
 from quadid.types import Json
@@ -23,8 +22,6 @@ MOST_UNITS = 12
 """Vehicles in one figure."""
 MOST_POINTS = 20_000
 """Flights that all figures together show; of more, every n-th."""
-MOST_ROWS = 200
-"""Rows of one table; the database has all."""
 
 
 def fleet_page(
@@ -40,8 +37,7 @@ def fleet_page(
         "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
         "verdict": asdict(fleet_verdict(summary, health)),
         "sections": [s for s in (
-            _health(health, logs), _over_time(logs, parameters), _units(summary), _drifts(summary), _outliers(summary),
-            _common(summary), _unusable(summary), _logs(logs),
+            _health(health, logs), _over_time(logs, parameters), *summary_sections(summary), every_log(logs),
         ) if s is not None],
         "provenance": provenance,
     }  # fmt: skip
@@ -52,7 +48,7 @@ def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     counts = summary["counts"]
     total, done = sum(counts.values()), counts.get("done", 0)
     last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
-    changed = [row for row in last.values() if row["verdict"] != "unchanged"]
+    changed = [row for row in last.values() if has_changed(row)]
     rough = summary["rough"]
     fit = done - rough
     level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
@@ -100,7 +96,7 @@ def _when(logs: Sequence[Json]) -> tuple[dict[str, Any], dict[str, Any]]:
     Dates of files are mostly those of a copy: then flights are counted, in the order of their dates and names.
     """
     if all(log["dated_by"] == "log" for log in logs):
-        return {log["name"]: _date(log["started"]) for log in logs}, {"type": "date"}
+        return {log["name"]: date(log["started"]) for log in logs}, {"type": "date"}
     count: Counter[str] = Counter()
     places = {}
     readable = (log for log in logs if log["status"] != "unreadable")
@@ -137,7 +133,7 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
     }  # fmt: skip
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
     changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
-    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS])
+    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], compact=True)
     count = Counter(row["unit"] for row in rows if row["baseline"]).values()
     most = "up to " * (len(set(count)) > 1) + str(max(count))
     intro = (
@@ -150,7 +146,7 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
 
 def _changes_of(own: Sequence[Json]) -> tuple[str, ...]:
     """How many flights of a vehicle have changed, the first and last of them, and what had at the last; or nothing."""
-    changed = [row for row in own if row["verdict"] != "unchanged"]
+    changed = [row for row in own if has_changed(row)]
     if not changed:
         return ()
     first, last = changed[0], changed[-1]
@@ -165,19 +161,20 @@ def _over_time(logs: Sequence[Json], parameters: Sequence[Json]) -> dict[str, An
     started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
     when = _when(logs)
     rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
-    figures = [
-        f for name in dict.fromkeys(p["parameter"] for p in rows) if (f := _one_figure(name, rows, started, *when))
-    ]
-    if not figures:
+    names = dict.fromkeys(p["parameter"] for p in rows)
+    views = [_view(name, [p for p in rows if p["parameter"] == name], started, *when) for name in names]
+    if not views:
         return None
     intro = f"Every flight with its 95 % interval; a vehicle is a folder.{_counted(when[1])}"
-    return section("over-time", "Parameters over time", intro, figures)
+    drawn = {"id": "fleet-parameters", "title": "Value of each flight", "views": views, "height": 280}
+    return section("over-time", "Parameters over time", intro, [drawn])
 
 
-def _one_figure(
+def _view(
     name: str, rows: Sequence[Json], started: Mapping[str, tuple[float, str]], places: Json, time: Json
-) -> dict[str, Any] | None:  # fmt: skip
-    mine = sorted((p for p in rows if p["parameter"] == name), key=lambda p: started[p["log"]][0])
+) -> dict[str, Any]:
+    """One parameter of every vehicle over its flights."""
+    mine = sorted(rows, key=lambda p: started[p["log"]][0])
     units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
     data = []
     for i, unit in enumerate(sorted(units)[:MOST_UNITS]):
@@ -189,95 +186,12 @@ def _one_figure(
         bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
         line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
         data.append({**line, "x": [places[p["log"]] for p in own]})
-    if not data:
-        return None
     layout = {
         "xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
         "showlegend": True,
     }  # fmt: skip
-    return figure(f"fleet-{name}", name, data, layout, 280)
+    return {"label": name, "data": data, "layout": layout}
 
 
 def _gap(high: float | None, low: float | None) -> float:
     return 0.0 if high is None or low is None or not math.isfinite(high - low) else max(high - low, 0.0)
-
-
-def _date(seconds: float) -> str:
-    return str(np.datetime_as_string(np.datetime64(round(seconds), "s"))).replace("T", " ")
-
-
-def _section(identifier: str, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], intro: str = "") -> Any:
-    if not rows:
-        return None
-    more = f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
-    return section(identifier, title, f"{intro}{more}".strip(), tables=[rows_of(head, rows[:MOST_ROWS])])
-
-
-def _units(summary: Json) -> Any:
-    rows = [
-        (unit["unit"], f"{unit['done']} of {unit['logs']}", p["parameter"], number(p["median"]), unit_text(p["unit"]),
-         percent(p["spread"]), str(p["flights"]))
-        for unit in summary["units"]
-        for p in unit["parameters"]
-    ]  # fmt: skip
-    head = ("Vehicle", "Logs with an answer", "Parameter", "Median", "Unit", "Spread between flights", "Flights")
-    return _section("vehicles", "Vehicles", head, rows, "Spread: robust standard deviation over the median.")
-
-
-def _drifts(summary: Json) -> Any:
-    rows = [
-        (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
-         f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
-         str(d["flights"]))
-        for d in summary["drifts"]
-    ]  # fmt: skip
-    head = ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights")
-    intro = "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."
-    return _section("drift", "Drift", head, rows, intro)
-
-
-def _outliers(summary: Json) -> Any:
-    rows = [
-        (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
-         number(o["deviations"], 2))
-        for o in summary["outliers"]
-    ]  # fmt: skip
-    head = ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations")
-    return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
-
-
-def _common(summary: Json) -> Any:
-    rows = [
-        (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
-         f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
-         f"{number(c['lowest'])} … {number(c['highest'])}")
-        for c in summary["common"]
-    ]  # fmt: skip
-    head = ("Vehicle", "Finding", "Flights", "Median", "Range")
-    return _section("common", "What the simulation gets wrong, flight after flight", head, rows)
-
-
-def _unusable(summary: Json) -> Any:
-    rows = [
-        (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
-        for r in summary["reasons"]
-    ]
-    return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)
-
-
-def _logs(logs: Sequence[Json]) -> Any:
-    """Every log with its error and where its date comes from, the worst error first."""
-    worst = sorted(logs, key=lambda log: -(log["mse_fitted"] if log["mse_fitted"] is not None else math.inf))
-    rows = [
-        (
-            log["name"], log["unit"], f"{_date(log['started'])} ({_DATED.get(log['dated_by'], log['dated_by'])})",
-            log["status"], number(log["mse_initial"], 3), number(log["mse_fitted"], 3),
-        )
-        for log in worst
-    ]  # fmt: skip
-    head = ("Log", "Vehicle", "Date (and whose)", "Outcome", "Error before", "Error after")
-    intro = "Error over one second of simulation, in noise variances: 1 is the noise floor."
-    return _section("logs", "Every log", head, rows, intro)
-
-
-_DATED = {"log": "clock in the log", "file": "date of the file"}

@@ -26,9 +26,9 @@ def section(
     }  # fmt: skip
 
 
-def rows_of(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> JsonDict:
-    """A table."""
-    return {"head": list(head), "rows": [list(row) for row in rows]}
+def rows_of(head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", compact: bool = False) -> JsonDict:
+    """A table; folded under a line where one is given; on a phone each row is a card, or compact: a line or two."""
+    return {"head": list(head), "rows": [list(row) for row in rows], "fold": fold, "compact": compact}
 
 
 def figure(

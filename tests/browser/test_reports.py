@@ -236,6 +236,23 @@ def test_the_other_reports_too(
         assert one.complaints == []
 
 
+@pytest.mark.parametrize("width", [390, 700])
+def test_a_fleet_is_read_on_a_phone(chromium: Browser, fleet_page: Path, shots: Path, width: int) -> None:
+    """A few screens as it opens; unfolded, two lines a log or three; what is folded opens where it is touched."""
+    with opened(chromium, fleet_page, width) as one:
+        page = one.page
+        assert page.evaluate("document.documentElement.scrollHeight") < 4000
+        page.screenshot(path=shots / f"fleet_page-{width}-folded.png", full_page=True)
+        assert not page.locator("#logs table").first.is_visible()
+        page.locator("#logs summary").first.click()
+        assert page.locator("#logs table").first.is_visible()
+        one.unfold()
+        rows = page.locator("#logs tbody tr").count()
+        assert rows > 100
+        assert page.locator("#logs").evaluate("part => part.clientHeight") < 80 * rows
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
 def test_the_airframe_names_the_damaged_rotor_within_its_picture(chromium: Browser, health_page: Path) -> None:
     with opened(chromium, health_page, 390) as one:
         page = one.page

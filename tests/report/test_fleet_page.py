@@ -105,10 +105,11 @@ def test_every_log_is_named_with_its_error_and_whose_date_it_has() -> None:
     (section,) = [s for s in page["sections"] if s["id"] == "logs"]
     table = {row[0]: row for row in section["tables"][0]["rows"]}
     assert list(table) == ["a/1.csv", "a/2.csv", "a/0.csv"]
-    assert table["a/2.csv"][3:] == ["done", "20", "1.02"]
-    assert "clock in the log" in table["a/0.csv"][2]
-    assert "date of the file" in table["a/1.csv"][2]
-    assert table["a/1.csv"][3] == "unreadable"
+    assert table["a/2.csv"][1:3] == ["done", "20 → 1.02"]
+    assert table["a/0.csv"][3] == "2020-09-13 12:26 (log)"
+    assert table["a/1.csv"][1:3] == ["unreadable", "–"]
+    assert table["a/1.csv"][3].endswith("(file)")
+    assert section["tables"][0]["fold"] == "a: 3 logs"
 
 
 def test_a_fleet_of_bad_fits_is_not_green() -> None:
