@@ -2,32 +2,32 @@
 
     python -m benchmarks.fleet --logs 1000 --workers 1 2 --kills 0 20 [--out docs/results]
 
-Flies a few vehicles, writes that many logs of 10 s of them, and runs the command's own cluster over all; before it a
-plain loop in one process over some of them.  Workers are killed at random places of the run, one at a time.  Beside the
-clock's time stands the processor time that parent and workers took, also those killed, which other work on the machine
-hardly lengthens: logs per processor second beside those of the plain loop are the throughput per core.
+Flies a few vehicles, writes that many logs of 10 s of them, and runs the command over all, its start and its report
+included; before it a plain loop in one process over some of them.  Workers are killed at random places of the run, one
+at a time.  Beside the clock's time stands the processor time that parent and workers took, also those killed, which
+other work on the machine hardly lengthens: logs per processor second beside those of the plain loop are the throughput
+per core.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import pickle
 import random
-import resource
 import signal
+import sqlite3
+import subprocess
+import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from quadid_cli.fleet_cluster import cluster, results
-from quadid_cli.fleet_folder import find_jobs
-from quadid_cli.fleet_store import open_store
 from quadid_replay import write_mcap
 
 from benchmarks.speed.timing import child
@@ -41,7 +41,7 @@ FLOWN = 10
 
 
 class Run(NamedTuple):
-    """One run over all logs: seconds of the clock and of processors, peak memory [MB], logs by outcome and twice."""
+    """One run over all logs: seconds of the clock and of processors, peak memory [MB], logs by outcome."""
 
     workers: int
     kills: int
@@ -51,13 +51,12 @@ class Run(NamedTuple):
     parent_memory: float
     worker_memory: float
     outcomes: Counter[str]
-    twice: int
 
 
 HEAD = (
     "workers", "killed", "seconds", "logs/s", "speed-up", "processor of workers, s/log", "processor of parent, s/log",
     "throughput per core, of a plain loop's", "peak of parent [MB]", "peak of a worker [MB]", "outcomes",
-    "lost", "answered twice",
+    "lost",
 )  # fmt: skip
 PLAIN = """
 import json, pickle, sys, time
@@ -111,7 +110,7 @@ def told(options: argparse.Namespace, plain: float, runs: list[Run], load: tuple
         "# Many logs, measured",
         "",
         f"`python -m benchmarks.fleet --logs {logs} --workers {count} --kills {killed} --out docs/results`: {logs}",
-        f"logs of {SECONDS:g} s, identified by the own cluster of `quadid fleet` on {os.cpu_count()} cores; load",
+        f"logs of {SECONDS:g} s, identified by `quadid fleet` on {os.cpu_count()} cores; load",
         f"average {load[0]:.1f} before and {load[1]:.1f} after. A plain loop in one process takes {plain:.3f} s of the",
         "processor for a log. Workers that are killed die at random places of the run; what they had begun and the",
         "start of those that replace them are counted.",
@@ -135,7 +134,7 @@ def _cells(one: Run, first: Run, logs: int, plain: float, idle: bool) -> list[st
         f"{first.seconds / one.seconds:.2f}{'' if idle or one is first else ', not sure'}",
         f"{one.worker_cpu / logs:.3f}", f"{one.parent_cpu / logs:.4f}",
         f"{logs * plain / (one.worker_cpu + one.parent_cpu):.0%}", f"{one.parent_memory:.0f}",
-        f"{one.worker_memory:.0f}", outcomes, f"{logs - one.outcomes.total() + one.twice}", f"{one.twice}",
+        f"{one.worker_memory:.0f}", outcomes, f"{logs - one.outcomes.total()}",
     ]  # fmt: skip
 
 
@@ -156,66 +155,75 @@ def write_logs(folder: Path, count: int) -> None:
 
 
 def jobs_of(folder: Path) -> Sequence[Job]:
-    """Jobs of all logs of the folder."""
-    return find_jobs(folder, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False).jobs
+    """Jobs of the plain loop, as the command makes them."""
+    text = Vehicle.shipped("pelican").to_yaml()
+    paths = sorted(folder.rglob("*.mcap"))[:PLAIN_LOGS]
+    return [Job(str(path), path.name, path.parent.name, text, path.stat().st_size, 0, "", 50.0, 1, False)
+            for path in paths]  # fmt: skip
 
 
 def plain_loop(folder: Path, place: Path) -> float:
     """Processor time of a log in a process that identifies one after the other [s]."""
     path = place / "jobs.pkl"
-    path.write_bytes(pickle.dumps(list(jobs_of(folder))[:PLAIN_LOGS]))
+    path.write_bytes(pickle.dumps(jobs_of(folder)))
     return float(child(PLAIN, str(path), environment={"OPENBLAS_NUM_THREADS": "1"})["a_log"])
 
 
 def run(folder: Path, out: Path, workers: int, kills: int = 0) -> Run:
     """Identifies the folder; kills that many workers at random places."""
     out.mkdir()
-    jobs = jobs_of(folder)
-    names: Counter[str] = Counter()
-    outcomes: Counter[str] = Counter()
-    seen = [0.0, 0.0]
+    count = sum(1 for _ in folder.rglob("*.mcap"))
     rng = random.Random(kills)
-    places = set(rng.sample(range(1, len(jobs)), kills))
-    with open_store(out / "fleet.sqlite") as store, cluster(None, workers, "2GiB") as client:
-        done = threading.Event()
-        watcher = threading.Thread(target=_watch, args=(seen, done))
-        watcher.start()
-        begin, parent, before = time.perf_counter(), time.process_time(), _workers_processor_time()
-        for row in results(client, jobs):
-            store.put(row)
-            outcomes[row["status"]] += 1
-            names[row["name"]] += 1
-            if outcomes.total() in places:
-                os.kill(rng.choice(list(client.run(os.getpid).values())), signal.SIGKILL)
-        seconds, parent = time.perf_counter() - begin, time.process_time() - parent
-        busy = _workers_processor_time() - before
-        done.set()
-        watcher.join()
-    twice = sum(count - 1 for count in names.values())
-    return Run(workers, kills, seconds, parent, busy, seen[0], seen[1], outcomes, twice)
+    places = sorted(rng.sample(range(1, count), kills), reverse=True)
+    command = [str(Path(sys.executable).with_name("quadid")), "fleet", str(folder), "--vehicle", "pelican"]
+    command += ["--workers", str(workers), "--out", str(out), "--json", str(out / "fleet.json")]
+    begin, seen = time.perf_counter(), Seen()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
+        while running.poll() is None:
+            time.sleep(0.2)
+            started = seen.look(running.pid)
+            if places and started and stored(out / "fleet.sqlite") >= places[-1]:
+                os.kill(rng.choice(started), signal.SIGKILL)
+                places.pop()
+    seconds = time.perf_counter() - begin
+    outcomes = Counter(json.loads((out / "fleet.json").read_text(encoding="utf-8"))["counts"])
+    return Run(workers, kills, seconds, *seen.processor, *seen.memory, outcomes)
 
 
-def _workers_processor_time() -> float:
-    """Processor time of all children, those that live and those that have ended [s]."""
-    import psutil
+def stored(database: Path) -> int:
+    """Logs with an outcome so far."""
+    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
+        return int(connection.execute("SELECT count(*) FROM logs").fetchone()[0])
 
-    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    living = 0.0
-    for process in psutil.Process().children(recursive=True):
+
+class Seen:
+    """Processor time [s] and peak memory [MB] of the command and of the processes below it, as far as they were seen.
+
+    Attributes:
+        processor: of the command, and of all below it, also those that have ended.
+        memory: of the command, and of the largest below it.
+    """
+
+    def __init__(self) -> None:
+        self.processor = [0.0, 0.0]
+        self.memory = [0.0, 0.0]
+
+    def look(self, pid: int) -> list[int]:
+        """Looks at what runs now; returns the workers, which a process of the command forks."""
+        import psutil
+
         with contextlib.suppress(psutil.NoSuchProcess):
-            living += sum(process.cpu_times()[:4])  # and of its children that have ended
-    return ended.ru_utime + ended.ru_stime + living
+            own = psutil.Process(pid)
+            below = own.children(recursive=True)
+            direct = {process.pid for process in own.children()}
+            self._note(0, [own], 2)
+            self._note(1, below, 4)  # and of their children that have ended
+            return [process.pid for process in below if process.ppid() in direct]
+        return []
 
-
-def _watch(seen: list[float], done: threading.Event) -> None:
-    import psutil
-
-    while not done.wait(0.5):
-        own = psutil.Process()
-        seen[0] = max(seen[0], own.memory_info().rss / 1e6)
-        for process in own.children(recursive=True):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                seen[1] = max(seen[1], process.memory_info().rss / 1e6)
+    def _note(self, which: int, processes: Sequence[Any], times: int) -> None:
+        self.processor[which] = max(self.processor[which], sum(sum(p.cpu_times()[:times]) for p in processes))
+        self.memory[which] = max([self.memory[which], *(p.memory_info().rss / 1e6 for p in processes)])
 
 
 if __name__ == "__main__":

@@ -215,9 +215,10 @@ def particles_and_parameters(rounds: int) -> dict[str, Any]:
 def memory(folder: Path) -> dict[str, Any]:
     """Peak memory of `quadid identify` of a 500 s log."""
     code = (
-        "import sys\nfrom quadid_cli.main import app_main\n"
+        "import contextlib, io, runpy, sys\nfrom pathlib import Path\n"
         "sys.argv = ['quadid', 'identify', sys.argv[1], '--vehicle', 'pelican', '--out', sys.argv[2]]\n"
-        "import contextlib, io\nwith contextlib.redirect_stdout(io.StringIO()):\n    app_main()\nprint('{}')"
+        "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):\n"
+        "    runpy.run_path(str(Path(sys.executable).with_name('quadid')), run_name='__main__')\nprint('{}')"
     )
     return child(code, str(logged(folder, 500.0, ".mcap")), str(folder))
 

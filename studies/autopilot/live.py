@@ -15,7 +15,6 @@ from quadid_replay.mavlink_frames import read_frames
 
 from studies.autopilot.flights import Outcome
 
-COMMAND = "import sys; from quadid_cli.main import app_main; sys.exit(app_main())"
 WARM = 120.0
 """Longest wait for the fit process to be warm [s]."""
 LINGER = 5.0
@@ -34,7 +33,7 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind(("127.0.0.1", 0))
         port, history = _free_port(), Path(folder) / "history.sqlite"
-        command = [sys.executable, "-c", COMMAND]
+        command = [str(Path(sys.executable).with_name("quadid"))]
         served = subprocess.Popen(
             [*command, "serve", "--vehicle", str(vehicle), "--mavlink", f"udpin:127.0.0.1:{port}",
              "--history", str(history)],

@@ -1,0 +1,1 @@
+"""Speed and load of the commands and the service, measured from outside."""
