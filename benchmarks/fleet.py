@@ -187,7 +187,8 @@ def run(folder: Path, out: Path, workers: int, kills: int = 0) -> Run:
                 places.pop()
     seconds = time.perf_counter() - begin
     outcomes = Counter(json.loads((out / "fleet.json").read_text(encoding="utf-8"))["counts"])
-    return Run(workers, kills, seconds, *seen.processor, *seen.memory, outcomes)
+    (parent, busy), (own, largest) = seen.processor, seen.memory
+    return Run(workers, kills, seconds, parent, busy, own, largest, outcomes)
 
 
 def stored(database: Path) -> int:
