@@ -15,7 +15,7 @@ from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, free_names, refit, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
-from quadid.diagnose.result import Diagnosis, Verdict, describe
+from quadid.diagnose.result import Diagnosis, Explanation, describe
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
@@ -94,14 +94,14 @@ def diagnose(
     verdict = judge(search.nominal, model, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
     if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
-        verdict = Verdict.UNKNOWN
+        verdict = Explanation.UNKNOWN
     doubted = {label: m for label, m in fewer.items() if label in doubts}
     parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
     parameters, moved = possible_moments(parameters)
     weak = late_unknown(model, parameters) | slight_changes(model)
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
-    findings = describe(decisive, search, worth, [] if verdict is Verdict.UNKNOWN else believed)
+    findings = describe(decisive, search, worth, [] if verdict is Explanation.UNKNOWN else believed)
     warnings = [
         *(f.text for f in faults),
         *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
@@ -127,7 +127,7 @@ def diagnose(
 
 
 def _nominal_parameters(
-    decisive: Shooting, short: Shooting, model: Model, verdict: Verdict, doubted: Mapping[str, Model] | None = None,
+    decisive: Shooting, short: Shooting, model: Model, verdict: Explanation, doubted: Mapping[str, Model] | None = None,
     held: Held | None = None,
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
@@ -154,7 +154,7 @@ def _nominal_parameters(
     reasons = (*on_bounds(nominal), *reasons)
     for cause in model.causes:
         nominal = tied(nominal, EFFECTS[cause.effect].ties)
-    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Verdict.UNKNOWN else {}
+    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
     if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
         spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
     safe = held.regardless() if held and spoilt else set()
@@ -253,7 +253,7 @@ def _with_noise(noise: NoiseModel, schedule: Sequence[Shooting], search: Search)
     return [s.with_noise(noise) for s in schedule], replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
-def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Verdict:
+def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Explanation:
     """Verdict from what the causes explain and what is left.
 
     Args:
@@ -266,8 +266,8 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
     least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
     structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
     if not model.causes:
-        return Verdict.UNKNOWN if structure else Verdict.NOTHING_FOUND
+        return Explanation.UNKNOWN if structure else Explanation.NOTHING_FOUND
     if not structure:
-        return Verdict.EXPLAINED
+        return Explanation.EXPLAINED
     share = SHARE_TO_NAME if len(model.effects) > 1 else SHARE_ALONE
-    return Verdict.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Verdict.UNKNOWN
+    return Explanation.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Explanation.UNKNOWN

@@ -28,7 +28,7 @@ TIME_SIGMA = 0.1
 """Standard deviation [s] given to a change time, the resolution of its scan."""
 
 
-class Verdict(StrEnum):
+class Explanation(StrEnum):
     """Overall answer."""
 
     NOTHING_FOUND = "nothing_found"
@@ -40,10 +40,10 @@ class Verdict(StrEnum):
     def sentence(self) -> str:
         """The verdict in plain words."""
         return {
-            Verdict.NOTHING_FOUND: "The simulation agrees with the flight: nothing was found that it gets wrong.",
-            Verdict.EXPLAINED: "These causes explain all of the model error.",
-            Verdict.PARTLY_EXPLAINED: "These causes explain most of the model error; some remains.",
-            Verdict.UNKNOWN: "The simulation gets something wrong that no known cause explains.",
+            Explanation.NOTHING_FOUND: "The simulation agrees with the flight: nothing was found that it gets wrong.",
+            Explanation.EXPLAINED: "These causes explain all of the model error.",
+            Explanation.PARTLY_EXPLAINED: "These causes explain most of the model error; some remains.",
+            Explanation.UNKNOWN: "The simulation gets something wrong that no known cause explains.",
         }[self]
 
 
@@ -105,7 +105,7 @@ class Diagnosis:
     values; `prediction` is what predicts better, if anything does.
     """
 
-    verdict: Verdict
+    verdict: Explanation
     findings: tuple[Finding, ...]
     validation: Validation
     remainder: Remainder

@@ -8,8 +8,8 @@ from quadid.inspection.airborne import proposed_cuts as proposed_cuts
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
 from quadid.inspection.findings import FATAL as FATAL
 from quadid.inspection.findings import Check as Check
+from quadid.inspection.findings import CheckResult as CheckResult
 from quadid.inspection.findings import Inspection as Inspection
-from quadid.inspection.findings import Verdict as Verdict
 from quadid.inspection.geometry import geometry_check, mass_check
 from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
 from quadid.inspection.outlook import missing_signals, parameter_outlook
@@ -59,12 +59,12 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
 def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans, lagged: Lagged | str) -> list[Check]:
     """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
     speeds = rotor_speed_check(recording, vehicle, spans)
-    if speeds.verdict is Verdict.ERROR:
+    if speeds.verdict is CheckResult.ERROR:
         return [speeds]
     hover, order = hover_check(recording, vehicle, spans), motor_order_check(lagged, vehicle)
     time = rotor_timing_check(recording, vehicle, spans)
     checks = [speeds, hover, order, time]
-    if Verdict.ERROR not in (hover.verdict, order.verdict, time.verdict):
+    if CheckResult.ERROR not in (hover.verdict, order.verdict, time.verdict):
         mass = mass_check(recording, vehicle, spans, hover.numbers.get("b_from_hover"))
         checks += [check for check in (mass, geometry_check(lagged, vehicle)) if check is not None]
     return checks

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.inspection.airborne import Spans, within
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import linear, sample_period
 from quadid.resampling_plan import GAP
 from quadid.turning import conjugate, rotated, turn
@@ -92,7 +92,7 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
     accel = recording.channels.get("accel")
     if accel is None:
-        return Check("gravity", Verdict.UNKNOWN, "no accelerometer")
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer")
     values = accel.values[within(accel.t, spans)] if spans else accel.values
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
@@ -102,42 +102,49 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
         if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
             fix = f"multiply acceleration by {factor:.6g}"
-            return Check("gravity", Verdict.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
+            return Check("gravity", CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
     if spans and steady < 0.3 * GRAVITY:
         return Check(
-            "gravity", Verdict.ERROR, f"{message}: gravity is missing", "log specific force, not linear acceleration",
-            numbers,
+            "gravity", CheckResult.ERROR, f"{message}: gravity is missing",
+            "log specific force, not linear acceleration", numbers,
         )  # fmt: skip
     if not 0.5 < length / GRAVITY < 2.0:
         return Check(
-            "gravity", Verdict.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration", numbers
+            "gravity",
+            CheckResult.ERROR,
+            f"{message}: this is no specific force in m/s^2",
+            "log raw acceleration",
+            numbers,
         )
     if not spans and abs(z) < 0.8 * length:
-        return Check("gravity", Verdict.UNKNOWN, f"{message}; the vehicle does not fly in this log", numbers=numbers)
+        return Check(
+            "gravity", CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log", numbers=numbers
+        )
     if z > 0.5 * length:
         return Check(
-            "gravity", Verdict.ERROR, f"{message}: z points up (FLU, as ROS has it) or the sign is reversed",
+            "gravity", CheckResult.ERROR, f"{message}: z points up (FLU, as ROS has it) or the sign is reversed",
             "turn body vectors to FRD: negate y and z", numbers,
         )  # fmt: skip
     if z > -0.5 * length:
         return Check(
-            "gravity", Verdict.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
+            "gravity", CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
         )
-    return Check("gravity", Verdict.OK, message, numbers=numbers)
+    return Check("gravity", CheckResult.OK, message, numbers=numbers)
 
 
 def attitude_check(recording: Recording) -> Check:
     """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
     rates = gyro_check(recording)
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
-    if rates.verdict is Verdict.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
+    if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
     down = float(np.median(_in_world(accel, attitude)[:, 2]))
     if down < 0.5 * GRAVITY:
         return rates
     return Check(
-        rates.name, Verdict.ERROR, f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): "
-        "its world has z up", "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
+        rates.name, CheckResult.ERROR,
+        f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
+        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
     )  # fmt: skip
 
 
@@ -145,7 +152,7 @@ def gyro_check(recording: Recording) -> Check:
     """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
     gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
     if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
-        return Check("gyro_attitude", Verdict.UNKNOWN, "needs gyro and attitude")
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
     best: tuple[str, AxisMap] | None = None
     for name, q in _attitude_readings(attitude.values):
         measured, derived = _moving_rates(gyro, attitude.t, q)
@@ -155,7 +162,7 @@ def gyro_check(recording: Recording) -> Check:
         if best is None or _likely(name, fit) > _likely(*best):
             best = (name, fit)
     if best is None:
-        return Check("gyro_attitude", Verdict.UNKNOWN, "too little rotation to compare gyro and attitude")
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
     return _judge_rates(*best)
 
 
@@ -189,28 +196,28 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     if fit.r2 < _CLEAR:
         message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
         fix = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
-        return Check("gyro_attitude", Verdict.ERROR, message, fix, numbers)
+        return Check("gyro_attitude", CheckResult.ERROR, message, fix, numbers)
     if reading != "as given":
         message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
         return Check(
-            "gyro_attitude", Verdict.ERROR, message, "write wxyz quaternions, body to world, FRD to NED", numbers
+            "gyro_attitude", CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED", numbers
         )
     if not fit.straight:
         message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         fix = "body axes must be FRD for both; ROS' FLU has y and z reversed"
         if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
             fix = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
-        return Check("gyro_attitude", Verdict.ERROR, message, fix, numbers)
+        return Check("gyro_attitude", CheckResult.ERROR, message, fix, numbers)
     for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
         if 0.75 < fit.scale / scale < 1.33:
             return Check(
-                "gyro_attitude", Verdict.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})",
+                "gyro_attitude", CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})",
                 "convert to radians", numbers,
             )  # fmt: skip
     message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
-    verdict = Verdict.OK if 0.85 < fit.scale < 1.15 else Verdict.WARNING
+    verdict = CheckResult.OK if 0.85 < fit.scale < 1.15 else CheckResult.WARNING
     return Check(
-        "gyro_attitude", verdict, message, "" if verdict is Verdict.OK else "check scales and filters", numbers
+        "gyro_attitude", verdict, message, "" if verdict is CheckResult.OK else "check scales and filters", numbers
     )
 
 
@@ -219,20 +226,22 @@ def velocity_check(recording: Recording) -> Check:
     channels = recording.channels
     accel, attitude, velocity = (channels.get(n) for n in ("accel", "attitude", "velocity"))
     if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
-        return Check("velocity_attitude", Verdict.UNKNOWN, "needs accelerometer, attitude and velocity")
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity")
     gained, derived = _velocity_gains(accel, attitude, velocity)
     if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
-        return Check("velocity_attitude", Verdict.UNKNOWN, "too little horizontal acceleration to compare")
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
     fit = fit_axes(derived[:, :2], gained[:, :2])
     numbers = {"scale": fit.scale, "r2": fit.r2}
     if fit.r2 < _CLEAR:
         message = f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})"
-        return Check("velocity_attitude", Verdict.UNKNOWN, message, numbers=numbers)
+        return Check("velocity_attitude", CheckResult.UNKNOWN, message, numbers=numbers)
     if not fit.straight:
         message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
-        return Check("velocity_attitude", Verdict.ERROR, message, "use NED for both; ROS' ENU swaps x and y", numbers)
+        return Check(
+            "velocity_attitude", CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y", numbers
+        )
     message = f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
-    return Check("velocity_attitude", Verdict.OK, message, numbers=numbers)
+    return Check("velocity_attitude", CheckResult.OK, message, numbers=numbers)
 
 
 def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:

@@ -15,7 +15,7 @@ FATAL = (
 """Checks whose error means that nothing may be fitted to the log."""
 
 
-class Verdict(StrEnum):
+class CheckResult(StrEnum):
     """Outcome of one check."""
 
     OK = "ok"
@@ -76,7 +76,7 @@ class Check:
     """
 
     name: str
-    verdict: Verdict
+    verdict: CheckResult
     message: str
     fix: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
@@ -133,7 +133,7 @@ class Inspection:
     @property
     def usable(self) -> bool:
         """Whether at least one parameter can be identified and no check says that the data are wrong."""
-        wrong = any(check.verdict is Verdict.ERROR for check in self.checks)
+        wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
         return any(outlook.possible for outlook in self.parameters) and not wrong
 
     def to_dict(self) -> dict[str, Any]:

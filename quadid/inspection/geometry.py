@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from quadid.inspection.airborne import Spans, within
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.inspection.motor_checks import Lagged
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -47,9 +47,9 @@ def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hove
         f"the known thrust coefficient {b:.3g} N s^2/rad^2 carries {mass:.3g} kg, {factor:.3f} times the stated mass"
     )
     if abs(factor - 1.0) <= max(_MASS_OFF, 3.0 * sigma):
-        return Check("mass", Verdict.OK, message, numbers=numbers)
+        return Check("mass", CheckResult.OK, message, numbers=numbers)
     fix = f"weigh the vehicle: {mass:.3g} kg would fit; or check the thrust stand and the unit of the rotor speeds"
-    return Check("mass", Verdict.WARNING, message, fix, numbers)
+    return Check("mass", CheckResult.WARNING, message, fix, numbers)
 
 
 def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
@@ -84,7 +84,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     """
     name = "geometry"
     if isinstance(lagged, str):
-        return Check(name, Verdict.UNKNOWN, lagged)
+        return Check(name, CheckResult.UNKNOWN, lagged)
     inertia, place = vehicle.initial[2:4], vehicle.rotor_positions
     fits = [
         _map(squares @ np.column_stack([-place[:, 1], place[:, 0]]), motion[:, :2] * inertia)
@@ -94,7 +94,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     if float(np.min(share)) < _CLEAR:
         axis = ("roll", "pitch")[int(np.argmin(share))]
         return Check(
-            name, Verdict.UNKNOWN,
+            name, CheckResult.UNKNOWN,
             f"rotor torques explain only {np.min(share):.0%} of the {axis} motion: too little to judge positions",
         )  # fmt: skip
     angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
@@ -103,7 +103,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     if abs(angle) > _TURNED:
         degrees = math.degrees(angle)
         return Check(
-            name, Verdict.ERROR, f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z",
+            name, CheckResult.ERROR, f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z",
             f"turn the rotor positions of the vehicle file by {degrees:+.0f} deg (x towards y)", numbers,
         )  # fmt: skip
     return _judge_scale(vehicle, scale, numbers)
@@ -121,14 +121,14 @@ def _judge_scale(vehicle: Vehicle, scale: float, numbers: dict[str, float]) -> C
     turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
     if thrust is None or not all(inertias):
         return Check(
-            "geometry", Verdict.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
+            "geometry", CheckResult.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
         )
     factor = scale / thrust[0]
     numbers = {**numbers, "arm_factor": factor}
     if abs(factor - 1.0) <= _ARM_OFF:
-        return Check("geometry", Verdict.OK, f"{turned}, the arm within {abs(factor - 1.0):.0%}", numbers=numbers)
+        return Check("geometry", CheckResult.OK, f"{turned}, the arm within {abs(factor - 1.0):.0%}", numbers=numbers)
     message = (
         f"roll and pitch answer {factor:.2f} times as strongly as the stated arm of {vehicle.arm:.3g} m lets expect"
     )
     fix = f"measure the arm: {factor * vehicle.arm:.3g} m, {factor:.2f} times it, would fit; or the inertias are wrong"
-    return Check("geometry", Verdict.WARNING, message, fix, numbers)
+    return Check("geometry", CheckResult.WARNING, message, fix, numbers)

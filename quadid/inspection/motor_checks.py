@@ -10,7 +10,7 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.grid import to_windows
 from quadid.inspection.airborne import Spans, within
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.model.supply import voltage_at
 from quadid.model.thrust import ThrustModel
 from quadid.resample import moving_mean
@@ -38,10 +38,10 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
-        return Check("hover", Verdict.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
+        return Check("hover", CheckResult.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
     inside = within(signal.t, spans)
     if not inside.any():
-        return Check("hover", Verdict.UNKNOWN, "no flight in this log, by its rotor speeds")
+        return Check("hover", CheckResult.UNKNOWN, "no flight in this log, by its rotor speeds")
     speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
     guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))
     needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
@@ -50,16 +50,16 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     numbers = {"b_from_hover": needed, "speed_rad_s": speed}
     message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
     if low <= needed <= high:
-        return Check("hover", Verdict.OK, f"{message}; bounds {low:.3g} to {high:.3g}", numbers=numbers)
+        return Check("hover", CheckResult.OK, f"{message}; bounds {low:.3g} to {high:.3g}", numbers=numbers)
     for unit, factor in (("rpm", _RPM), ("rev/s", 2.0 * np.pi)):
         if low <= needed / factor**2 <= high:
             return Check(
-                "hover", Verdict.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
+                "hover", CheckResult.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
                 f"multiply rotor speeds by {factor:.6g}, or use the vehicle file of this log", numbers,
             )  # fmt: skip
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
-    return Check("hover", Verdict.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
+    return Check("hover", CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
 
 
 def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
@@ -78,7 +78,9 @@ Lagged = list[tuple[FloatArray, FloatArray]]
 
 def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     """Correlates roll, pitch and yaw torque of every motor order with angular acceleration (of `lagged_motion`)."""
-    return Check("motor_order", Verdict.UNKNOWN, lagged) if isinstance(lagged, str) else _judge_order(lagged, vehicle)
+    return (
+        Check("motor_order", CheckResult.UNKNOWN, lagged) if isinstance(lagged, str) else _judge_order(lagged, vehicle)
+    )
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
@@ -131,7 +133,7 @@ def _quick_motion(windows: Sequence[Window], thrust: list[FloatArray], lag: int)
 def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     rotors = len(vehicle.rotors)
     if float(np.max(np.std(lagged[0][1], axis=0))) < 0.05:
-        return Check("motor_order", Verdict.UNKNOWN, "too little rotation to check the motor order")
+        return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
     orders = _orders(rotors)
     scores = _correlations(lagged, vehicle, orders)
     own, means = scores[orders.index(tuple(range(rotors)))], scores.mean(axis=1)
@@ -141,17 +143,21 @@ def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     if means[best] - own.mean() > _MARGIN and means[best] > _CLEAR:
         order = ", ".join(str(i + 1) for i in orders[best])
         return Check(
-            "motor_order", Verdict.ERROR,
+            "motor_order", CheckResult.ERROR,
             f"{text}; much better ({means[best]:.2f} on average) with the log's columns in the order {order}",
             f"reorder the rotors of the vehicle file to take columns {order}", numbers,
         )  # fmt: skip
     if own[2] < -_CLEAR:
         return Check(
-            "motor_order", Verdict.ERROR, f"{text}: yaw is reversed", "negate the spins in the vehicle file", numbers
+            "motor_order",
+            CheckResult.ERROR,
+            f"{text}: yaw is reversed",
+            "negate the spins in the vehicle file",
+            numbers,
         )
     if min(own[0], own[1]) > _CLEAR:
-        return Check("motor_order", Verdict.OK, text, numbers=numbers)
-    return Check("motor_order", Verdict.UNKNOWN, f"{text}: too weak to judge", numbers=numbers)
+        return Check("motor_order", CheckResult.OK, text, numbers=numbers)
+    return Check("motor_order", CheckResult.UNKNOWN, f"{text}: too weak to judge", numbers=numbers)
 
 
 def _orders(rotors: int) -> list[tuple[int, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.inspection.conventions import fit_axes, running_integral, usable_steps
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import sample_period
 from quadid.types import FloatArray
 from quadid.window import Channel, Recording
@@ -41,11 +41,11 @@ def position_checks(recording: Recording) -> list[Check]:
 def _compared(position: Channel, velocity: Channel) -> Check:
     moved, flown, independent = _changes(position, velocity)
     if independent < FEWEST_STRETCHES:
-        return Check("position_velocity", Verdict.UNKNOWN, "too few stretches without a gap to compare")
+        return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
     horizontal = fit_axes(moved[:, :2], flown[:, :2])
     if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and horizontal.r2 > CLEAR**2 and not horizontal.straight:
         return Check(
-            "position_velocity", Verdict.WARNING,
+            "position_velocity", CheckResult.WARNING,
             f"world axes of velocity differ from those of position: {horizontal} (R^2 {horizontal.r2:.2f})",
             "use NED for both; ROS' ENU swaps x and y", {"r2": horizontal.r2},
         )  # fmt: skip
@@ -66,12 +66,12 @@ def _compared(position: Channel, velocity: Channel) -> Check:
             off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
     if not told:
         message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
-        return Check("position_velocity", Verdict.UNKNOWN, message)
+        return Check("position_velocity", CheckResult.UNKNOWN, message)
     measured = f"velocity against change of position: {', '.join(told)}"
     if not off:
-        return Check("position_velocity", Verdict.OK, measured, numbers=numbers)
+        return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
     return Check(
-        "position_velocity", Verdict.WARNING,
+        "position_velocity", CheckResult.WARNING,
         f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
         "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
         "`velocity_scale`",

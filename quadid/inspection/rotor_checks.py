@@ -11,7 +11,7 @@ import numpy as np
 
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans, within
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import true_runs
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import BoolArray, FloatArray
@@ -42,11 +42,11 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
-        return Check(name, Verdict.UNKNOWN, error.found)
+        return Check(name, CheckResult.UNKNOWN, error.found)
     edges = _edges(spans)
     inside = within(signal.t, spans)
     if len(edges) < 4 or np.count_nonzero(inside) < 20:
-        return Check(name, Verdict.UNKNOWN, "too little flight to compare the rotors")
+        return Check(name, CheckResult.UNKNOWN, "too little flight to compare the rotors")
     squares, known = _means(signal.t, signal.values**2, edges, spans)
     problem = (
         _dead(signal.values[inside])
@@ -56,8 +56,8 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     )
     fix = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
     if problem is not None:
-        return Check(name, Verdict.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
-    return Check(name, Verdict.OK, "the rotors agree with each other and with the thrust felt")
+        return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
+    return Check(name, CheckResult.OK, "the rotors agree with each other and with the thrust felt")
 
 
 def _edges(spans: Spans) -> FloatArray:

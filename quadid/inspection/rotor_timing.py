@@ -12,7 +12,7 @@ import numpy as np
 
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
-from quadid.inspection.findings import Check, Verdict
+from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import linear, moving_mean, sample_period
 from quadid.rotor_signal import RotorSignal, rotor_signal
 from quadid.types import FloatArray
@@ -45,14 +45,14 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     name = "rotor_timing"
     gyro = recording.channels.get("gyro")
     if gyro is None or not spans:
-        return Check(name, Verdict.UNKNOWN, "needs gyro and rotor signal in flight")
+        return Check(name, CheckResult.UNKNOWN, "needs gyro and rotor signal in flight")
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
-        return Check(name, Verdict.UNKNOWN, error.found)
+        return Check(name, CheckResult.UNKNOWN, error.found)
     slowest = max(sample_period(signal.t), sample_period(gyro.t))
     if not slowest <= 1.0 / _SLOWEST_RATE:
-        return Check(name, Verdict.UNKNOWN, "rotor signal or gyro too slow to place them in time")
+        return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.
     width = max(3, round(2.5 * slowest / _STEP) | 1)
     peaks = [peak for times in _blocks(spans) for peak in _peaks(signal, gyro, vehicle, times, width)]
@@ -61,14 +61,14 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
 
 def _judge(name: str, peaks: list[_Peak]) -> Check:
     if not peaks:
-        return Check(name, Verdict.UNKNOWN, "too little flight to place the rotor signal in time")
+        return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
     correlation = float(np.median([p.correlation for p in peaks]))
     clear = np.array([p.lag for p in peaks if p.correlation > _CLEAR])
     about = [_about_median([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
     numbers = {"correlation": correlation}
     if len(clear) < max(2, len(peaks) // 2):
         message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
-        return Check(name, Verdict.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
+        return Check(name, CheckResult.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
     low, high = np.quantile(np.concatenate(about), [0.1, 0.9])
     lag = float(np.median(clear))
     numbers |= {"lag_s": lag, "wander_s": float(high - low)}
@@ -78,12 +78,12 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
     )
     fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
     if high - low > _WANDER:
-        return Check(name, Verdict.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
+        return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
     if lag < -_LATE:
-        return Check(name, Verdict.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
+        return Check(name, CheckResult.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
     if lag > _EARLY:
-        return Check(name, Verdict.ERROR, f"{message}: no motor answers that late", fix, numbers)
-    return Check(name, Verdict.OK, message, numbers=numbers)
+        return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
+    return Check(name, CheckResult.OK, message, numbers=numbers)
 
 
 def _about_median(lags: list[float]) -> FloatArray:

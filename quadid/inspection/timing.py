@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.inspection.airborne import Spans, within
-from quadid.inspection.findings import ChannelFacts, Check, Verdict
+from quadid.inspection.findings import ChannelFacts, Check, CheckResult
 from quadid.resample import measured_period, true_runs
 from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
@@ -78,7 +78,7 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         if not f.gaps and rows > FILLED * f.rate:
             message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
             checks.append(
-                Check("timing", Verdict.WARNING, message, "log it at this rate, or without the interpolated rows")
+                Check("timing", CheckResult.WARNING, message, "log it at this rate, or without the interpolated rows")
             )
     gaps = {f.name: f for f in facts if f.gaps}
     if gaps:
@@ -86,7 +86,8 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         text = ", ".join(f"{f.name} {f.gaps}" for f in gaps.values())
         checks.append(
             Check(
-                "timing", Verdict.WARNING, f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
+                "timing", CheckResult.WARNING,
+                f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
                 "windows are cut there; log to a faster card or at a lower rate",
                 {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
             )
@@ -96,14 +97,16 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
     ]
     for f in unsteady:
         message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
-        checks.append(Check("timing", Verdict.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
+        checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
     for f in facts:
         if f.name in ("gyro", "accel") and f.stuck > _STUCK:
             message = f"{f.name}: does not change for {f.stuck:.2g} s of flight ({f.source})"
-            checks.append(Check("stuck", Verdict.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck}))
+            checks.append(
+                Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
+            )
         if f.name in ("gyro", "accel") and f.saturated:
             message = f"{f.name}: {f.saturated} samples at the limit of its range"
-            checks.append(Check("saturated", Verdict.WARNING, message, "choose a larger range or fly more gently"))
+            checks.append(Check("saturated", CheckResult.WARNING, message, "choose a larger range or fly more gently"))
     return checks
 
 
@@ -114,7 +117,7 @@ def _clock_check(recording: Recording, facts: tuple[ChannelFacts, ...]) -> Check
             dropped[reason] = dropped.get(reason, 0) + count
     numbers = {"breaks": float(len(recording.breaks)), **{k: float(v) for k, v in dropped.items()}}
     if not recording.breaks and not dropped:
-        return Check("clock", Verdict.OK, "time rises steadily, no sample was dropped", numbers=numbers)
+        return Check("clock", CheckResult.OK, "time rises steadily, no sample was dropped", numbers=numbers)
     parts = [f"{len(recording.breaks)} breaks (reboots or clock steps)"] if recording.breaks else []
     parts += [f"{count} samples dropped: {reason.replace('_', ' ')}" for reason, count in dropped.items()]
-    return Check("clock", Verdict.WARNING, "; ".join(parts), "nothing is joined across breaks", numbers)
+    return Check("clock", CheckResult.WARNING, "; ".join(parts), "nothing is joined across breaks", numbers)

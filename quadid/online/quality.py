@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.inspection.conventions import attitude_check, gravity_check, velocity_check
-from quadid.inspection.findings import Verdict
+from quadid.inspection.findings import CheckResult
 from quadid.inspection.motor_checks import lagged_of, motor_order_check
 from quadid.model.thrust import ThrustModel
 from quadid.online.grid_buffer import Cut
@@ -99,7 +99,7 @@ def mistake(cut: Cut, vehicle: Vehicle, known: bool) -> str:
 def _wrong_unit(window: Window) -> str:
     recording, spans = as_recording([window]), ((window.t0, window.t0 + window.dt * len(window)),)
     for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
-        if check.verdict is Verdict.ERROR:
+        if check.verdict is CheckResult.ERROR:
             return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
@@ -107,7 +107,7 @@ def _wrong_unit(window: Window) -> str:
 def _wrong_order(cut: Cut, vehicle: Vehicle) -> str:
     rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
     check = motor_order_check(lagged_of(cut.windows, vehicle, rate), vehicle)
-    return f"motor order: {check.message}; {check.fix}" if check.verdict is Verdict.ERROR else ""
+    return f"motor order: {check.message}; {check.fix}" if check.verdict is CheckResult.ERROR else ""
 
 
 def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:

@@ -218,17 +218,17 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> Check
     Raises:
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
-    from quadid.inspection import FATAL, Verdict, inspect
+    from quadid.inspection import FATAL, CheckResult, inspect
 
     found, doubts = inspect(recording, vehicle), []
     flown = flown_parts(recording, found.flying, cut)
     for check in found.checks:
         # A check without numbers could not be made; what comes next says why, and better.
-        if check.verdict is Verdict.ERROR and check.name in FATAL and check.numbers:
+        if check.verdict is CheckResult.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             parts = " ".join(names_of(cut, flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {check.message}", fix=fix)
-        if check.verdict in (Verdict.ERROR, Verdict.WARNING):
+        if check.verdict in (CheckResult.ERROR, CheckResult.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
     return Checked(tuple(doubts), flown)

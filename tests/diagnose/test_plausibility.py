@@ -12,7 +12,7 @@ from quadid.diagnose.model import Model, Start, extend, free_names, without
 from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
-from quadid.diagnose.result import Verdict
+from quadid.diagnose.result import Explanation
 from quadid.identify.answer import possible_moments
 from quadid.identify.result import with_values
 from quadid.parameters import Status
@@ -121,7 +121,7 @@ def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> Non
     layout, vehicle = problem.shooting.layout, problem.shooting.vehicle
     theta[layout.entry("J_zz").index] *= 8.0
     far = replace(problem.nominal, theta=theta)
-    nominal, reasons = _nominal_parameters(problem.shooting, problem.shooting, far, Verdict.UNKNOWN)
+    nominal, reasons = _nominal_parameters(problem.shooting, problem.shooting, far, Explanation.UNKNOWN)
     assert reasons[-1].endswith("not to be used while the cause of the error is unknown")
     parameters, said = possible_moments(nominal)
     assert said is not None
@@ -140,7 +140,7 @@ def test_numbers_beside_a_cause_that_stands_for_something_else_are_not_to_be_use
     def told(*labels: str) -> tuple[dict[str, Status], str]:
         doubted = {label: without(problem.shooting, model, cause(problem, label)) for label in labels}
         numbers, reasons = _nominal_parameters(
-            problem.shooting, problem.shooting, model, Verdict.PARTLY_EXPLAINED, doubted
+            problem.shooting, problem.shooting, model, Explanation.PARTLY_EXPLAINED, doubted
         )
         return {p.name: p.status for p in numbers}, " ".join(reasons)
 
@@ -154,7 +154,7 @@ def test_numbers_beside_a_cause_that_stands_for_something_else_are_not_to_be_use
 def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> None:
     problem = fitted(window_with({"motor_lag": {"tau": 0.04}}), clean().shooting.noise)
     model = extend(problem.shooting, problem.nominal, cause(problem, "motor_lag"), iterations=12)
-    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Verdict.EXPLAINED)
+    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Explanation.EXPLAINED)
     assert late_unknown(model, numbers) == {}
     useless = [replace(p, status=Status.UNRELIABLE) for p in numbers]
     assert list(late_unknown(model, useless)) == ["motor_lag"]
@@ -175,7 +175,7 @@ def test_a_change_as_between_parts_of_any_flight_is_no_event(fraction: float, be
 def test_without_gyroscopic_coupling_yaw_inertia_is_known_relative_to_the_drag_torque() -> None:
     problem = fitted(window_with({"no_gyroscopic_coupling": {"share": 1.0}}), clean().shooting.noise)
     model = extend(problem.shooting, problem.nominal, cause(problem, "no_gyroscopic_coupling"), iterations=12)
-    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Verdict.EXPLAINED)
+    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Explanation.EXPLAINED)
     yaw = next(p for p in numbers if p.name == "J_zz")
     assert yaw.status is not Status.IDENTIFIED
     assert yaw.relative_to in ("d", None)
@@ -188,6 +188,6 @@ def test_why_a_number_on_its_bound_is_not_to_be_used_is_said() -> None:
     entry = problem.shooting.layout.entry("J_xx")
     theta[entry.index] = entry.lower
     low = replace(problem.nominal, theta=theta)
-    numbers, reasons = _nominal_parameters(problem.shooting, problem.shooting, low, Verdict.EXPLAINED)
+    numbers, reasons = _nominal_parameters(problem.shooting, problem.shooting, low, Explanation.EXPLAINED)
     assert {p.name: p.status for p in numbers}["J_xx"] is Status.UNRELIABLE
     assert any(r.startswith("J_xx = ") and "rests on its bound" in r for r in reasons)

@@ -13,7 +13,7 @@ from quadid.diagnose.model import Model
 from quadid.diagnose.pipeline import judge
 from quadid.diagnose.residual_regressors import SITES, Follows
 from quadid.diagnose.residual_tests import ALARM, Remainder, Structure, remainder
-from quadid.diagnose.result import Verdict
+from quadid.diagnose.result import Explanation
 from quadid.identify.noise_spectrum import mode_power
 from quadid.types import FloatArray
 from tests.diagnose.problems import Problem, clean, fitted, window_with
@@ -87,7 +87,7 @@ class Stub:
         return {f"effect {i}" for i in range(len(self.causes))}
 
 
-def verdict(explained: float, left: float, causes: int) -> Verdict:
+def verdict(explained: float, left: float, causes: int) -> Explanation:
     nominal, model = Stub((), np.full(10, ROWS / 10 + explained / 10)), Stub(("x",) * causes, np.full(10, ROWS / 10))
     rest = Remainder((Structure("p", 0.1, left, 7.0, ALARM + 1.0),), (), ROWS)
     return judge(cast(Model, cast(Any, nominal)), cast(Model, cast(Any, model)), rest)
@@ -96,19 +96,19 @@ def verdict(explained: float, left: float, causes: int) -> Verdict:
 @pytest.mark.parametrize(
     ("explained", "left", "causes", "expected"),
     [
-        (0.0, 0.0, 0, Verdict.NOTHING_FOUND),
-        (0.0, 0.005 * ROWS, 0, Verdict.NOTHING_FOUND),
-        (0.0, 0.05 * ROWS, 0, Verdict.UNKNOWN),
-        (1e4, 0.0, 1, Verdict.EXPLAINED),
-        (1e8, 0.9e5, 1, Verdict.EXPLAINED),
-        (1e4, 0.1e4, 1, Verdict.PARTLY_EXPLAINED),
-        (1e4, 0.12e4, 1, Verdict.UNKNOWN),
-        (1e4, 0.24e4, 2, Verdict.PARTLY_EXPLAINED),
-        (1e4, 0.26e4, 2, Verdict.UNKNOWN),
-        (1e4, 9e4, 2, Verdict.UNKNOWN),
+        (0.0, 0.0, 0, Explanation.NOTHING_FOUND),
+        (0.0, 0.005 * ROWS, 0, Explanation.NOTHING_FOUND),
+        (0.0, 0.05 * ROWS, 0, Explanation.UNKNOWN),
+        (1e4, 0.0, 1, Explanation.EXPLAINED),
+        (1e8, 0.9e5, 1, Explanation.EXPLAINED),
+        (1e4, 0.1e4, 1, Explanation.PARTLY_EXPLAINED),
+        (1e4, 0.12e4, 1, Explanation.UNKNOWN),
+        (1e4, 0.24e4, 2, Explanation.PARTLY_EXPLAINED),
+        (1e4, 0.26e4, 2, Explanation.UNKNOWN),
+        (1e4, 9e4, 2, Explanation.UNKNOWN),
     ],
 )
 def test_the_verdict_follows_from_what_is_explained_and_what_is_left(
-    explained: float, left: float, causes: int, expected: Verdict
+    explained: float, left: float, causes: int, expected: Explanation
 ) -> None:
     assert verdict(explained, left, causes) is expected

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quadid.diagnose.pipeline import diagnose
-from quadid.diagnose.result import Diagnosis, Verdict
+from quadid.diagnose.result import Diagnosis, Explanation
 from quadid.vehicle import GRAVITY, Vehicle
 from studies.rotorpy_flight import RotorpyFlight, fly, hummingbird
 
@@ -33,7 +33,7 @@ def test_aerodynamics_at_the_hubs_and_a_lag_are_named_with_the_numbers_of_the_si
     check_nominal(fitted, truth)
     m = truth["mass"]
     hover = 4.0 * np.sqrt(m * GRAVITY / (4.0 * truth["k_eta"]))
-    assert result.verdict is Verdict.EXPLAINED
+    assert result.verdict is Explanation.EXPLAINED
     assert set(findings) == {"motor_lag", "rotor_drag", "axial_inflow", "parasitic_drag", "translational_lift"}
     assert findings["motor_lag"]["tau"] == pytest.approx(0.045, rel=0.02)
     for axis in ("k_x", "k_y"):
@@ -47,7 +47,7 @@ def test_without_aerodynamics_nothing_but_the_short_lag_is_named() -> None:
     truth = hummingbird(tau_m=0.005)
     findings, fitted, result = diagnosed(fly(truth, SECONDS, seed=2, aero=False))
     check_nominal(fitted, truth)
-    assert result.verdict in (Verdict.EXPLAINED, Verdict.NOTHING_FOUND)
+    assert result.verdict in (Explanation.EXPLAINED, Explanation.NOTHING_FOUND)
     assert set(findings) <= {"motor_lag"}
     if findings:
         assert findings["motor_lag"]["tau"] == pytest.approx(0.005, abs=5e-4)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.inspection import inspect
-from quadid.inspection.findings import Verdict
+from quadid.inspection.findings import CheckResult
 from quadid.model.layout import Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online.grid_buffer import Cut
@@ -142,5 +142,5 @@ def test_a_wrong_order_of_rotors_is_named_where_their_readings_are_quick_enough(
         slow = replace(rotors, t=rotors.t[::every], values=rotors.values[::every][:, [1, 0, 2, 3]])
         log = inspect(replace(made.recording, channels={**made.recording.channels, "rotor_speed": slow}), PELICAN)
         (check,) = [c for c in log.checks if c.name == "motor_order"]
-        assert (check.verdict is Verdict.ERROR) == (every == 1)
+        assert (check.verdict is CheckResult.ERROR) == (every == 1)
     assert mistake(Cut((swapped,), 10.0, 0), PELICAN, known=True) == ""

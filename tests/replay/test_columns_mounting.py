@@ -12,7 +12,7 @@ from quadid_replay.reading import read_in_child
 
 from quadid.errors import LogError, VehicleError
 from quadid.grid import to_windows
-from quadid.inspection import Verdict, inspect
+from quadid.inspection import CheckResult, inspect
 from quadid.mounting import mounting_matrix
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -58,7 +58,7 @@ def test_an_imu_that_sits_turned_is_turned_back() -> None:
         assert expected is not None
         np.testing.assert_allclose(found, expected, atol=1e-12)
     verdicts = {c.name: c.verdict for c in inspect(turned, vehicle).checks}
-    assert verdicts["gyro_attitude"] is verdicts["motor_order"] is verdicts["rotor_timing"] is Verdict.OK
+    assert verdicts["gyro_attitude"] is verdicts["motor_order"] is verdicts["rotor_timing"] is CheckResult.OK
     assert not inspect(turned, PELICAN).usable
 
 

@@ -12,7 +12,7 @@ import pytest
 from quadid_replay import open_log
 from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
-from quadid.inspection import Check, Inspection, Verdict, inspect, proposed_cuts
+from quadid.inspection import Check, CheckResult, Inspection, inspect, proposed_cuts
 from quadid.inspection.airborne import Spans
 from quadid.inspection.conventions import fit_axes, gyro_check
 from quadid.types import FloatArray
@@ -49,7 +49,7 @@ def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
     found = inspect(clean, PELICAN)
     assert {c.name: c.verdict for c in found.checks} == dict.fromkeys(
         ("clock", "gravity", "gyro_attitude", "velocity_attitude", "rotor_speed", "hover", "motor_order",
-         "rotor_timing", "geometry"), Verdict.OK,
+         "rotor_timing", "geometry"), CheckResult.OK,
     )  # fmt: skip
     assert found.usable
     np.testing.assert_allclose(found.flying, [(0.0, 19.98)])
@@ -66,7 +66,7 @@ def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
 )
 def test_wrong_units_of_the_accelerometer(clean: Recording, factor: float, unit: str, happened: Happened) -> None:
     gravity = check(inspect(changed(clean, "accel", lambda v: v * factor)), "gravity")
-    assert gravity.verdict is Verdict.ERROR
+    assert gravity.verdict is CheckResult.ERROR
     assert unit in gravity.message
     assert gravity.fix
     happened(10, f"accelerometer times {factor:.4g}: '{gravity.message[-40:]}'; fix: {gravity.fix}")
@@ -86,15 +86,15 @@ def test_axes_that_hardly_turn_are_not_called_swapped(axis: int) -> None:
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     channels = {"gyro": Channel("gyro", t, gyro), "attitude": Channel("attitude", t, attitude)}
     found = gyro_check(Recording("roll", "csv", channels))
-    assert found.verdict is Verdict.OK, found.message
+    assert found.verdict is CheckResult.OK, found.message
 
 
 def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording, happened: Happened) -> None:
     gravity = check(inspect(changed(clean, "accel", flip_body)), "gravity")
-    assert gravity.verdict is Verdict.ERROR
+    assert gravity.verdict is CheckResult.ERROR
     assert "FLU" in gravity.message
     gyro = check(inspect(changed(clean, "gyro", flip_body)), "gyro_attitude")
-    assert gyro.verdict is Verdict.ERROR
+    assert gyro.verdict is CheckResult.ERROR
     assert "x = x, y = -y, z = -z" in gyro.message
     ros = clean
     for name, flip in (
@@ -105,13 +105,13 @@ def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording, happened: Happe
     ):
         ros = changed(ros, name, flip)
     verdicts = {c.name: c.verdict for c in inspect(ros).checks}
-    assert verdicts["gravity"] is Verdict.ERROR
+    assert verdicts["gravity"] is CheckResult.ERROR
     happened(10, "FLU for FRD in one channel or in all: refused, with the axis map 'x = x, y = -y, z = -z'")
 
 
 def test_degrees_for_radians(clean: Recording, happened: Happened) -> None:
     gyro = check(inspect(changed(clean, "gyro", np.degrees)), "gyro_attitude")
-    assert gyro.verdict is Verdict.ERROR
+    assert gyro.verdict is CheckResult.ERROR
     assert "deg/s" in gyro.message
     assert gyro.fix == "convert to radians"
     happened(10, "gyro in deg/s: refused, 'convert to radians'")
@@ -125,19 +125,19 @@ def test_quaternions_read_the_wrong_way(
     clean: Recording, change: Callable[[FloatArray], FloatArray], name: str
 ) -> None:
     found = check(inspect(changed(clean, "attitude", change)), "gyro_attitude")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert name in found.message
 
 
 def test_swapped_gyro_axes_are_named(clean: Recording) -> None:
     found = check(inspect(changed(clean, "gyro", lambda v: v[:, [1, 0, 2]])), "gyro_attitude")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert "x = y, y = x, z = z" in found.message
 
 
 def test_velocity_in_enu_beside_an_attitude_in_ned(clean: Recording) -> None:
     found = check(inspect(changed(clean, "velocity", flip_world)), "velocity_attitude")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert "x = y, y = x" in found.message
 
 
@@ -155,7 +155,7 @@ def with_position(recording: Recording, factor: tuple[float, float, float], shuf
 
 def test_a_velocity_that_is_the_change_of_position_is_said_to_be(clean: Recording) -> None:
     found = check(inspect(with_position(clean, (1.0, 1.0, 1.0))), "position_velocity")
-    assert found.verdict is Verdict.OK
+    assert found.verdict is CheckResult.OK
     assert found.numbers["scale horizontally"] == pytest.approx(1.0, abs=1e-3)
 
 
@@ -163,7 +163,7 @@ def test_a_horizontal_velocity_larger_than_the_change_of_position_is_a_finding(c
     """As the estimator on board of Crazyflies has it, by 8 %; the vertical one is right."""
     recording = with_position(clean, (1.08, 1.08, 1.0))
     found = check(inspect(recording), "position_velocity")
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is CheckResult.WARNING
     assert "8.0% larger horizontally" in found.message
     assert "vertically than" not in found.message
     assert found.numbers["scale horizontally"] == pytest.approx(1.08, abs=1e-3)
@@ -171,24 +171,24 @@ def test_a_horizontal_velocity_larger_than_the_change_of_position_is_a_finding(c
 
 def test_a_position_in_enu_beside_a_velocity_in_ned(clean: Recording) -> None:
     found = check(inspect(with_position(clean, (1.0, 1.0, 1.0), shuffle=True)), "position_velocity")
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is CheckResult.WARNING
     assert "x = y, y = x" in found.message
 
 
 def test_recorded_crazyflies_have_a_velocity_that_is_too_large_horizontally(data_dir: Path) -> None:
     for log in ("nanodrone/random_run1.csv", "brushed/jana00.csv", "crazyflie_rpm/figure8_22.csv"):
         found = check(inspect(open_log(data_dir / log)), "position_velocity")
-        assert found.verdict is Verdict.WARNING
+        assert found.verdict is CheckResult.WARNING
         assert 1.05 < found.numbers["scale horizontally"] < 1.11
     right = check(inspect(open_log(data_dir / "nanobench" / "B2_circle_fast_rep1.csv")), "position_velocity")
-    assert right.verdict is Verdict.OK
+    assert right.verdict is CheckResult.OK
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1), (1, 2, 3, 0)])
 def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...], happened: Happened) -> None:
     swapped = changed(clean, "rotor_speed", lambda v: v[:, order])
     found = check(inspect(swapped, PELICAN), "motor_order")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     back = ", ".join(str(int(i) + 1) for i in np.argsort(order))
     assert back in found.message
     assert back in found.fix
@@ -224,24 +224,26 @@ def test_the_vehicle_is_weighed_by_its_whole_model(clean: Recording, effect: str
     vehicle = known(PELICAN).model_copy(update={"reference_voltage": 12.6})
     whole = vehicle.model_copy(update={"effects": {effect: numbers}})
     found = check(inspect(flown, whole), "mass")
-    assert found.verdict is Verdict.OK
+    assert found.verdict is CheckResult.OK
     assert found.numbers["mass_kg"] == pytest.approx(PELICAN.mass, rel=0.03)
-    assert check(inspect(flown, vehicle), "mass").verdict is Verdict.WARNING, "by b omega^2 alone it would weigh less"
+    assert check(inspect(flown, vehicle), "mass").verdict is CheckResult.WARNING, (
+        "by b omega^2 alone it would weigh less"
+    )
 
 
 @pytest.mark.filterwarnings("error")
 def test_thrust_that_pulls_down_is_no_flight_by_the_vehicle_file(clean: Recording) -> None:
     pulls = PELICAN.model_copy(update={"effects": {"weak_rotor": {"rotor": 1, "loss": 20.0}}})
-    assert check(inspect(clean, pulls), "hover").verdict is not Verdict.OK
+    assert check(inspect(clean, pulls), "hover").verdict is not CheckResult.OK
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_wrong_mass_is_named_with_the_factor_where_thrust_is_known(
     clean: Recording, factor: float, happened: Happened
 ) -> None:
-    assert check(inspect(clean, known(PELICAN)), "mass").verdict is Verdict.OK
+    assert check(inspect(clean, known(PELICAN)), "mass").verdict is CheckResult.OK
     found = check(inspect(clean, known(PELICAN, mass=factor)), "mass")
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is CheckResult.WARNING
     assert found.numbers["mass_factor"] == pytest.approx(1.0 / factor, rel=0.03)
     assert "kg would fit" in found.fix
     assert not [c for c in inspect(clean, PELICAN).checks if c.name == "mass"], "m / b alone shows when b is a guess"
@@ -254,9 +256,9 @@ def test_a_wrong_mass_is_named_with_the_factor_where_thrust_is_known(
 def test_a_wrong_arm_is_named_with_the_factor_where_inertia_is_known(
     clean: Recording, factor: float, happened: Happened
 ) -> None:
-    assert check(inspect(clean, known(PELICAN)), "geometry").verdict is Verdict.OK
+    assert check(inspect(clean, known(PELICAN)), "geometry").verdict is CheckResult.OK
     found = check(inspect(clean, known(PELICAN, arm=factor)), "geometry")
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is CheckResult.WARNING
     assert found.numbers["arm_factor"] == pytest.approx(1.0 / factor, rel=0.1)
     assert "measure the arm" in found.fix
     happened(
@@ -267,7 +269,7 @@ def test_a_wrong_arm_is_named_with_the_factor_where_inertia_is_known(
 @pytest.mark.parametrize("degrees", [45.0, -45.0, 30.0])
 def test_a_frame_turned_about_z_is_named_with_the_angle(clean: Recording, degrees: float, happened: Happened) -> None:
     found = check(inspect(clean, known(PELICAN, turn=np.radians(degrees))), "geometry")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert np.degrees(found.numbers["turned_rad"]) == pytest.approx(-degrees, abs=5.0)
     happened(10, f"rotor positions turned by {degrees:+.0f} deg (X for +): '{found.message}'")
 
@@ -277,20 +279,20 @@ def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
     for rotor in data["rotors"]:
         rotor["spin"] = -rotor["spin"]
     found = check(inspect(clean, Vehicle.model_validate(data)), "motor_order")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(60 / (2 * np.pi), "rpm"), (1 / (2 * np.pi), "rev/s")])
 def test_rotor_speeds_in_other_units(clean: Recording, factor: float, unit: str, happened: Happened) -> None:
     found = check(inspect(changed(clean, "rotor_speed", lambda v: v * factor), PELICAN), "hover")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert unit in found.message
     happened(10, f"rotor speeds in {unit}: refused, fix: {found.fix}")
 
 
 def test_the_wrong_vehicle_is_an_error_of_hover(clean: Recording) -> None:
     found = check(inspect(clean, Vehicle.shipped("hexacopter")), "hover")
-    assert found.verdict is Verdict.ERROR
+    assert found.verdict is CheckResult.ERROR
     assert "4 rotor columns" in found.message
 
 
@@ -422,8 +424,8 @@ def test_axis_fits_find_any_signed_permutation() -> None:
 )
 def test_real_flights_are_believed_and_their_motors_in_order(data_dir: Path, log: str, vehicle: str) -> None:
     found = inspect(open_log(data_dir / log), Vehicle.from_yaml((data_dir / vehicle).read_text()))
-    assert not [c for c in found.checks if c.verdict is Verdict.ERROR]
-    assert check(found, "motor_order").verdict is Verdict.OK
+    assert not [c for c in found.checks if c.verdict is CheckResult.ERROR]
+    assert check(found, "motor_order").verdict is CheckResult.OK
     assert found.usable
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 
-from quadid.inspection import Check, Verdict, inspect
+from quadid.inspection import Check, CheckResult, inspect
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
@@ -47,7 +47,7 @@ def part(of: float, change: Callable[[FloatArray], FloatArray]) -> Callable[[Flo
 @pytest.mark.parametrize("rotor", [1, 2, 3, 4])
 def test_a_dead_rotor_signal_is_named(flight: tuple[Recording, Vehicle], rotor: int) -> None:
     check = judged(flight, lambda c: column(c, rotor, part(0.3, np.zeros_like)), "rotor_speed")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert f"rotor {rotor} reads nothing for 30%" in check.message
 
 
@@ -59,13 +59,13 @@ def test_a_rotor_that_is_dead_at_first_is_named_and_not_taken_for_ground(
     check = judged(
         flight, lambda c: column(c, rotor, lambda x: np.where(np.arange(len(x)) < 0.2 * len(x), 0.0, x)), "rotor_speed"
     )
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert f"rotor {rotor} reads nothing for 20%" in check.message
 
 
 def test_a_stuck_rotor_signal_is_named(flight: tuple[Recording, Vehicle]) -> None:
     check = judged(flight, lambda c: column(c, 3, part(0.02, lambda x: np.full_like(x, x[0]))), "rotor_speed")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert "rotor 3 holds" in check.message
 
 
@@ -74,7 +74,7 @@ def test_a_halved_or_doubled_rotor_signal_is_named(
     flight: tuple[Recording, Vehicle], factor: float, share: float
 ) -> None:
     check = judged(flight, lambda c: column(c, 2, part(share, lambda x: factor * x)), "rotor_speed")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert "rotor 2 reads" in check.message
     assert check.numbers["speed_ratio"] == pytest.approx(factor, rel=0.05)
     assert check.numbers["share"] == pytest.approx(share, abs=0.05)
@@ -87,7 +87,7 @@ def test_speeds_that_disagree_with_the_thrust_felt_are_refused(flight: tuple[Rec
         return replace(channel, values=values)
 
     check = judged(flight, raise_all, "rotor_speed")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert check.numbers["thrust_range"] == pytest.approx(1.45**2, rel=0.1)
 
 
@@ -95,26 +95,26 @@ def test_a_rotor_that_lost_a_third_of_its_thrust_is_no_broken_signal(flight: tup
     recording, vehicle = flight
     speeds = column(recording.channels["rotor_speed"], 1, lambda x: x / np.sqrt(0.67))
     found = inspect(replace(recording, channels={**recording.channels, "rotor_speed": speeds}), vehicle)
-    assert next(c for c in found.checks if c.name == "rotor_speed").verdict is Verdict.OK
+    assert next(c for c in found.checks if c.name == "rotor_speed").verdict is CheckResult.OK
 
 
 def test_a_signal_that_drifts_out_of_time_is_refused(flight: tuple[Recording, Vehicle]) -> None:
     check = judged(flight, lambda c: replace(c, t=c.t * (1.0 + 0.05 / 120.0)), "rotor_timing")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert "not in time" in check.message
     assert 0.02 < check.numbers["wander_s"] < 0.05
 
 
 def test_a_signal_that_comes_after_its_effect_is_refused(flight: tuple[Recording, Vehicle]) -> None:
     check = judged(flight, lambda c: replace(c, t=c.t + 0.06), "rotor_timing")
-    assert check.verdict is Verdict.ERROR
+    assert check.verdict is CheckResult.ERROR
     assert "the rotor signal lags its effect" in check.message
 
 
 def test_correlation_and_lag_are_reported(flight: tuple[Recording, Vehicle]) -> None:
     recording, vehicle = flight
     check = next(c for c in inspect(recording, vehicle).checks if c.name == "rotor_timing")
-    assert check.verdict is Verdict.OK
+    assert check.verdict is CheckResult.OK
     assert check.numbers["correlation"] > 0.9
     assert abs(check.numbers["lag_s"] - 0.01) < 0.005  # half of a held sample
 

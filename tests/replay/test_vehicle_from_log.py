@@ -12,7 +12,7 @@ from quadid_replay.airframes import ARDUPILOT, frame_of
 from quadid_replay.vehicle_from_log import vehicle_text
 
 from quadid.errors import LogError
-from quadid.inspection import Verdict, inspect
+from quadid.inspection import CheckResult, inspect
 from quadid.vehicle import Vehicle
 
 
@@ -38,7 +38,7 @@ def test_the_frame_of_arducopter_is_that_of_its_truth(data_dir: Path) -> None:
     assert made.effects == {"imu_lag": {"cutoff": 20.0}}
     assert made.parameters["b"].initial == pytest.approx(4.1e-5, rel=0.1)  # between secant and tangent of the curve
     checks = {c.name: c.verdict for c in inspect(log, made).checks}
-    assert checks["motor_order"] is checks["rotor_timing"] is checks["hover"] is Verdict.OK
+    assert checks["motor_order"] is checks["rotor_timing"] is checks["hover"] is CheckResult.OK
 
 
 def test_pulse_widths_take_the_range_that_the_autopilot_uses(data_dir: Path) -> None:
