@@ -59,8 +59,8 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
 
 def _few(flights: Sequence[recorded.Flown]) -> str:
     return (
-        "## Few baseline flights\nUp to ten choices of healthy flights; damaged: cuts from 3 mm and glued weights. "
-        "Unknown: with five baseline flights of the same spread it would be a change; before, that was unchanged.\n\n"
+        "## Few baseline flights\nVehicle and number of baseline flights, ten choices of them: which share of other "
+        "healthy flights, and of damage from 3 mm on, is changed, unknown, unchanged. Unknown was unchanged before.\n\n"
         + few.text(flights)
     )
 

@@ -138,7 +138,7 @@ def text(judged: Sequence[Judged]) -> str:
     compared = ("healthy", lambda f: f.condition == "healthy"), *GROUPS
     flights = [j.flown for j in judged if any(chosen(j.flown) for _, chosen in compared)]
     none = {j.flown.file for j in untraced(judged)}
-    hints: set[str] = set()
+    hints, silent = set[str](), list[str]()
     lines = [
         "| logarithm of | " + " | ".join(name for name, _ in GROUPS) + " |",
         "|---" * (1 + len(GROUPS)) + "|",
@@ -150,16 +150,19 @@ def text(judged: Sequence[Judged]) -> str:
         for _, chosen in GROUPS:
             mine = [far[f.file] for f in flights if chosen(f) and f.file in far]
             cells.append(f"{sum(mine)}/{len(mine)}")
-        lines.append(f"| {feature.name} | " + " | ".join(cells) + " |")
+        if all(cell.startswith("0/") for cell in cells):
+            silent.append(feature.name)
+        else:
+            lines.append(f"| {feature.name} | " + " | ".join(cells) + " |")
     shaking = outside(GYRO, flights)
     mended = [j.flown.file for j in judged if j.flown.condition == "cut" and shaking.get(j.flown.file)]
     wrong = [j.flown.file for j in judged if j.flown.file in mended and not kind_right(j)]
-    return "\n".join(lines) + _WHY.format(len(wrong), len(none), len(hints))
+    return "\n".join(lines) + _WHY.format(", ".join(silent), len(wrong), len(none), len(hints))
 
 
 _WHY = """
 
-Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel. Propellers with
-unlike blades shake, others no more than healthy ones, and every rotor of an X frame shakes roll and pitch alike. As
-evidence of a propeller, shaking would mend {} of the wrong answers. Of the {} large cuts that fly like healthy flights,
-{} are outside in any row. A weight's inertia is lost in the spread of acceleration per command."""
+Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel; none by {}.
+Propellers with unlike blades shake, others no more than healthy ones, and every rotor of an X frame shakes roll and
+pitch alike. As evidence of a propeller, shaking would mend {} of the wrong answers. Of the {} large cuts that fly like
+healthy flights, {} are outside in any row. A weight's inertia is lost in the spread of acceleration per command."""

@@ -11,7 +11,7 @@ import numpy as np
 from quadid.health import assess
 from studies.health.recorded import CRAZYFLIE, Flown, Judged, is_large
 
-COUNTS = (1, 2, 3, 4, 5)
+COUNTS = (1, 2, 3)
 MOST = 10
 """Choices of baseline flights of an airframe, drawn where there are more."""
 SEED = 5
@@ -42,20 +42,17 @@ def answer(one: Judged) -> str:
 
 def text(flights: Sequence[Flown]) -> str:
     """Shares of each answer by number of baseline flights, as Markdown."""
-    lines = [
-        "| vehicle, baseline flights | healthy: changed, unknown, unchanged [%] | damaged, as above [%] |",
-        "|---|---|---|",
-    ]
+    lines = []
     for airframe in sorted({f.airframe for f in flights}):
         for count in COUNTS:
             counts = Counter(
                 (one.flown.condition == "healthy", answer(one)) for one in judged(flights, airframe, count)
             )
-            cells = [_shares([counts[healthy, name] for name in _ANSWERS]) for healthy in (True, False)]
-            lines.append(f"| {airframe}, {count} | {' | '.join(cells)} |")
+            each = ([counts[healthy, name] for name in _ANSWERS] for healthy in (True, False))
+            lines.append(f"* {airframe}, {count}: {'; '.join(map(_shares, each))}")
     return "\n".join(lines)
 
 
 def _shares(counts: Sequence[int]) -> str:
     total = sum(counts)
-    return f"{', '.join(f'{100 * n / total:.0f}' for n in counts)} of {total}" if total else "–"
+    return f"{', '.join(f'{100 * n / total:.0f}' for n in counts)} % of {total}"

@@ -193,14 +193,17 @@ def text(judged: Sequence[Judged]) -> str:
     lines += [
         "\nAt best: the likeliest rotor where the spread, that one was cut, and by how much are known; no test of the "
         "trims is right more often.",
-        f"\n| order of score against mm cut | expected (95 % of draws) | {WANTED:g} is reached in |",
-        "|---|---|---|",
     ]  # fmt: skip
+    orders = []
     for airframe in AIRFRAMES:
         for kind in ("controller", "motor"):
             name, drawn = f"{airframe} {kind}", limits.orders(airframe, kind)
             reached[name] = float(np.mean(drawn >= WANTED))
-            lines.append(f"| {name} | {_range(drawn, '.2f', '.2f')} | {100.0 * reached[name]:.0f} % |")
+            orders.append(f"{name} {_range(drawn, '.2f', '.2f')}, {100.0 * reached[name]:.0f} %")
+    lines.append(
+        f"\nOrder of score against mm cut, expected (95 % of draws), and how often {WANTED:g} is reached: "
+        f"{'; '.join(orders)}."
+    )
     spreads = [
         f"{name} {_shown(one.deviation)} (same propeller {_shown(_again(judged, name))})"
         for name, one in limits.healthy.items()
@@ -250,7 +253,11 @@ def untraced(judged: Sequence[Judged]) -> list[Judged]:
 
 
 def _not_reached(judged: Sequence[Judged], reached: Mapping[str, float]) -> str:
-    """What forbids the rows that are not reached, or that nothing does, and what was tried."""
+    """What forbids the rows that are not reached, or that nothing does.
+
+    Tried in vain: `studies.health.features`; the likeliest kind of change before the likeliest change; angular
+    acceleration beside velocity; a rotor that keeps its thrust as an explanation (one false alarm).
+    """
     single, uncut = [j for j in judged if is_single(j, LARGE, 99.0)], untraced(judged)
     cut = [kind_right(j) for j in judged if j.flown.condition == "cut" and j.flown.total >= LARGE]
     glued = [j for j in judged if "glued" in j.flown.weight]
@@ -263,11 +270,8 @@ def _not_reached(judged: Sequence[Judged], reached: Mapping[str, float]) -> str:
         f"channel, which leaves {len(single) - len(uncut)} of {len(single)}.\n"
         f"* One propeller, 1 to 2.5 mm: the spread forbids it in {small:.0f} % of draws, to any test of the trims.\n"
         f"* Propeller or weight: the spread does not forbid it. Right are {sum(cut)} of {len(cut)} cuts and "
-        f"{sum(map(kind_right, glued))} of {len(glued)} weights, of which {yawed} yaw like a cut. Always answering a "
-        f"propeller would reach {len(cut)} of {len(cut) + len(glued)} and tell nothing.\n"
-        f"* Order of E8's motor logs: missed in {order_:.0f} % of draws.\n\n"
-        "Tried in vain: what the next table holds; the likeliest kind of change before the likeliest change; angular "
-        "acceleration beside velocity; a rotor that keeps its thrust as an explanation (one false alarm)."
+        f"{sum(map(kind_right, glued))} of {len(glued)} weights, of which {yawed} yaw like a cut.\n"
+        f"* Order of E8's motor logs: missed in {order_:.0f} % of draws."
     )
 
 
