@@ -55,6 +55,14 @@ def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
     assert "a/7.mcap" in page
 
 
+def test_a_flight_that_few_baseline_flights_cannot_judge_is_no_change() -> None:
+    logs, _ = fleet()
+    row = {"unit": "a", "log": "a/8.mcap", "baseline": False, "verdict": "unknown", "changes": []}
+    for lacking, changed in ((2, False), (0, True)):
+        verdict = fleet_verdict(summarise(logs, [], []), [{**row, "baseline_lacking": lacking}])
+        assert verdict.headline.endswith("vehicles have changed.") == changed
+
+
 def test_a_vehicle_with_few_flights_has_no_trend() -> None:
     logs, trims = [], []
     for k in range(FEWEST):
