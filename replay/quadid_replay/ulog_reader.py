@@ -26,14 +26,19 @@ from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.flight_modes import PX4, mode_changes
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.px4_allocation import allocated, allocation
 from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
 
 _TOPICS = frozenset((
     "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",
     "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
-    "esc_status", "vehicle_status",
+    "esc_status", "vehicle_status", "vehicle_torque_setpoint", "vehicle_thrust_setpoint",
 ))  # fmt: skip
 _XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
+_FEWEST_COMPARED = 20
+"""Logged rows of motors that must show how the vehicle allocates."""
+_ALLOCATED_ALIKE = 0.005
+"""Largest difference of allocated and logged motors, in nine rows of ten."""
 
 
 class _Log(NamedTuple):
@@ -60,7 +65,7 @@ def read_ulog(path: Path) -> Recording:
         *_simple(log, "velocity", "vehicle_local_position", ("vx", "vy", "vz"), "v_xy_valid"),
         *_simple(log, "position", "vehicle_local_position", ("x", "y", "z"), "xy_valid"),
         *_battery(log),
-        *fastest_first([*_actuator_motors(log), *_actuator_outputs(log)], 2.0),
+        *fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0),
         *_esc(log),
     ]
     recording = assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), log.parameters)
@@ -199,14 +204,41 @@ def _actuator_motors(log: _Log) -> list[RawChannel]:
         return []
     values = _stack(log.topics[key], columns)
     count = px4_rotor_count(log.parameters) or int(np.count_nonzero(np.isfinite(values).any(axis=0)))
-    values = values[:, :count]
+    return [_motor_command(log, key, values[:, :count])]
+
+
+def _motor_command(log: _Log, key: tuple[str, int], thrust: FloatArray, how: str = "normalized") -> RawChannel:
+    """What goes to the ESCs of relative thrust (n, rotors), as PX4 itself makes it with THR_MDL_FAC."""
     factor = log.parameters.get("THR_MDL_FAC", 0.0)
-    note = "normalized"
-    if factor > 0.0:  # as PX4 itself turns relative thrust into the signal that goes to the ESC
+    if factor > 0.0:
         rest = 1.0 - factor
-        values = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(values, 0.0)) - rest) / (2.0 * factor)
-        note = f"normalized, THR_MDL_FAC {factor:g} undone"
-    return [_raw(log, "motor_command", key, values, "timestamp", note)]
+        thrust = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(thrust, 0.0)) - rest) / (2.0 * factor)
+        how += f", THR_MDL_FAC {factor:g} undone"
+    return _raw(log, "motor_command", key, thrust, "timestamp", how)
+
+
+def _allocated(log: _Log) -> list[RawChannel]:
+    """Motors as PX4 allocates them, of torque and thrust setpoints of one moment; only where logged motors agree."""
+    torque, thrust, motors = (("vehicle_torque_setpoint", 0), ("vehicle_thrust_setpoint", 0), ("actuator_motors", 0))
+    mix = allocation(log.parameters)
+    columns = (*_XYZ, "timestamp_sample")
+    if mix is None or not (_has(log, torque, *columns) and _has(log, thrust, *columns)):
+        return []
+    wanted = tuple(f"control[{i}]" for i in range(len(mix)))
+    if not _has(log, motors, *wanted, "timestamp_sample"):
+        return []
+    moment, of_torque, of_thrust = np.intersect1d(
+        log.topics[torque]["timestamp_sample"], log.topics[thrust]["timestamp_sample"], return_indices=True
+    )
+    setpoints = np.hstack([_stack(log.topics[torque], _XYZ)[of_torque], _stack(log.topics[thrust], _XYZ)[of_thrust]])
+    values = np.full((len(log.topics[torque]["timestamp"]), len(mix)), np.nan)
+    values[of_torque] = allocated(mix, setpoints)
+    _, here, there = np.intersect1d(moment, log.topics[motors]["timestamp_sample"], return_indices=True)
+    off = values[of_torque][here] - _stack(log.topics[motors], wanted)[there]
+    known = np.isfinite(off).all(axis=1)
+    if np.count_nonzero(known) < _FEWEST_COMPARED or not np.quantile(np.abs(off[known]), 0.9) < _ALLOCATED_ALIKE:
+        return []
+    return [_motor_command(log, torque, values, "allocated as actuator_motors, normalized")]
 
 
 def _actuator_outputs(log: _Log) -> list[RawChannel]:

@@ -1,6 +1,9 @@
-"""A simulated flight as PX4 logs it with `SDLOG_PROFILE` 17: a ULog with geometry, sensors and motors at full rate."""
+"""A simulated flight as PX4 logs it: a ULog with geometry, sensors, and motors or setpoints at full rate."""
 
 from __future__ import annotations
+
+import numpy as np
+from quadid_replay.px4_allocation import allocation
 
 from quadid.flight import Flight
 from quadid.vehicle import Vehicle
@@ -12,26 +15,34 @@ FORMATS = {
     "int32_t accelerometer_timestamp_relative;float[3] accelerometer_m_s2;uint32_t accelerometer_integral_dt;",
     "vehicle_attitude": "uint64_t timestamp;float[4] q;",
     "actuator_motors": "uint64_t timestamp;uint64_t timestamp_sample;float[12] control;",
+    "vehicle_torque_setpoint": "uint64_t timestamp;uint64_t timestamp_sample;float[3] xyz;",
+    "vehicle_thrust_setpoint": "uint64_t timestamp;uint64_t timestamp_sample;float[3] xyz;",
 }
 BOOT = 5.0
 """Time of the autopilot at the recording's time 0 [s]."""
 
 
-def px4_ulog(flight: Flight, vehicle: Vehicle, max_speed: float) -> bytes:
+def px4_ulog(
+    flight: Flight, vehicle: Vehicle, max_speed: float, thinned: int = 1, mixed_otherwise: float = 0.0
+) -> bytes:
     """The ULog of a flight.
 
     Args:
         flight: gyro, accelerometer, attitude and rotor speeds.
         vehicle: its geometry becomes `CA_ROTOR…`.
         max_speed: rotor speed at full command [rad/s].
+        thinned: one row of motors in so many is logged, as without `SDLOG_PROFILE` 17.
+        mixed_otherwise: what motors have beside what the setpoints ask for.
     """
     log, channels = Ulog(), flight.recording.channels
     for name, fields in FORMATS.items():
         log.format(name, fields)
-    log.parameter("CA_ROTOR_COUNT", len(vehicle.rotors))
+    parameters = {"CA_AIRFRAME": 0.0, "CA_ROTOR_COUNT": float(len(vehicle.rotors))}
     for n, rotor in enumerate(vehicle.rotors):
         for key, value in zip(("PX", "PY", "PZ", "KM"), (*rotor.position, 0.05 * rotor.spin), strict=True):
-            log.parameter(f"CA_ROTOR{n}_{key}", value)
+            parameters[f"CA_ROTOR{n}_{key}"] = value
+    for name, value in parameters.items():
+        log.parameter(name, value)
     for name in FORMATS:
         log.subscribe(name)
     gyro, accel = channels["gyro"], channels["accel"]
@@ -42,8 +53,15 @@ def px4_ulog(flight: Flight, vehicle: Vehicle, max_speed: float) -> bytes:
         log.add("vehicle_attitude", "Q4f", t, *q)
     rotors = channels["rotor_speed"]
     rest = [float("nan")] * (12 - len(vehicle.rotors))
-    for t, control in zip(stamps(rotors), rotors.values / max_speed, strict=True):
-        log.add("actuator_motors", "QQ12f", t, t, *control, *rest)
+    mix = allocation(parameters)
+    assert mix is not None
+    controls = rotors.values / max_speed
+    setpoints = controls @ np.linalg.pinv(mix).T
+    for k, (t, control, wanted) in enumerate(zip(stamps(rotors), controls, setpoints, strict=True)):
+        log.add("vehicle_torque_setpoint", "QQ3f", t, t, *wanted[:3])
+        log.add("vehicle_thrust_setpoint", "QQ3f", t, t, *wanted[3:])
+        if k % thinned == 0:
+            log.add("actuator_motors", "QQ12f", t, t, *(control + mixed_otherwise * (-1.0) ** k), *rest)
     return bytes(log.data)
 
 

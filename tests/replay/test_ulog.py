@@ -103,7 +103,9 @@ def test_values_are_those_of_pyulog(data_dir: Path) -> None:
     np.testing.assert_array_equal(
         recording.channels["gyro"].values[:, 2], data["sensor_combined"]["gyro_rad[2]"].astype(np.float64)
     )
-    assert recording.channels["motor_command"].values.shape == (330, 4)
+    assert recording.channels["motor_command"].values.shape == (1422, 4), (
+        "of the setpoints, not of the 330 rows of motors"
+    )
 
 
 def test_a_wild_stamp_moves_nothing(tmp_path: Path, happened: Happened) -> None:
