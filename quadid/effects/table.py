@@ -103,7 +103,11 @@ TABLE: tuple[Effect, ...] = (
         shows=("p': p", "q': q", "r': r"),
     ),
     Effect(
-        "axial_inflow", "air", (P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1), _CENTRAL),
+        "axial_inflow", "air", (
+            P("k_z", "1/s", 0.0, -0.5, 3.0, 0.25, start=0.2, sign=1),
+            P("k_climb", "1/m", 0.0, -0.1, 0.5, 0.03, optional=True, sign=1),
+            _CENTRAL,
+        ),
         summary="Thrust falls when climbing.",
         sentence="thrust falls by {k_z:.2f} m/s^2 for each m/s of climb",
         advice="Usual; matters for climbs and descents.",

@@ -84,7 +84,10 @@ def hub_forces(
         turned_x, turned_y = rates[1] * z - rates[2] * y, rates[2] * x - rates[0] * z
         along = -weight * air.drag_x * (velocity[0] + drag_reach * turned_x)
         across = -weight * air.drag_y * (velocity[1] + drag_reach * turned_y)
-        lost = -weight * air.axial * (velocity[2] + axial_reach * (rates[0] * y - rates[1] * x))
+        sinking = velocity[2] + axial_reach * (rates[0] * y - rates[1] * x)
+        lost = -weight * air.axial * sinking
+        if sinking < 0.0:
+            lost += body.mass / omega.shape[0] * air.climb * sinking * sinking
         ahead, aside = velocity[0] + turned_x, velocity[1] + turned_y
         lift = -body.mass / omega.shape[0] * air.lift * (ahead * ahead + aside * aside)
         fx += along
@@ -152,7 +155,7 @@ def derivative(
 
     force_x = force_y = 0.0
     force_z = -thrust
-    if air.drag_x != 0.0 or air.drag_y != 0.0 or air.axial != 0.0 or air.lift != 0.0:
+    if air.drag_x != 0.0 or air.drag_y != 0.0 or air.axial != 0.0 or air.climb != 0.0 or air.lift != 0.0:
         at_hubs = hub_forces(omega, (u, v, w), (p, q, r), changed, body, air)
         force_x, force_y, force_z = at_hubs[0], at_hubs[1], at_hubs[2] - thrust
         roll, pitch, yaw = roll + at_hubs[3], pitch + at_hubs[4], yaw + at_hubs[5]

@@ -52,7 +52,7 @@ class Air(NamedTuple):
         lift: k of translational_lift [1/m].
         moment_x, moment_y: h_x, h_y of rotor_drag_moment [m], positive when the force acts above the hubs.
         damping_p, damping_q, damping_r: l_p, m_q, n_r [1/s].
-        axial: k_z [1/s].
+        axial, climb: k_z [1/s], k_climb [1/m].
         wind_north, wind_east: velocity of the air [m/s].
         ground_radius: effective rotor radius of the Cheeseman-Bennett ground effect [m].
         hover_sum: sum of the rotor speeds in hover [rad/s].
@@ -71,6 +71,7 @@ class Air(NamedTuple):
     damping_q: float
     damping_r: float
     axial: float
+    climb: float
     wind_north: float
     wind_east: float
     ground_radius: float

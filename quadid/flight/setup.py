@@ -184,6 +184,7 @@ def _air(vehicle: Vehicle, truth: TruthParameters, value: _Lookup) -> Air:
         damping_q=value("rate_damping", "m_q"),
         damping_r=value("rate_damping", "n_r"),
         axial=value("axial_inflow", "k_z"),
+        climb=value("axial_inflow", "k_climb"),
         wind_north=value("wind", "north"),
         wind_east=value("wind", "east"),
         ground_radius=value("ground_effect", "radius_scale") * propeller_radius(vehicle),

@@ -18,11 +18,11 @@ from quadid.types import FloatArray
 # isort: off
 from quadid.model.rows import (
     A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
-    C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HUB,
-    C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ,
-    C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF,
-    L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E,
-    X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY,
+    C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY,
+    C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF,
+    L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N,
+    X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 
 # isort: on
@@ -96,7 +96,12 @@ def _body(  # type: ignore[no-untyped-def]
         up = k * (square + 2.0 * r * (v1 * gx - u1 * gy) + r * r * (gxx + gyy))
         mx -= k * (square * gy + 2.0 * r * (v1 * gxy - u1 * gyy)) + cy * up
         my += k * (square * gx + 2.0 * r * (v1 * gxx - u1 * gxy)) + cx * up
-        sz -= up * s[C_INVM + lane]
+        # Inflow in climb: square of each hub's axial speed, to first order about that of their middle.
+        k, sink = s[C_CLIMB + lane], min(w1, 0.0)
+        down = k * sink * (sink + 2.0 * hf * (p * gy - q * gx))
+        mx += hf * (k * sink * (sink * gy + 2.0 * hf * (p * gyy - q * gxy)) + cy * down)
+        my -= hf * (k * sink * (sink * gx + 2.0 * hf * (p * gxy - q * gxx)) + cx * down)
+        sz += (down - up) * s[C_INVM + lane]
     if solid:
         sx, sy, sz = sx * im, sy * im, sz * im
     if air:

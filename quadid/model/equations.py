@@ -32,8 +32,12 @@ Rotors
 Air at each hub: (u_i, v_i, w_i) = (u, v, w) + nu x r_i, r_i from the CG to the hub, heights included
     rotor_drag          force -(m / N) (k_x u_i, k_y v_i, 0) omega_i / omega_h at the hub.  Martin & Salaun 2010,
                         doi:10.1109/ROBOT.2010.5509980; Faessler et al. 2018, doi:10.1109/LRA.2017.2776353.
-    axial_inflow        force -(m / N) k_z (0, 0, w_i) omega_i / omega_h at the hub: what momentum theory takes from
-                        thrust in climb, to first order.
+    axial_inflow        force -(m / N) k_z (0, 0, w_i) omega_i / omega_h at the hub: blades meet the air at a
+                        smaller angle in climb; and (m / N) k_climb max(-w_i, 0)^2: a slipstream that leaves with the
+                        speed v_e, as the rotor turns, lifts with rho A (v_e^2 - w_i^2) / 2.  In descent air no longer
+                        passes from above, no slipstream forms (vortex ring), and momentum theory has no such term.
+                        In the model w_i^2 is taken to first order about the middle of the hubs.  Leishman 2006,
+                        *Principles of Helicopter Aerodynamics*, 2.13.
                         Both with moment r_i x force; omega_h carries the weight: b (omega_h - dead_speed)^2 + offset.
                         central: r_i times 1 - central, in the hub's velocity and in the moment; 1 in simulators whose
                         rotor aerodynamics act at the CG.

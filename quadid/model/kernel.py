@@ -22,7 +22,7 @@ from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
-    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CPAR, C_CPAR_Z, C_D, C_DROP,
+    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DROP,
     C_DRAG_ARM, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY,
     C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX,
     C_KY, C_KZ, C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING,
@@ -112,7 +112,8 @@ def body_constants(theta: FloatArray, flight: Flight, rotors: int, s: FloatArray
         s[C_KX + lane], s[C_KY + lane], s[C_KZ + lane] = each * th[ix.KX], each * th[ix.KY], each * th[ix.KZ]
         s[C_DRAG_ARM + lane], s[C_FLOW_ARM + lane] = 1.0 - th[ix.DRAG_CENTRAL], 1.0 - th[ix.FLOW_CENTRAL]
         s[C_CPAR + lane], s[C_CPAR_Z + lane] = th[ix.CPAR], th[ix.CPAR] + th[BESIDE_Z]
-        s[C_HX + lane], s[C_HY + lane], s[C_LIFT + lane] = th[ix.HX], th[ix.HY], flight.mass * th[LIFT]
+        s[C_HX + lane], s[C_HY + lane] = th[ix.HX], th[ix.HY]
+        s[C_LIFT + lane], s[C_CLIMB + lane] = flight.mass * th[LIFT], flight.mass * th[ix.KCLIMB]
         s[C_GX + lane], s[C_GY + lane], s[C_GXX + lane] = flight.plan[0], flight.plan[1], flight.plan[2]
         s[C_GYY + lane], s[C_GXY + lane] = flight.plan[3], flight.plan[4]
         s[C_LP + lane], s[C_MQ + lane], s[C_NR + lane] = th[ix.LP], th[ix.MQ], th[ix.NR]

@@ -51,7 +51,7 @@ class Needs(NamedTuple):
 
 
 HUB_ENTRIES = places("rotor_drag.k_x", "rotor_drag.k_y", "axial_inflow.k_z")
-RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift")
+RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift", "axial_inflow.k_climb")
 PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
 FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
 SOLID_ENTRIES = places(

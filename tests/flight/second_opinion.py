@@ -96,6 +96,9 @@ class SecondOpinion:
             for effect, acts in {"rotor_drag": [1.0, 1.0, 0.0], "axial_inflow": [0.0, 0.0, 1.0]}.items():
                 nearer = arm * (1.0 - self.get(effect, "central"))
                 air = -p.mass / self.n * k * acts * (v_body + np.cross(nu, nearer)) * omega[i] / self.omega_h
+                if effect == "axial_inflow":
+                    climbs = max(0.0, -(v_body + np.cross(nu, nearer))[2])
+                    air[2] += p.mass / self.n * self.get(effect, "k_climb") * climbs**2
                 force += air
                 torque += np.cross(nearer, air) + [h_y * air[1], -h_x * air[0], 0.0]
             dragging = 1.0 - self.get("weak_rotor", "drag_loss", loss) * weak

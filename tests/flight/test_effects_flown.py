@@ -114,6 +114,22 @@ def test_climbing_costs_thrust() -> None:
     np.testing.assert_allclose(got[:3], [0.0, 0.0, 0.6], atol=1e-12)
 
 
+@pytest.mark.parametrize(("down", "lost"), [(-2.0, 0.2), (0.0, 0.0), (2.0, 0.0)])
+def test_the_square_of_the_climb_costs_thrust_and_a_descent_gives_none(down: float, lost: float) -> None:
+    got = acceleration({"axial_inflow": {"k_z": 0.0, "k_climb": 0.05}}, velocity=np.array([0.0, 0.0, down]))
+    np.testing.assert_allclose(got, [0.0, 0.0, lost, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_k_climb_is_what_a_slipstream_of_given_speed_loses() -> None:
+    """T = rho A (v_e^2 - v^2) / 2 a rotor, with v_e such that it hovers: k_climb = rho A N / (2 m) = g / v_e^2."""
+    area, density, climb, mass = 0.05, 1.2, 3.0, setup_of().truth.mass
+    leaving = np.sqrt(2.0 * mass * GRAVITY / (4.0 * density * area))
+    left = 4.0 * density * area / 2.0 * (leaving**2 - climb**2)
+    effects = {"axial_inflow": {"k_z": 0.0, "k_climb": GRAVITY / leaving**2}}
+    got = acceleration(effects, velocity=np.array([0.0, 0.0, -climb]))
+    assert got[2] == pytest.approx(GRAVITY - left / mass, rel=1e-9)
+
+
 def test_weak_rotor_one_of_the_pelican_is_the_rear_one() -> None:
     """The tail drops (nose up), and the vehicle turns to the right, since rotor 1 pushed it to the left."""
     p = setup_of().truth

@@ -17,7 +17,7 @@ EVERYTHING = {
     "translational_lift": {"k": 0.01},
     "rotor_drag_moment": {"h_x": 0.03, "h_y": -0.02},
     "rate_damping": {"l_p": 0.8, "m_q": 1.3, "n_r": 0.4},
-    "axial_inflow": {"k_z": 0.3, "central": 0.7},
+    "axial_inflow": {"k_z": 0.3, "k_climb": 0.03, "central": 0.7},
     "wind": {"north": 2.0, "east": -1.5},
     "weak_rotor": {"rotor": 2.0, "loss": 0.08, "drag_loss": -0.05},
     "cg_offset": {"x": 0.006, "y": -0.004},

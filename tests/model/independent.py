@@ -154,11 +154,20 @@ class Independent:
             for k, effect in ((drag, "rotor_drag"), (inflow, "axial_inflow")):
                 nearer = arm * (1.0 - self[f"{effect}.central"])
                 hub = -self.m / self.n * k * (v_air + cross(nu, nearer)) * speed / self.hover
+                if effect == "axial_inflow":
+                    square = self.climb_square(v_air, nu, nearer, arms)
+                    hub = hub + self.m / self.n * self["axial_inflow.k_climb"] * square
                 force = force + hub
                 torque += cross(nearer, hub) + higher * hub[[1, 0, 2]]
         c = self["parasitic_drag.c"]
         drag = np.array([c, c, c + self["parasitic_drag.beside_z"]]) * np.linalg.norm(v_air) * v_air
         return force - self.m * drag, torque
+
+    def climb_square(self, v_air: FloatArray, nu: FloatArray, arm: FloatArray, arms: FloatArray) -> FloatArray:
+        """Squared climb speed of a hub along z, as its tangent at the climb speed of the middle of all hubs."""
+        middle = arms.mean(axis=0) * (1.0 - self["axial_inflow.central"])
+        climbs = max(-(v_air + cross(nu, middle))[2], 0.0)
+        return np.asarray((climbs**2 + 2.0 * climbs * -cross(nu, arm - middle)[2]) * DOWN)
 
     def loaded(self, t: float) -> bool:
         """Whether the payload has been taken up at time t."""
