@@ -11,7 +11,7 @@ fewest within a standard error of the best (Breiman and others 1984).  The physi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, islice
 
 import numpy as np
@@ -140,12 +140,12 @@ def _path(windows: Sequence[Window], physical: Vehicle, candidates: Terms) -> It
     terms: Terms = ()
     yield terms
     for seconds in STAGES[:-1]:
-        terms = _fitted(windows, physical, _selected(windows, physical, terms, plain, PLAIN[0], seconds), seconds)
+        terms = _stepped(_selected(windows, physical, terms, plain, PLAIN[0], seconds))
     for size in SIZES[1:]:
         offered = plain if size in PLAIN else candidates
-        terms = _selected(windows, physical, terms, offered, size, STAGES[-1])
-        for _ in range(STEPS):
-            terms = _fitted(windows, physical, terms, STAGES[-1])
+        terms = _stepped(_selected(windows, physical, terms, offered, size, STAGES[-1]))
+        for _ in range(1, STEPS):
+            terms = _stepped(_linear(windows, physical, terms, STAGES[-1]))
         yield terms
 
 
@@ -153,42 +153,60 @@ def _runs(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: S
     return RunErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS)
 
 
-def _products(
-    runs: RunErrors, physical: Vehicle, terms: Terms, prior: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of the linear problem of `terms`, all in units of typical sizes: values, curvature, slope; and those sizes."""
-    slopes, errors = runs.slopes(terms)
-    sizes = typical(physical, terms)
-    values = np.array([t.value for t in terms]) / sizes
+@dataclass(frozen=True)
+class _Linear:
+    """The linear problem of terms about their values, all in units of typical sizes.
+
+    Attributes:
+        terms: the terms; physical: vehicle; windows, seconds: what runs are compared over.
+        curvature: shape (P, P); slope: shape (P,).
+    """
+
+    terms: Terms
+    physical: Vehicle
+    windows: Sequence[Window]
+    seconds: Sequence[float]
+    curvature: FloatArray
+    slope: FloatArray
+
+    def of(self, chosen: Sequence[int]) -> _Linear:
+        """The problem of some of the terms; those left out act on nothing yet."""
+        terms = tuple(self.terms[i] for i in chosen)
+        return replace(self, terms=terms, curvature=self.curvature[np.ix_(chosen, chosen)], slope=self.slope[chosen])
+
+
+def _linear(
+    windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float], more: Terms = ()
+) -> _Linear:
+    """The problem of `terms` and of `more`, which have coefficients of zero."""
+    slopes, errors = _runs(windows, physical, terms, seconds).slopes((*terms, *more))
+    prior = PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)  # curvature beside that of the mean error
+    values = np.array([t.value for t in (*terms, *more)]) / typical(physical, (*terms, *more))
     curvature = (slopes @ slopes.T).astype(np.float64) + prior * np.eye(len(values))
-    return values, curvature, slopes @ errors + prior * values, sizes
-
-
-def _prior(windows: Sequence[Window]) -> float:
-    """Curvature of the prior of a coefficient of typical size, beside that of the mean error."""
-    return PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)
+    return _Linear((*terms, *more), physical, windows, seconds, curvature, slopes @ errors + prior * values)
 
 
 def _selected(
     windows: Sequence[Window], physical: Vehicle, terms: Terms, candidates: Terms, size: int, seconds: Sequence[float]
-) -> Terms:
+) -> _Linear:
     """Adds candidates, with coefficients of zero, until there are `size` terms."""
     have = {(term.acts_on, term.product) for term in terms}
     more = tuple(c for c in candidates if (c.acts_on, c.product) not in have)
-    _, h, g, _ = _products(_runs(windows, physical, terms, seconds), physical, (*terms, *more), _prior(windows))
-    chosen = _pursued(h, g, list(range(len(terms))), size)
-    return tuple((*terms, *more)[i] for i in chosen)
+    linear = _linear(windows, physical, terms, seconds, more)
+    return linear.of(_pursued(linear.curvature, linear.slope, list(range(len(terms))), size))
 
 
-def _fitted(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> Terms:
+def _stepped(linear: _Linear) -> Terms:
     """Takes one step in all coefficients, as long a part of it as lowers the error."""
-    runs = _runs(windows, physical, terms, seconds)
-    values, h, g, sizes = _products(runs, physical, terms, _prior(windows))
-    change = -np.linalg.solve(h, g)
+    terms, physical = linear.terms, linear.physical
+    before = _runs(linear.windows, physical, terms, linear.seconds).share()
+    sizes = typical(physical, terms)
+    values = np.array([t.value for t in terms]) / sizes
+    change = -np.linalg.solve(linear.curvature, linear.slope)
     for part in _STEPS:
         at = (values + part * change) * sizes
         moved = tuple(t.model_copy(update={"value": float(v)}) for t, v in zip(terms, at, strict=True))
-        if _runs(windows, physical, moved, seconds).share() < runs.share():
+        if _runs(linear.windows, physical, moved, linear.seconds).share() < before:
             return moved
     return terms
 

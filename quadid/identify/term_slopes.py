@@ -26,6 +26,8 @@ _PROBES = (
 """Terms whose effect over one step tells the answer to unit forces and moments, and the signals."""
 _STEP = 1e-4
 """Of a state [rad, rad/s, m/s, m], and of a probe as a share of its typical size, for differences."""
+_AT_ONCE = 4096
+"""States whose answers are simulated in one call: enough to keep the processor busy, few enough for its cache."""
 
 
 def typical(vehicle: Vehicle, terms: tuple[ResidualTerm, ...]) -> FloatArray:
@@ -51,19 +53,24 @@ def term_slopes(loop: OpenLoop, vehicle: Vehicle, candidates: tuple[ResidualTerm
     acting = [np.flatnonzero(numbers[:, 0] == target) for target in range(len(TARGETS))]
     sizes = typical(vehicle, candidates)
     one_step = _OneStep(loop, vehicle)
-    state = initial_states(loop.window, one_step.theta[0], loop.known)[loop.rows]
-    slope: SingleArray = np.zeros((len(state), TANGENTS, len(candidates)), dtype=np.float32)
+    states = one_step.onward(loop.rows, initial_states(loop.window, one_step.theta[0], loop.known)[loop.rows], at[-1])
+    slope: SingleArray = np.zeros((len(loop.rows), TANGENTS, len(candidates)), dtype=np.float32)
     out: list[SingleArray] = []
-    for i in range(int(at[-1])):
-        state, onward, force, found = one_step.answers(loop.rows + i, state)
-        values = np.column_stack([np.ones(len(found)), found])
-        products = (sizes * np.prod(values[:, numbers[:, 1:]], axis=2)).astype(np.float32)
-        slope = onward @ slope
-        for target, columns in enumerate(acting):
-            slope[:, :, columns] += force[:, :, target, None] * products[:, None, columns]
-        if i + 1 in at:
-            out.append(slope)
-    by_quantity = np.stack(out, axis=1).reshape(len(state), len(at), 4, 3, len(candidates))
+    several = max(_AT_ONCE // max(len(loop.rows), 1), 1)
+    for first in range(0, len(states), several):
+        some = states[first : first + several]
+        rows = loop.rows + np.arange(first, first + len(some))[:, None]
+        answers = one_step.answers(rows.ravel(), some.reshape(-1, some.shape[2]))
+        by_step = (a.reshape(*rows.shape, *a.shape[1:]) for a in answers)
+        for i, (onward, force, found) in enumerate(zip(*by_step, strict=True), first):
+            values = np.column_stack([np.ones(len(found)), found])
+            products = (sizes * np.prod(values[:, numbers[:, 1:]], axis=2)).astype(np.float32)
+            slope = onward @ slope
+            for target, columns in enumerate(acting):
+                slope[:, :, columns] += force[:, :, target, None] * products[:, None, columns]
+            if i + 1 in at:
+                out.append(slope)
+    by_quantity = np.stack(out, axis=1).reshape(len(loop.rows), len(at), 4, 3, len(candidates))
     return by_quantity[:, :, [3, 2, 0, 1]]  # a state has rotation, rate, velocity, position
 
 
@@ -80,15 +87,22 @@ class _OneStep:
         self.theta[1 + TANGENTS :, len(own) - len(_PROBES) :] += np.diag(self._steps)
         self._rollout = Rollout(loop.padded, probed)
 
-    def answers(self, rows: IndexArray, state: FloatArray) -> tuple[FloatArray, SingleArray, SingleArray, FloatArray]:
-        """States (n, 13) one step after `rows`, and their slopes.
+    def onward(self, rows: IndexArray, state: FloatArray, steps: int) -> FloatArray:
+        """States along runs from `rows`, before each of so many steps, shape (steps, n, 13)."""
+        out = np.empty((steps, *state.shape))
+        for i in range(steps):
+            out[i] = state
+            state = np.ascontiguousarray(self._ends(rows + i, state, self.theta[:1], None)[0, :, :, 0])
+        return out
+
+    def answers(self, rows: IndexArray, state: FloatArray) -> tuple[SingleArray, SingleArray, FloatArray]:
+        """What a step from `rows` and states (n, 13) makes of a change.
 
         Returns:
-            The states; slopes along the 12 directions of the state before (n, 12, 12) and along constant forces and
-            moments (n, 12, 6), in single precision; signals, means over the step (n, signals).
+            Slopes along the 12 directions of the state before (n, 12, 12) and along constant forces and moments
+            (n, 12, 6), in single precision; signals, means over the step (n, signals).
         """
-        step = Segments(0, 1, (rows + 1).astype(np.int64))
-        ends = self._rollout.roll(step, self.theta, np.ascontiguousarray(state), self._offsets)[1]
+        ends = self._ends(rows, state, self.theta, self._offsets)
         after = np.moveaxis(ends, 3, 1).reshape(-1, *state.shape)[: len(self.theta)]
         base, moved = after[0], after[1:]
         before = np.broadcast_to(base[:, :4], (*moved.shape[:2], 4))
@@ -98,4 +112,9 @@ class _OneStep:
         force, by_signal = probed[:, :, : len(TARGETS)], probed[:, :, len(TARGETS) :]
         along = force[:, :, :1]
         signals = np.sum(by_signal * along, axis=1) / np.sum(along * along, axis=1)
-        return base, onward.astype(np.float32), force.astype(np.float32), signals
+        return onward.astype(np.float32), force.astype(np.float32), signals
+
+    def _ends(self, rows: IndexArray, state: FloatArray, theta: FloatArray, offsets: FloatArray | None) -> FloatArray:
+        """States one step after `rows`, shape (blocks, n, 13, lanes)."""
+        step = Segments(0, 1, (rows + 1).astype(np.int64))
+        return self._rollout.roll(step, theta, np.ascontiguousarray(state), offsets)[1]
