@@ -43,7 +43,7 @@ FLEET = {
         {"parameter": n, "unit": u, "median": 1.23456e-5, "spread": 0.0123} for n, u in NOMINAL_UNITS.items()
     ]}],
     "counts": {"done": 2}, "rough": 0, "drifts": [], "outliers": [], "reasons": [], "health": [], "worked": 2,
-    "logs": 2, "seconds": 1.0, "files": [], "report": "fleet.html",
+    "logs": 2, "copies": [], "seconds": 1.0, "files": [], "report": "fleet.html",
 }  # fmt: skip
 SHOWN: dict[str, tuple[Any, dict[str, Any], tuple[str, ...]]] = {
     "excite": (excite.show, EXCITED, ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
