@@ -77,7 +77,7 @@ def listed(json: str | None) -> None:
     from quadid.workflow.export import forms
     from quadid_cli import output, tables, terminal
 
-    carried = {name: {"program": form.program, "effects": list(form.carried)} for name, form in FORMS.items()}
+    carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
     output.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
     console = terminal.console(quiet=json == "-")
     tables.print_tables(console, forms())

@@ -248,6 +248,24 @@ def test_the_list_names_what_the_files_leave_out(inside: Cli, vehicle: Vehicle) 
     assert "weak_rotor" in next(iter(export(unknown, "px4", "x").values())).split("no place here")[1].split("\n")[0]
 
 
+@pytest.mark.parametrize("form", FORMATS)
+def test_optional_numbers_that_have_no_place_are_named_too(vehicle: Vehicle, form: str) -> None:
+    lag, inflow = {"tau": 0.03, "tau_down": 0.05}, {"k_z": 0.2, "k_climb": 0.03, "central": 0.0}
+    rotors, effects = Vehicle.shipped("pelican_x").rotors, {"motor_lag": lag, "axial_inflow": inflow}
+    for text in export(vehicle.model_copy(update={"rotors": rotors, "effects": effects}), form, "x").values():
+        told = "".join(line for line in text.splitlines() if "have no place here" in line)
+        assert ("k_climb" in told) == (form in {"rotorpy", "drone-models"})
+        assert ("tau_down" in told) == (form in {"rotorpy", "agilicious"})
+        assert "central" not in told, "neutral: nothing is left out"
+
+
+def test_gazebo_slows_rotors_by_their_own_lag(vehicle: Vehicle) -> None:
+    effects = {"motor_lag": {"tau": 0.03, "tau_down": 0.05}}
+    text = export(vehicle.model_copy(update={"effects": effects}), "gazebo", "x")[".sdf"]
+    assert "<timeConstantUp>0.03<" in text
+    assert "<timeConstantDown>0.05<" in text
+
+
 def test_isaac_lab_ranges_are_the_intervals(vehicle: Vehicle) -> None:
     text = export(vehicle, "isaac-lab", "x")["_isaaclab.py"].replace("from isaaclab_contrib", "#")
     space: dict[str, Any] = {"ThrusterCfg": dict}

@@ -10,7 +10,10 @@ from quadid.errors import ParameterError
 from quadid.report.programs.facts import Facts, matrix
 from quadid.vehicle import GRAVITY
 
-CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "axial_inflow")
+CARRIED = (
+    "cg_offset", "product_of_inertia", "motor_lag", "motor_lag.tau_down", "rotor_drag", "rotor_drag.central",
+    "axial_inflow", "axial_inflow.central",
+)  # fmt: skip
 ROTORS = 4
 _PER_RPM = 2.0 * math.pi / 60.0
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.effects import rotor_losses
+from quadid.effects import EFFECTS, rotor_losses
 from quadid.model.thrust import ThrustModel
 from quadid.parameters import NOMINAL_UNITS
 from quadid.sanitise import LONGEST_LINE, plain
@@ -162,9 +162,10 @@ class Facts:
         """Lines that say what this is, what came from data, and which effects the other program cannot hold.
 
         Args:
-            used: effects that the form carries.
+            used: effects that the form carries, and those of their optional numbers that it does.
         """
         left = [name for name in self.vehicle.effects if name not in used]
+        left += [number for name in self.vehicle.effects if name in used for number in self._optional(name, used)]
         left += [f"residual ({t.formula})" for t in self.vehicle.residual if "residual" not in used]
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
         lines += [
@@ -176,6 +177,14 @@ class Facts:
         if left:
             lines.append(f"Effects that have no place here: {', '.join(left)}")
         return [plain(line, LONGEST_LINE) for line in lines]
+
+    def _optional(self, name: str, used: tuple[str, ...]) -> list[str]:
+        """Optional numbers of an effect that say something and are not among `used`."""
+        there = [p for p in EFFECTS[name].parameters if p.optional and p.name in self.vehicle.effects[name]]
+        said = [
+            p for p in there if self.effect(name, p.name) != (self.effect(name, p.beside) if p.beside else p.neutral)
+        ]
+        return [f"{name}.{p.name}" for p in said if f"{name}.{p.name}" not in used]
 
     def xml_comment(self, used: tuple[str, ...]) -> str:
         """The header inside an XML comment, which two hyphens would end."""

@@ -17,7 +17,7 @@ class Form(NamedTuple):
 
     Attributes:
         program: whose.
-        carried: effects that it can hold; all others are named in the file as left out.
+        carried: effects that it can hold, and optional numbers of these; all others are named in the file as left out.
         texts: makes the text that belongs in a file, by the ending of its name.
     """
 
@@ -25,14 +25,23 @@ class Form(NamedTuple):
     carried: tuple[str, ...]
     texts: Mapping[str, Callable[[Facts], str]]
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Effects that it can hold."""
+        return tuple(name for name in self.carried if name in EFFECTS)
+
+
+ALL = (*EFFECTS, *(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters), "residual")
+"""Everything that a vehicle file holds."""
+
 
 def _yaml(facts: Facts) -> str:
-    head = facts.header((*facts.vehicle.effects, "residual"))
+    head = facts.header(ALL)
     return "".join(f"# {line}\n" for line in head) + facts.vehicle.to_yaml()
 
 
 FORMS: dict[str, Form] = {
-    "yaml": Form("quadid", tuple(EFFECTS), {".yaml": _yaml}),
+    "yaml": Form("quadid", ALL, {".yaml": _yaml}),
     "px4": Form("PX4, SIH, EKF2", px4.CARRIED, {".params": px4.px4}),
     "ardupilot": Form(
         "ArduPilot, SITL", ardupilot.CARRIED,

@@ -8,7 +8,7 @@ import numpy as np
 
 from quadid.report.programs.facts import TENSOR, Facts, number
 
-CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "rotor_drag", "weak_rotor")
+CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "motor_lag.tau_down", "rotor_drag", "weak_rotor")
 ROTOR_MASS = 1e-3
 """Share of the mass that each rotor link gets; taken off the body, so that the whole vehicle keeps mass and inertia."""
 
@@ -73,7 +73,7 @@ def _plugin(facts: Facts, i: int) -> str:
         "linkName": f"rotor_{i}",
         "turningDirection": turning,
         "timeConstantUp": f"{facts.lag:.6g}",
-        "timeConstantDown": f"{facts.lag:.6g}",
+        "timeConstantDown": f"{facts.lag_down:.6g}",
         "maxRotVelocity": f"{facts.fastest[0]:.6g}",
         "motorConstant": f"{float(facts.thrust[i]):.8g}",
         "momentConstant": f"{facts.torque_per_thrust:.8g}",

@@ -9,7 +9,7 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.report.programs.facts import Facts, matrix
 
-CARRIED = ("cg_offset", "product_of_inertia", "motor_lag")
+CARRIED = ("cg_offset", "product_of_inertia", "motor_lag", "motor_lag.tau_down")
 
 
 def isaac_lab(facts: Facts) -> str:
