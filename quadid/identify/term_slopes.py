@@ -116,5 +116,7 @@ class _OneStep:
 
     def _ends(self, rows: IndexArray, state: FloatArray, theta: FloatArray, offsets: FloatArray | None) -> FloatArray:
         """States one step after `rows`, shape (blocks, n, 13, lanes)."""
-        step = Segments(0, 1, (rows + 1).astype(np.int64))
-        return self._rollout.roll(step, theta, np.ascontiguousarray(state), offsets)[1]
+        order = np.argsort(rows, kind="stable")  # rotors turn on from segment to segment
+        step = Segments(0, 1, (rows[order] + 1).astype(np.int64))
+        ends = self._rollout.roll(step, theta, np.ascontiguousarray(state[order]), offsets)[1]
+        return ends[:, np.argsort(order)]

@@ -236,6 +236,8 @@ class Rollout:
         """Cuts parameter vectors into blocks of lanes; raises ValueError for what cannot be simulated."""
         if not 1 <= n_pre <= segments.lead:
             raise ValueError(f"n_pre = {n_pre}; allowed: 1 to the segments' lead, {segments.lead}")
+        if np.any(np.diff(segments.starts) < 0):
+            raise ValueError("segments that begin before the one in front of them; allowed: rising starts")
         if not np.isfinite(theta).all():
             vector, entry = np.argwhere(~np.isfinite(theta))[0]
             raise ValueError(f"theta[{vector}, {entry}] = {theta[vector, entry]}; allowed: finite numbers (see Layout)")

@@ -128,6 +128,8 @@ def test_impossible_calls_are_refused() -> None:
     x0 = rollout.initial_states(segments)
     with pytest.raises(ValueError, match="n_pre = 3; allowed: 1 to the segments' lead, 2"):
         rollout.roll(segments, NOMINAL[None], x0, n_pre=3)
+    with pytest.raises(ValueError, match="rising starts"):
+        rollout.roll(segments.at(np.arange(len(segments.starts))[::-1]), NOMINAL[None], x0)
     with pytest.raises(ValueError, match=r"theta\[0, 0\] = nan"):
         rollout.roll(segments, Layout(VEHICLE).neutral()[None], x0)
 
