@@ -159,13 +159,14 @@ class _Linear:
 
     Attributes:
         terms: the terms; physical: vehicle; windows, seconds: what runs are compared over.
-        curvature: shape (P, P); slope: shape (P,).
+        error: mean error of the runs; curvature: shape (P, P); slope: shape (P,).
     """
 
     terms: Terms
     physical: Vehicle
     windows: Sequence[Window]
     seconds: Sequence[float]
+    error: float
     curvature: FloatArray
     slope: FloatArray
 
@@ -179,11 +180,13 @@ def _linear(
     windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float], more: Terms = ()
 ) -> _Linear:
     """The problem of `terms` and of `more`, which have coefficients of zero."""
-    slopes, errors = _runs(windows, physical, terms, seconds).slopes((*terms, *more))
+    runs = _runs(windows, physical, terms, seconds)
+    slopes, errors = runs.slopes((*terms, *more))
     prior = PRIOR_SECONDS / sum(len(w) * w.dt for w in windows)  # curvature beside that of the mean error
     values = np.array([t.value for t in (*terms, *more)]) / typical(physical, (*terms, *more))
     curvature = (slopes @ slopes.T).astype(np.float64) + prior * np.eye(len(values))
-    return _Linear((*terms, *more), physical, windows, seconds, curvature, slopes @ errors + prior * values)
+    slope = slopes @ errors + prior * values
+    return _Linear((*terms, *more), physical, windows, seconds, runs.share(), curvature, slope)
 
 
 def _selected(
@@ -199,14 +202,13 @@ def _selected(
 def _stepped(linear: _Linear) -> Terms:
     """Takes one step in all coefficients, as long a part of it as lowers the error."""
     terms, physical = linear.terms, linear.physical
-    before = _runs(linear.windows, physical, terms, linear.seconds).share()
     sizes = typical(physical, terms)
     values = np.array([t.value for t in terms]) / sizes
     change = -np.linalg.solve(linear.curvature, linear.slope)
     for part in _STEPS:
         at = (values + part * change) * sizes
         moved = tuple(t.model_copy(update={"value": float(v)}) for t, v in zip(terms, at, strict=True))
-        if _runs(linear.windows, physical, moved, linear.seconds).share() < before:
+        if _runs(linear.windows, physical, moved, linear.seconds).share() < linear.error:
             return moved
     return terms
 

@@ -92,7 +92,7 @@ class _OneStep:
         out = np.empty((steps, *state.shape))
         for i in range(steps):
             out[i] = state
-            state = np.ascontiguousarray(self._ends(rows + i, state, self.theta[:1], None)[0, :, :, 0])
+            state = self._ends(rows + i, state, self.theta[:1], None)[0, :, :, 0]
         return out
 
     def answers(self, rows: IndexArray, state: FloatArray) -> tuple[SingleArray, SingleArray, FloatArray]:
@@ -118,5 +118,5 @@ class _OneStep:
         """States one step after `rows`, shape (blocks, n, 13, lanes)."""
         order = np.argsort(rows, kind="stable")  # rotors turn on from segment to segment
         step = Segments(0, 1, (rows[order] + 1).astype(np.int64))
-        ends = self._rollout.roll(step, theta, np.ascontiguousarray(state[order]), offsets)[1]
+        ends = self._rollout.roll(step, theta, state[order], offsets)[1]
         return ends[:, np.argsort(order)]
