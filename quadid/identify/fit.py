@@ -169,11 +169,11 @@ def quick_fit(quick: QuickMotion, names: Sequence[str], robust: bool = True, com
     said = [_QUICK]
     if late := [n for n, step in zip(quick.free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
         said.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
-    if vague := [n for n, by in zip(quick.free.names, quick.undecided, strict=True) if by > SPREAD_LIMIT]:
-        share = np.exp(-np.max(quick.undecided))
-        said.append(
-            f"{', '.join(vague)}: the rotors' torque accounts for {share:.0%} of quick angular acceleration only"
-        )
+    said += [
+        f"{name}: the rotors' torque accounts for {np.exp(-by):.0%} of quick angular acceleration only"
+        for name, by in zip(quick.free.names, quick.undecided, strict=True)
+        if by > SPREAD_LIMIT
+    ]
     judge = quick.short if comparable else None
     others = [quick.prompt, quick.undecided]
     found = _finish(quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, robust, judge, others).of(
