@@ -75,9 +75,8 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
     for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
         inputs, outputs = quadrotor_io(rollout.window)
         prediction = predict(box.model, inputs, outputs, segments.length, segments.starts, _sigma(noise))
-        rows = segments.starts[:, None] + np.arange(segments.length)
-        error = _error(prediction.outputs, outputs[rows])
-        seen = rollout.valid[rows][..., :_CHANNELS]
+        error = _error(prediction.outputs, outputs[segments.rows])
+        seen = rollout.valid[segments.rows][..., :_CHANNELS]
         squares += np.sum(np.where(seen, error, 0.0) ** 2, axis=(0, 1))
         samples += np.count_nonzero(seen, axis=(0, 1))
     told = expected > 0.0

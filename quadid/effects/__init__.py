@@ -18,11 +18,6 @@ EFFECTS: dict[str, Effect] = {e.name: e for e in TABLE}
 """Every effect by name; `docs/effects.md` explains each."""
 
 
-def effect_of(entry: str) -> Effect | None:
-    """The effect to which an entry of the parameter vector belongs (``rotor_drag.k_x``); None for nominal ones."""
-    return EFFECTS.get(entry.split(".")[0])
-
-
 def parameter_of(effect: str, key: str) -> EffectParameter:
     """The parameter called `key` of an effect.
 

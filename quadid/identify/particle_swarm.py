@@ -4,7 +4,7 @@ An optimiser is a state machine with two verbs: `Swarm.ask` hands out positions 
 their costs.  It knows nothing of the problem, draws all randomness from its seed, prints nothing and starts no threads.
 
 Sources:
-    Kennedy & Eberhart 1995, doi:10.1109/ICNN.1995.488968 (the swarm; local-best ring);
+    Kennedy & Eberhart 1995, doi:10.1109/ICNN.1995.488968 (the swarm);
     Shi & Eberhart 1998, doi:10.1109/ICEC.1998.699146 (inertia weight; the paper's Algorithm 1);
     Clerc & Kennedy 2002, doi:10.1109/4235.985692 (constriction);
     Eberhart & Shi 2000, doi:10.1109/CEC.2000.870279 (constriction with a velocity clamp).
@@ -44,7 +44,6 @@ class SwarmOptions:
         c2: social acceleration coefficient; constriction needs c1 + c2 > 4.
         w_start: inertia weight of the first iteration (variant ``inertia`` only).
         w_end: inertia weight of the last iteration, reached linearly; equal to `w_start` for a constant weight.
-        topology: whom a particle follows: ``global``, the best of all; ``ring``, the best of itself and two neighbours.
         update: ``batch``: all particles move, then all are evaluated; ``in_turn``: one particle at a time moves and is
             evaluated, so the next one already follows a new best, as the loop of Algorithm 1 is printed.
         walls: what happens at a bound besides clamping the position: ``absorb`` sets the velocity component to zero,
@@ -62,7 +61,6 @@ class SwarmOptions:
     c2: float = 2.05
     w_start: float = 0.9
     w_end: float = 0.4
-    topology: Literal["global", "ring"] = "global"
     update: Literal["batch", "in_turn"] = "batch"
     walls: Literal["absorb", "clamp"] = "absorb"
     velocity_clamp: float | None = 0.5
@@ -98,7 +96,7 @@ class SwarmOptions:
             c2: social acceleration coefficient.
         """
         start, end = w if isinstance(w, tuple) else (w, w)
-        return cls("inertia", c1, c2, start, end, "global", "in_turn", "clamp", None, iterations, patience=None)
+        return cls("inertia", c1, c2, start, end, "in_turn", "clamp", None, iterations, patience=None)
 
     @property
     def chi(self) -> float:
@@ -204,7 +202,7 @@ class Swarm:
         r1, r2 = self._rng.random((2, *x.shape))
         # Algorithm 1, line 3: v_i(t) = w v_i(t-1) + c1 r1 (P_best,i - x_i(t-1)) + c2 r2 (g_best,i - x_i(t-1)),
         # with r1, r2 ~ U(0, 1) drawn anew for every particle and component.
-        pull = o.c1 * r1 * (self._own_best[turn] - x) + o.c2 * r2 * (self._leaders(turn) - x)
+        pull = o.c1 * r1 * (self._own_best[turn] - x) + o.c2 * r2 * (self.best - x)
         # Clerc & Kennedy's constriction scales the whole sum instead: v = chi (v + pull).
         v = o.chi * (v + pull) if o.variant == "constriction" else self.inertia_weight * v + pull
         if o.velocity_clamp is not None:
@@ -214,15 +212,6 @@ class Swarm:
         self._x[turn] = np.clip(moved, self._lower, self._upper)
         outside = (moved < self._lower) | (moved > self._upper)
         self._v[turn] = np.where(outside & (o.walls == "absorb"), 0.0, v)
-
-    def _leaders(self, turn: slice) -> FloatArray:
-        if self.options.topology == "global":
-            return self.best
-        index = np.arange(turn.start, turn.stop)
-        ring = np.stack([index, index - 1, (index + 1) % len(self._x)])  # itself first: it wins a draw
-        chosen = ring[np.argmin(self._own_cost[ring], axis=0), np.arange(len(index))]
-        leaders: FloatArray = self._own_best[chosen]
-        return leaders
 
     def _advance(self) -> None:
         particles, initial = len(self._x), self.evaluations == len(self._x)

@@ -235,8 +235,7 @@ def expected_squares(shooting: Shooting, theta: FloatArray, states: InitialState
     parts = []
     for i, part in enumerate(shooting.columns(theta, shooting.free([]), states)):
         q = part.basis.reshape(len(part.basis), shooting.length, shooting.channels, -1)
-        rows = shooting.segments[i].starts[:, None] + np.arange(shooting.length)
-        measured = np.count_nonzero(shooting.rollouts[i].valid[rows][..., : shooting.channels], axis=1)
+        measured = np.count_nonzero(shooting.measured_weights(i), axis=1)
         left = variance * (measured - np.sum(q**2, axis=(1, 3)))
         for c in np.flatnonzero(~np.array(white)):
             coloured = np.sum(factor[c] ** 2) - np.sum(np.matmul(factor[c], q[:, :, c]) ** 2, axis=(1, 2))
@@ -268,7 +267,7 @@ def _errors(measured: FloatArray, simulated: FloatArray) -> tuple[float, float]:
 def _series(shooting: Shooting, lin: Linearised) -> Series:
     parts, place = [], 0
     for rollout, segments in zip(shooting.rollouts, shooting.segments, strict=True):
-        rows = (segments.starts[:, None] + np.arange(segments.length)).ravel()
+        rows = segments.rows.ravel()
         part = slice(place, place + len(segments.starts))
         residual = lin.residuals[part].reshape(len(rows), -1)
         place += len(segments.starts)

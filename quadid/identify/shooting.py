@@ -201,8 +201,7 @@ class Shooting:
 
     def measured_weights(self, i: int) -> FloatArray:
         """1 where a window's segments were measured and count, 0 elsewhere, shape (segments, length, channels)."""
-        rows = self.segments[i].starts[:, None] + np.arange(self.length)
-        weights = np.array(self.rollouts[i].valid[rows][..., : self.channels], dtype=np.float64)
+        weights = np.array(self.rollouts[i].valid[self.segments[i].rows][..., : self.channels], dtype=np.float64)
         weights[..., list(self.left_out)] = 0.0
         return weights
 
@@ -278,9 +277,8 @@ class Shooting:
             ridge = np.repeat(np.diag(1.0 / RIDGE[:k])[None], len(flat), axis=0)
             basis = np.linalg.qr(np.concatenate([flat[..., :k], ridge], axis=1))[0][:, :-k]
             yield Columns(
-                self.rollouts[i].window, self.segments[i].starts[:, None] + np.arange(self.length), basis,
-                white[..., -1], np.all(weights > 0.0, axis=1), flat[..., k:-1], base[..., 0], weights,
-                self.noise,
+                self.rollouts[i].window, self.segments[i].rows, basis, white[..., -1], np.all(weights > 0.0, axis=1),
+                flat[..., k:-1], base[..., 0], weights, self.noise,
             )  # fmt: skip
 
 

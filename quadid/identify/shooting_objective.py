@@ -61,8 +61,7 @@ class BoxProblem:
         sigma = np.sqrt(s.noise.variance)
         parts = []
         for rollout, segments, x0, basis in zip(s.rollouts, s.segments, self._x0, self._bases, strict=True):
-            rows = segments.starts[:, None] + np.arange(segments.length)
-            weights = rollout.valid[rows][..., : s.channels] / sigma
+            weights = rollout.valid[segments.rows][..., : s.channels] / sigma
             out, _ = rollout.roll(segments, thetas, x0, None, self._n_pre)
             flat = (out[..., : s.channels, :] * weights[..., None]).reshape(*out.shape[:2], -1, LANES)
             flat = flat - np.matmul(basis, np.matmul(basis.transpose(0, 2, 1), flat))

@@ -36,9 +36,10 @@ class Segments:
             raise WindowError(f"window of {rows} rows", f"at least {length + lead + 1} rows", "use a longer stretch")
         return cls(length, lead, starts)
 
-    def every(self, n: int) -> Segments:
-        """Returns every n-th segment, the first included."""
-        return self.at(np.arange(0, len(self.starts), n))
+    @property
+    def rows(self) -> IntArray:
+        """Scored rows of each segment, shape (segments, length)."""
+        return self.starts[:, None] + np.arange(self.length)
 
     def at(self, places: IndexArray) -> Segments:
         """Returns the segments at `places`."""

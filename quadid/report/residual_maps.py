@@ -140,7 +140,7 @@ def _signals(shooting: Shooting, residual: FloatArray, settled: Linearised) -> d
     parts: list[dict[str, FloatArray]] = []
     place = 0
     for rollout, segments, x0 in zip(shooting.rollouts, shooting.segments, starts, strict=True):
-        rows = segments.starts[:, None] + np.arange(segments.length)
+        rows = segments.rows
         mine = residual[place : place + len(rows)]
         place += len(rows)
         signals = _of_window(rollout.window, rows, rollout.measured[rows][..., :3] - mine[..., :3], shooting)
@@ -152,7 +152,7 @@ def _signals(shooting: Shooting, residual: FloatArray, settled: Linearised) -> d
 def _of_window(window: Window, rows: IndexArray, rates: FloatArray, shooting: Shooting) -> dict[str, FloatArray]:
     dt, speed = window.dt, window.rotor_speed
     square = np.mean(speed**2, axis=1)
-    spins = np.array([rotor.spin for rotor in shooting.vehicle.rotors], dtype=np.float64)
+    spins = shooting.vehicle.spins
     start = window.log_span[0] if np.isfinite(window.log_span[0]) else window.t0
     level = square / square.mean()
     out = {
