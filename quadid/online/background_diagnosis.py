@@ -29,31 +29,6 @@ ANSWER_AFTER = 30.0
 
 
 @dataclass(frozen=True)
-class DiagnosisRequest(Job):
-    """The last minute, to be diagnosed.
-
-    Attributes:
-        seed: of what is drawn.
-    """
-
-    background: ClassVar[bool] = True
-    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, ArithmeticError, ValueError)
-
-    seed: int
-
-    def answer(self) -> DiagnosisReply:
-        """Diagnoses the windows."""
-        from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
-
-        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
-        return DiagnosisReply(self.number, "", tuple(map(_online, result.findings)), result.verdict.value)
-
-    def failed(self, problem: str) -> DiagnosisReply:
-        """The reply of a diagnosis that could not be run."""
-        return DiagnosisReply(self.number, problem)
-
-
-@dataclass(frozen=True)
 class DiagnosisReply(JobReply):
     """Answer, or why there is none.
 
@@ -64,6 +39,28 @@ class DiagnosisReply(JobReply):
 
     findings: tuple[OnlineFinding, ...] = ()
     verdict: str = ""
+
+
+@dataclass(frozen=True)
+class DiagnosisRequest(Job):
+    """The last minute, to be diagnosed.
+
+    Attributes:
+        seed: of what is drawn.
+    """
+
+    background: ClassVar[bool] = True
+    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, ArithmeticError, ValueError)
+    reply = DiagnosisReply
+
+    seed: int
+
+    def answer(self) -> DiagnosisReply:
+        """Diagnoses the windows."""
+        from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
+
+        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
+        return DiagnosisReply(self.number, "", tuple(map(_online, result.findings)), result.verdict.value)
 
 
 def _online(f: Finding) -> OnlineFinding:

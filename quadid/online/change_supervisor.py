@@ -92,7 +92,7 @@ class ChangeSupervisor:
     def answer_without_fit(request: ChangeRequest, estimator: Estimator) -> ChangeReply | None:
         """The answer where a fit could say nothing: no data, or nothing known before."""
         if not request.windows:
-            return request.failed("too little data after the change")
+            return ChangeReply(request.number, "too little data after the change")
         if not estimator.learned:
             return ChangeReply(request.number, finding=_unlearned(request.change, request.time))
         return None

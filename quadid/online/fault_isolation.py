@@ -38,6 +38,13 @@ EFFECT_SIGMA = 0.3
 
 
 @dataclass(frozen=True)
+class ChangeReply(JobReply):
+    """Answer: the most likely finding, or why there is none."""
+
+    finding: OnlineFinding | None = None
+
+
+@dataclass(frozen=True)
 class ChangeRequest(Job):
     """A change to be explained.
 
@@ -50,6 +57,8 @@ class ChangeRequest(Job):
         time: when, refined; in the time of the stream's stamps [s].
     """
 
+    reply = ChangeReply
+
     theta: FloatArray
     z_sigma: FloatArray
     noise: NoiseModel | None
@@ -59,17 +68,6 @@ class ChangeRequest(Job):
     def answer(self) -> ChangeReply:
         """Fits every look-alike to the data after the change."""
         return _explain(self)
-
-    def failed(self, problem: str) -> ChangeReply:
-        """The reply where nothing could be fitted."""
-        return ChangeReply(self.number, problem)
-
-
-@dataclass(frozen=True)
-class ChangeReply(JobReply):
-    """Answer: the most likely finding, or why there is none."""
-
-    finding: OnlineFinding | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     layout = Layout(request.vehicle)
     shooting = Shooting.cut(request.windows, request.vehicle, SEGMENT, request.noise, layout)
     if shooting.count < 3:
-        return request.failed("too little data after the change")
+        return ChangeReply(request.number, "too little data after the change")
     nothing = _fit(shooting, request, _Cause("", (), ()))
     outcomes = []
     for cause in _causes(request):
@@ -105,7 +103,7 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     best = outcomes[0] if outcomes else nothing
     drop = nothing.deviance - best.deviance
     if not outcomes or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1)):
-        return request.failed("no known cause explains it")
+        return ChangeReply(request.number, "no known cause explains it")
     return ChangeReply(request.number, finding=_finding(request, nothing, outcomes))
 
 

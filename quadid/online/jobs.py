@@ -36,6 +36,7 @@ class Job(ABC):
     Attributes:
         background: whether the session goes on meanwhile; it stands still for all others.
         trouble: what may go wrong with data that nobody foresaw.
+        reply: what it is answered with.
         number: counts the jobs of a session.
         vehicle: the vehicle.
         windows: stretches of data on one grid.
@@ -44,6 +45,7 @@ class Job(ABC):
 
     background: ClassVar[bool] = False
     trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, np.linalg.LinAlgError)
+    reply: ClassVar[type[JobReply]]
 
     number: int
     vehicle: Vehicle
@@ -62,10 +64,10 @@ class Job(ABC):
     def answer(self) -> JobReply:
         """Does it; raises what is `trouble`."""
 
-    @abstractmethod
     def failed(self, problem: str) -> JobReply:
         """The reply of a job that could not be run."""
+        return self.reply(self.number, problem)
 
     def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
         """Whether a reply is to this job, and of its kind."""
-        return isinstance(reply, type(self.failed(""))) and reply.number == self.number
+        return isinstance(reply, self.reply) and reply.number == self.number

@@ -56,52 +56,6 @@ INERTIAL = (0, 1, 2, 6, 7, 8)
 
 
 @dataclass(frozen=True)
-class FitRequest(Job):
-    """A window to be fitted.
-
-    Attributes:
-        theta: full parameter vector to start from.
-        noise: sensor noise; None lets the fit estimate it.
-        search: run the swarm first: nothing is known yet, or the vehicle has changed.
-        seed: of the swarm.
-        measure: measure the sensor noise in this window too.
-        flexible: fit every effect that moves the vehicle along.
-        spacing: time between two readings of the rotors [rows].
-    """
-
-    theta: FloatArray
-    noise: NoiseModel | None
-    search: bool
-    seed: int
-    measure: bool = False
-    flexible: bool = False
-    spacing: float = 1.0
-
-    def answer(self) -> FitReply:
-        """Fits the windows."""
-        return _fit(self)
-
-    def failed(self, problem: str) -> FitReply:
-        """The reply of a fit that could not be run."""
-        return FitReply(self.number, problem)
-
-    def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
-        """Whether a reply is to this job, and of its form."""
-        if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
-            return False
-        channels = {channels_of(self.windows), *([] if self.noise is None else [len(self.noise.white)])}
-        estimate = reply.estimate
-        return (
-            all(a is None or a.shape == (SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
-            and all(n is None or is_noise(n, channels) for n in (reply.noise, reply.measured))
-            and (
-                reply.theta is None or is_vector(reply.theta, self.theta, estimate is not None and not estimate.finite)
-            )
-            and (estimate is None or is_estimate(estimate, self.vehicle, self.start, self.stop))
-        )
-
-
-@dataclass(frozen=True)
 class FitReply(JobReply):
     """Answer to a request.
 
@@ -133,6 +87,50 @@ class FitReply(JobReply):
     between_rows: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class FitRequest(Job):
+    """A window to be fitted.
+
+    Attributes:
+        theta: full parameter vector to start from.
+        noise: sensor noise; None lets the fit estimate it.
+        search: run the swarm first: nothing is known yet, or the vehicle has changed.
+        seed: of the swarm.
+        measure: measure the sensor noise in this window too.
+        flexible: fit every effect that moves the vehicle along.
+        spacing: time between two readings of the rotors [rows].
+    """
+
+    reply = FitReply
+
+    theta: FloatArray
+    noise: NoiseModel | None
+    search: bool
+    seed: int
+    measure: bool = False
+    flexible: bool = False
+    spacing: float = 1.0
+
+    def answer(self) -> FitReply:
+        """Fits the windows."""
+        return _fit(self)
+
+    def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
+        """Whether a reply is to this job, and of its form."""
+        if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
+            return False
+        channels = {channels_of(self.windows), *([] if self.noise is None else [len(self.noise.white)])}
+        estimate = reply.estimate
+        return (
+            all(a is None or a.shape == (SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
+            and all(n is None or is_noise(n, channels) for n in (reply.noise, reply.measured))
+            and (
+                reply.theta is None or is_vector(reply.theta, self.theta, estimate is not None and not estimate.finite)
+            )
+            and (estimate is None or is_estimate(estimate, self.vehicle, self.start, self.stop))
+        )
+
+
 def prior_of(vehicle: Vehicle) -> Prior:
     """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
     given = [vehicle.parameters[name] for name in NOMINAL_NAMES]
@@ -143,7 +141,7 @@ def _fit(request: FitRequest) -> FitReply:
     layout, theta, noise = Layout(request.vehicle), request.theta, request.noise
     shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
     if shooting.count == 0:
-        return request.failed("no stretch is long enough for one segment")
+        return FitReply(request.number, "no stretch is long enough for one segment")
     free = shooting.free(list(NOMINAL_NAMES))
     lin, guess = shooting.linearise(theta, free), layout.initial(request.vehicle)
     if not np.isfinite(lin.total_cost) and not np.array_equal(theta, guess):
@@ -195,7 +193,7 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
     vehicle, layout, nominal = request.vehicle, Layout(request.vehicle), prior_of(request.vehicle)
     shooting, free, prior, result = flexible_fit(request.windows, vehicle, nominal, theta, noise)
     if not np.isfinite(result.cost):
-        return request.failed("the simulation diverges at every point tried")
+        return FitReply(request.number, "the simulation diverges at every point tried")
     estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
     # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
     bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
