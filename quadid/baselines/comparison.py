@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from quadid.baselines.optimisers import NAMES as OPTIMISERS
-from quadid.baselines.optimisers import minimise
+from quadid.baselines.optimisers import Result, minimise
 from quadid.baselines.subspace import METHODS as SUBSPACE
 from quadid.errors import ParameterError, nearest
 from quadid.types import FloatArray, JsonDict
-
-Clock = Callable[[], float]
 
 METHODS = (
     "initial", "quasi_newton", "least_squares", "pso", "pso_polish", "cma_es", "l_shade", "differential_evolution",
@@ -28,8 +26,6 @@ KNOWN = (*METHODS, *(name for name in OPTIMISERS if name not in METHODS))
 """All names that may be asked for."""
 SEEDLESS = frozenset({"initial", "quasi_newton", "least_squares", *SUBSPACE})
 """Methods without randomness: run once, whatever the number of seeds."""
-BUDGET = 4000
-"""Simulations of the data that an optimiser may spend in one run."""
 SUCCESS = 1.01
 """A run has failed when its cost is above this multiple of the lowest cost that any run of any method found."""
 
@@ -57,19 +53,11 @@ class Trial:
 
     Attributes:
         seed: of all its randomness.
-        point: best point found, shape (n,).
-        cost: its cost.
-        evaluations: parameter vectors simulated.
-        seconds: on the caller's clock.
-        stop: how it ended, a sentence.
+        found: what it ended with.
     """
 
     seed: int
-    point: FloatArray
-    cost: float
-    evaluations: int
-    seconds: float
-    stop: str
+    found: Result
 
 
 @dataclass(frozen=True)
@@ -87,11 +75,11 @@ class Tried:
     @property
     def typical(self) -> Trial:
         """The run of median cost (the lower one of two), which stands for the method in the tables."""
-        return sorted(self.trials, key=lambda t: t.cost)[(len(self.trials) - 1) // 2]
+        return sorted(self.trials, key=lambda t: t.found.cost)[(len(self.trials) - 1) // 2]
 
     def failures(self, lowest: float) -> int:
         """Number of runs that ended above `SUCCESS` times the lowest cost."""
-        return sum(not t.cost <= SUCCESS * lowest for t in self.trials)
+        return sum(not t.found.cost <= SUCCESS * lowest for t in self.trials)
 
 
 def check_methods(names: Sequence[str]) -> tuple[str, ...]:
@@ -103,21 +91,20 @@ def check_methods(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def run_optimiser(
-    name: str, problem: Problem, seeds: Sequence[int], budget: int = BUDGET, clock: Clock | None = None
+    name: str, problem: Problem, seeds: Sequence[int], budget: int, clock: Callable[[], float] | None = None
 ) -> Tried:
     """Runs one optimiser on a problem, once for each seed, or once where it has no randomness."""
-    trials = []
-    for seed in seeds[:1] if name in SEEDLESS else seeds:
-        found = minimise(
-            name, problem.cost, problem.start, problem.lower, problem.upper, budget, seed, problem.residual, clock
-        )
-        trials.append(Trial(seed, found.x, found.cost, found.evaluations, found.seconds, found.stop.value))
+    p = problem
+    trials = [
+        Trial(seed, minimise(name, p.cost, p.start, p.lower, p.upper, budget, seed, p.residual, clock))
+        for seed in (seeds[:1] if name in SEEDLESS else seeds)
+    ]
     return Tried(name, tuple(trials))
 
 
 def lowest_cost(tried: Sequence[Tried]) -> float:
     """Lowest cost of all runs; infinite when there is none."""
-    return min((t.cost for method in tried for t in method.trials), default=math.inf)
+    return min((t.found.cost for method in tried for t in method.trials), default=math.inf)
 
 
 @dataclass(frozen=True)
@@ -141,7 +128,7 @@ def optimiser_entry(
     method: Tried, lowest: float, scores: Scores, paper: Scores | None, parameters: Mapping[str, float]
 ) -> JsonDict:
     """One optimiser in the form of ``quadid.compare/1``; `mse` and `parameters` are those of its typical run."""
-    typical = method.typical
+    typical = method.typical.found
     return {
         "name": method.name,
         "mse": scores.entry(),
@@ -150,12 +137,13 @@ def optimiser_entry(
         "evaluations": typical.evaluations,
         "seconds": typical.seconds,
         "parameters": dict(parameters),
-        "seed": typical.seed,
-        "stop": typical.stop,
+        "seed": method.typical.seed,
+        "stop": typical.stop.value,
         "runs": len(method.trials),
         "failures": method.failures(lowest),
         "trials": [
-            {"seed": t.seed, "cost": t.cost, "evaluations": t.evaluations, "seconds": t.seconds} for t in method.trials
+            {"seed": t.seed, "cost": t.found.cost, "evaluations": t.found.evaluations, "seconds": t.found.seconds}
+            for t in method.trials
         ],
     }
 

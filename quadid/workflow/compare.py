@@ -126,7 +126,7 @@ class Judge:
         from quadid.identify.score import mse_score
         from quadid.parameters import NOMINAL_NAMES
 
-        theta = problem.theta(method.typical.point)
+        theta = problem.theta(method.typical.found.x)
         sets = (self.train, *self.unseen)
         train, *validate = (mse_score(part, self.vehicle, theta, self.noise).mse for part in sets)
         flown = [paper_score(part, self.vehicle, theta, self.autopilot) for part in sets]

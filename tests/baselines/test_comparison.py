@@ -11,6 +11,7 @@ import pytest
 from quadid.baselines import comparison
 from quadid.baselines.black_box import fit_black_box, score_black_box
 from quadid.baselines.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
+from quadid.baselines.optimisers import Result, Stop
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import fly
 from quadid.identify.noise_model import NoiseModel
@@ -39,12 +40,12 @@ class Bowl:
 
 
 def trial(cost: float, seed: int = 1) -> comparison.Trial:
-    return comparison.Trial(seed, np.zeros(2), cost, 10, 0.1, "done")
+    return comparison.Trial(seed, Result(np.zeros(2), cost, 10, 0.1, Stop.CONVERGED))
 
 
 def test_the_run_of_median_cost_stands_for_a_method_and_failures_are_counted_against_the_best_of_all() -> None:
     method = Tried("pso", (trial(3.0, 1), trial(1.0, 2), trial(1.005, 3), trial(math.inf, 4)))
-    assert method.typical.cost == 1.005
+    assert method.typical.found.cost == 1.005
     assert method.failures(1.0) == 2
     assert lowest_cost([method, Tried("cma_es", (trial(0.5),))]) == 0.5
 
@@ -53,8 +54,8 @@ def test_random_methods_run_once_a_seed_others_once() -> None:
     assert [t.seed for t in run_optimiser("pso", Bowl(), (3, 4, 5), 200).trials] == [3, 4, 5]
     alone = run_optimiser("least_squares", Bowl(), (3, 4, 5), 200)
     assert len(alone.trials) == 1
-    np.testing.assert_allclose(alone.typical.point, 0.3, atol=1e-6)
-    assert alone.typical.cost == pytest.approx(0.5)
+    np.testing.assert_allclose(alone.typical.found.x, 0.3, atol=1e-6)
+    assert alone.typical.found.cost == pytest.approx(0.5)
 
 
 def test_methods_keep_the_order_of_the_table_and_unknown_ones_are_refused() -> None:
