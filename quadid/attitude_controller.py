@@ -82,8 +82,7 @@ def pack_gains(gains: Mapping[str, float]) -> FloatArray:
 def mixer_matrix(vehicle: Vehicle, gains: Mapping[str, float]) -> FloatArray:
     """Pseudo-inverse of the geometry: (thrust [N], roll, pitch, yaw torque [N m]) to omega^2, shape (rotors, 4)."""
     b, d = gains["thrust_coefficient"], gains["drag_coefficient"]
-    x, y = vehicle.rotor_positions[:, 0], vehicle.rotor_positions[:, 1]
-    effect = np.vstack([np.full(len(x), b), -b * y, b * x, d * vehicle.spins])
+    effect = np.vstack([np.ones(len(vehicle.rotors)), vehicle.torque_arms.T]) * [[b], [b], [b], [d]]
     return np.ascontiguousarray(np.linalg.pinv(effect))
 
 

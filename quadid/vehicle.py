@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_valid
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
-from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
+from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.proof import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
@@ -132,35 +132,30 @@ class Vehicle(Strict):
     @model_validator(mode="after")
     def _physical(self) -> Vehicle:
         low, high = self.parameters["b"].limits
-        slip = impossible_size(self.mass, self.arm) or impossible_hover((self.hover_speed(high), self.hover_speed(low)))
+        slip = impossible_size(self.mass, self.arm) or impossible_hover(self.hover_speed(high), self.hover_speed(low))
         if slip:
             raise ValueError(slip)
         try:
             rotor_drag_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
         except ParameterError as error:
             raise ValueError(str(error)) from error
-        diagonal = [self.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")]
-        why = impossible_inertia(diagonal)
-        if why:
+        if why := impossible_inertia([self.parameters[n].initial for n in INERTIAS]):
             raise ValueError(f"impossible inertia: {why}")
-        if self.stand_thrust is not None:
-            low, high = self.parameters["b"].limits
-            if not low < self.stand_thrust[0] < high:
-                raise ValueError(
-                    f"thrust_stand yields b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
-                    "check rad/s and N, one rotor a reading"
-                )
+        if self.stand_thrust is not None and not low < self.stand_thrust[0] < high:
+            raise ValueError(
+                f"thrust_stand yields b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
+                "check rad/s and N, one rotor a reading"
+            )
         if isinstance(self.mixer, str) and self.mixer not in MIXERS:
             raise ValueError(f"no mixer '{self.mixer}'; {nearest(self.mixer, MIXERS)}, or write its matrix")
         if self.mixer is not None and self.mixing.shape[0] != len(self.rotors):
             raise ValueError(f"mixer with {self.mixing.shape[0]} rows for {len(self.rotors)} rotors; one row a rotor")
-        arms = np.array([r.position for r in self.rotors])[:, :2]
-        spread = np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)
-        if spread[-1] < 1e-4:
+        arms = self.rotor_positions[:, :2]
+        if np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)[-1] < 1e-4:
             raise ValueError(
                 "all rotors lie on one line: roll and pitch cannot both be controlled; check positions [m]"
             )
-        if len({r.spin for r in self.rotors}) == 1:
+        if np.ptp(self.spins) == 0.0:
             raise ValueError("all rotors spin the same way: yaw cannot be balanced; use both +1 and -1")
         return self
 
@@ -183,6 +178,12 @@ class Vehicle(Strict):
     def spins(self) -> FloatArray:
         """Shape (rotors,), +1 or -1."""
         return np.array([float(r.spin) for r in self.rotors])
+
+    @property
+    def torque_arms(self) -> FloatArray:
+        """Roll and pitch torque over thrust, which acts along -z, and yaw torque over drag, shape (rotors, 3)."""
+        x, y, _ = self.rotor_positions.T
+        return np.column_stack([-y, x, self.spins])
 
     @property
     def arm(self) -> float:

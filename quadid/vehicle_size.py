@@ -45,13 +45,13 @@ def _fits(mass: float, arm: float) -> bool:
     return MASSES[0] <= mass <= MASSES[1] and 0.005 <= arm <= 20.0 and DENSITY[0] <= mass / arm**3 <= DENSITY[1]
 
 
-def impossible_hover(hover: tuple[float, float]) -> str:
+def impossible_hover(low: float, high: float) -> str:
     """Says that no thrust coefficient within its bounds hovers at a speed rotors have; empty where one does.
 
     Args:
-        hover: rotor speeds [rad/s] at which the upper and the lower bound of b carry the weight.
+        low: rotor speed [rad/s] at which the upper bound of b carries the weight.
+        high: that of the lower bound.
     """
-    low, high = hover
     if math.isfinite(low) and high >= SPEEDS[0] and low <= SPEEDS[1]:
         return ""
     return (

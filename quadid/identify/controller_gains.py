@@ -75,8 +75,7 @@ def find_autopilot(windows: Sequence[Window], vehicle: Vehicle) -> Autopilot | N
         return None
     b, d = (vehicle.parameters[n].initial for n in NOMINAL_NAMES[:2])
     throttle, ceiling = _throttle(rows)
-    positions = vehicle.rotor_positions
-    arms = (-b * positions[:, 1], b * positions[:, 0], d * vehicle.spins)
+    arms = vehicle.torque_arms.T * [[b], [b], [d]]
     # The first minutes tell whether it runs faster than the log, and the gains to begin with.
     some = [_Rows(*(values[:TRIAL_ROWS] for values in rows[0]))] if len(rows[0].rate) >= SHORTEST else rows
     found = []

@@ -35,7 +35,7 @@ def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) ->
         vehicle: places of the rotors.
         white: standard deviation of the white noise of roll and pitch rate [rad/s], shape (2,).
     """
-    dt, place = windows[0].dt, vehicle.rotor_positions
+    dt = windows[0].dt
     length = max(round(SECONDS / dt), 4)
     taper = np.hanning(length)[:, None]
     torque_power, motion_power, cross = (np.zeros((length // 2 + 1, 2), dtype) for dtype in (float, float, complex))
@@ -43,7 +43,7 @@ def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) ->
     for window in windows:
         if window.gyro is None or len(window) < length:
             continue
-        torque = window.rotor_speed**2 @ np.column_stack([-place[:, 1], place[:, 0]])
+        torque = window.rotor_speed**2 @ vehicle.torque_arms[:, :2]
         acceleration = np.gradient(_without_gaps(window.gyro[:, :2]), dt, axis=0)
         for begin in range(0, len(window) - length + 1, length // 2):
             part = slice(begin, begin + length)

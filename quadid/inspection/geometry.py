@@ -85,11 +85,8 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     name = "geometry"
     if isinstance(lagged, str):
         return Check(name, CheckResult.UNKNOWN, lagged)
-    inertia, place = vehicle.initial[2:4], vehicle.rotor_positions
-    fits = [
-        _map(squares @ np.column_stack([-place[:, 1], place[:, 0]]), motion[:, :2] * inertia)
-        for squares, motion in lagged
-    ]
+    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
+    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion in lagged]
     share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
     if float(np.min(share)) < _CLEAR:
         axis = ("roll", "pitch")[int(np.argmin(share))]

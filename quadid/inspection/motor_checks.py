@@ -169,12 +169,8 @@ def _orders(rotors: int) -> list[tuple[int, ...]]:
 
 
 def _correlations(lagged: Lagged, vehicle: Vehicle, orders: list[tuple[int, ...]]) -> FloatArray:
-    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3).
-
-    Thrust acts along -z, so torque is (-y, x) times thrust, and spin times drag about z.
-    """
-    place = vehicle.rotor_positions
-    arms = np.column_stack([-place[:, 1], place[:, 0], vehicle.spins])[np.argsort(orders, axis=1)]
+    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3)."""
+    arms = vehicle.torque_arms[np.argsort(orders, axis=1)]
     found = []
     for squares, motion in lagged:
         torque = np.einsum("nr,ora->noa", squares, arms, optimize=True)

@@ -130,7 +130,7 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
     Yaw is left free, for a vehicle may turn for long.  One rotor is named: that whose square, set to what balance
     needs, agrees best with the others.
     """
-    lever = np.column_stack([-vehicle.rotor_positions[:, 1], vehicle.rotor_positions[:, 0]]) / vehicle.arm
+    lever = vehicle.torque_arms[:, :2] / vehicle.arm
     share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-9)
     odd = np.linalg.norm(share @ lever, axis=1) > _IMBALANCE / (len(lever) - 0.25)
     if odd.mean() < _UNBALANCED:

@@ -103,12 +103,11 @@ def _blocks(spans: Spans) -> list[FloatArray]:
 
 def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray, width: int) -> list[_Peak]:
     """Peaks of one block at times `at`, with both signals smoothed over `width` of its rows."""
-    place = vehicle.rotor_positions
     turning, speeds = _around(gyro.t, at), _around(signal.t, at)
     rates = linear(gyro.t[turning], gyro.values[turning, :2], at)
     squares = linear(signal.t[speeds], signal.values[speeds] ** 2, at)
     motion = _quick(np.gradient(rates, _STEP, axis=0), width)
-    torque = _quick(squares @ np.column_stack([-place[:, 1], place[:, 0]]), width)
+    torque = _quick(squares @ vehicle.torque_arms[:, :2], width)
     return [_peak(axis, torque[:, axis], motion[:, axis]) for axis in range(2)]
 
 

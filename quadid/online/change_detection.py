@@ -82,8 +82,7 @@ class ChangeDetector:
     def __init__(self, vehicle: Vehicle) -> None:
         """Watches flights of `vehicle`."""
         self._vehicle = vehicle
-        position = vehicle.rotor_positions
-        self._arms = np.column_stack([-position[:, 1], position[:, 0]])
+        self._arms = vehicle.torque_arms[:, :2]
         self._state = FlightState(vehicle)
         self._velocity = Velocity()
         self._chunks: deque[_Chunk] = deque(maxlen=round((BASELINE + LOOK_BACK) / CHUNK))

@@ -52,9 +52,8 @@ class CommandReconstruction:
         known = vehicle.stabiliser
         self._gains = pack_gains(known.gains) if known is not None else None
         self._mixer = mixer_matrix(vehicle, known.gains) if known is not None else np.empty((0, 4))
-        positions = vehicle.rotor_positions
         b, d = (known.gains[n] for n in ("thrust_coefficient", "drag_coefficient")) if known is not None else (0.0, 0.0)
-        self._arms = np.column_stack([-b * positions[:, 1], b * positions[:, 0], d * vehicle.spins])
+        self._arms = vehicle.torque_arms * [b, b, d]
         self._hover = vehicle.mass * GRAVITY / b if known is not None else math.inf
         self._inertia = np.array([vehicle.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")])
         self._rate = (known.rate if known is not None else None) or 0.0
