@@ -1,6 +1,6 @@
 """Health of recorded and simulated vehicles, into a result page.
 
-python -m studies.health --out docs/results [--parts recorded few limits features fleet simulated]
+python -m studies.health --out docs/results [--parts recorded few limits kinds features fleet simulated]
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from studies.health import features, few, fleet, limits, recorded, simulated
+from studies.health import features, few, fleet, kinds, limits, recorded, simulated
 from studies.page import put_section
 
-PARTS = ("recorded", "few", "limits", "features", "fleet", "simulated")
+PARTS = ("recorded", "few", "limits", "kinds", "features", "fleet", "simulated")
 TITLE = "Health: what changed in this vehicle"
 
 
@@ -34,6 +34,7 @@ def main() -> None:
         "recorded": lambda: _recorded(judged(), chosen.out / "health-score.png"),
         "few": lambda: _few(flights()),
         "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged())}",
+        "kinds": lambda: f"## Propeller or weight\n{kinds.text(judged())}",
         "features": lambda: f"## What else the logs hold, and why it is not used\n{features.text(judged())}",
         "fleet": lambda: _fleet(flights(), chosen.data / "crazypad", chosen.report),
         "simulated": lambda: _simulated(chosen.each),
