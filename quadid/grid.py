@@ -216,12 +216,14 @@ def _notes(plan: Plan, period: float) -> list[str]:
 def _nothing_left(
     recording: Recording, longest: float, needed: float, parts: Sequence[Span]
 ) -> LogError | NotIdentifiableError:
-    first, last = _log_span(recording)
     if tuple(parts) != (WHOLE,):
-        asked = " nor ".join(f"{a:g} and {b:g} s" for a, b in parts)
+        # In the time in which people ask for a part.
+        zero = recording.first_imu_time
+        first, last = (t - zero for t in _log_span(recording))
+        asked = " nor ".join(f"{a - zero:g} and {b - zero:g} s" for a, b in parts)
         return LogError(
             f"{recording.name}: nothing to use between {asked}",
-            f"times within {first:.3f} to {last:.3f} s", "see `quadid inspect` for the flying spans",
+            f"{first:.1f} to {last:.1f} s after its first IMU sample", "see `quadid inspect` for the flying spans",
         )  # fmt: skip
     return NotIdentifiableError(
         f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",

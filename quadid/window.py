@@ -152,6 +152,12 @@ class Recording:
     epoch: float | None = None
     modes: tuple[tuple[float, str], ...] = ()
 
+    @property
+    def first_imu_time(self) -> float:
+        """Time [s] of the first gyro or accelerometer sample, else of the first of any channel: LOG@0 begins there."""
+        first = {name: float(c.t[0]) for name, c in self.channels.items() if len(c.t)}
+        return min([t for name, t in first.items() if name in ("gyro", "accel")] or first.values(), default=0.0)
+
 
 @dataclass(frozen=True)
 class Window:

@@ -53,6 +53,7 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
         missing=missing_signals(recording.format, facts),
         parameters=parameter_outlook(facts),
         warnings=recording.warnings,
+        zero=recording.first_imu_time,
     )
 
 

@@ -115,6 +115,7 @@ class Inspection:
         parameters: what the channels allow.
         excitation: rows computed elsewhere, as given.
         warnings: what the reader had to say.
+        zero: time of the log's first IMU sample [s]: ``LOG@from:to``, and tables for people, count from there.
     """
 
     name: str
@@ -129,6 +130,7 @@ class Inspection:
     parameters: tuple[Outlook, ...]
     excitation: tuple[Mapping[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
+    zero: float = 0.0
 
     @property
     def usable(self) -> bool:

@@ -19,16 +19,16 @@ def inspect_tables(found: Inspection) -> list[TextTable]:
 def channel_table(found: Inspection) -> TextTable:
     """One row a channel."""
     columns = (
-        Column("channel"), Column("rate (Hz)", right=True), Column("samples", right=True, rank=3),
-        Column("from-to (s)", right=True, rank=4), Column("gaps", right=True),
-        Column("longest (s)", right=True, rank=2), Column("dropped", right=True, rank=1), Column("source", rank=5),
+        Column("channel"), Column("rate (Hz)", right=True), Column("samples", right=True, rank=4),
+        Column("from-to (s)", right=True, rank=3), Column("gaps", right=True),
+        Column("longest (s)", right=True, rank=5), Column("dropped", right=True, rank=2), Column("source", rank=1),
     )  # fmt: skip
     rows = tuple(
         (
             f.name,
             number(f.rate),
             str(f.count),
-            f"{f.first:.1f}-{f.last:.1f}",
+            _from_to(f.first, f.last, found),
             str(f.gaps),
             f"{f.longest_gap:.3g}" if f.gaps else "",
             str(sum(f.dropped.values()) or ""),
@@ -77,8 +77,13 @@ def sentences(found: Inspection) -> list[Cell]:
 
 def heading(found: Inspection) -> str:
     """Name, format, length, and when it flies."""
-    flying = ", ".join(f"{a:.1f}-{b:.1f}" for a, b in found.flying) or "none found"
+    flying = ", ".join(_from_to(a, b, found) for a, b in found.flying) or "none found"
     return f"{_clean(found.name)}: {found.format}, {found.seconds:.1f} s, flying from-to (s): {flying}"
+
+
+def _from_to(first: float, last: float, found: Inspection) -> str:
+    """In the time of ``LOG@from:to``; a channel may begin before the IMU."""
+    return f"{first - found.zero:z.1f}-{last - found.zero:z.1f}"
 
 
 def _spaced(name: str) -> str:

@@ -73,7 +73,7 @@ def inspect(
     if whole is None:
         named = {} if described is None else described.columns
         whole = open_recording(cut.path, preset, {**named, **(columns or {})})
-    found = inspect_recording(cut.of(whole), described)
+    found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
     flown = flown_parts(whole, found.flying, cut)
     if described is not None:
         found = replace(found, excitation=_excitation(whole, described, cut, flown))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from quadid.errors import LogError, VehicleError
-from quadid.workflow.parts import Cut, first_imu_time, flown_parts, left_on_ground, names_of, parse_cut
+from quadid.workflow.parts import Cut, flown_parts, left_on_ground, names_of, parse_cut
 
 if TYPE_CHECKING:
     from quadid.grid import GridReport
@@ -180,7 +180,7 @@ def gridded(
     """What is flown of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
     from quadid.grid import grid_recording
 
-    zero = first_imu_time(recording)
+    zero = recording.first_imu_time
     return grid_recording(recording, vehicle, rate, [(zero + a, zero + b) for a, b in flown] or [cut.span(recording)])
 
 

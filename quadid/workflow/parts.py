@@ -29,7 +29,7 @@ class Cut:
 
     def span(self, recording: Recording) -> tuple[float, float]:
         """First and last time of the part [s], in the time of the recording; infinite for open ends."""
-        zero = first_imu_time(recording)
+        zero = recording.first_imu_time
         low = -math.inf if self.start is None else zero + self.start
         return low, math.inf if self.stop is None else zero + self.stop
 
@@ -50,7 +50,7 @@ class Cut:
 
     def _empty(self, recording: Recording) -> LogError:
         """Nothing is there: which span was asked for, and which there is."""
-        zero = first_imu_time(recording)
+        zero = recording.first_imu_time
         times = [float(t) - zero for c in recording.channels.values() if len(c.t) for t in (c.t[0], c.t[-1])]
         asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
         if self.start is None:
@@ -95,7 +95,7 @@ def flown_parts(recording: Recording, flying: Spans, cut: Cut) -> Spans:
     imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
     if cut.start is not None or cut.stop is not None or not imu:
         return ()
-    return proposed_cuts(flying, first_imu_time(recording), max(float(t[-1]) for t in imu))
+    return proposed_cuts(flying, recording.first_imu_time, max(float(t[-1]) for t in imu))
 
 
 def names_of(cut: Cut, parts: Spans) -> list[str]:
@@ -107,10 +107,3 @@ def left_on_ground(names: Sequence[str]) -> str:
     """What is used of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
     whole = names[0].rpartition("@")[0]
     return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
-
-
-def first_imu_time(recording: Recording) -> float:
-    """Time [s] of the first gyro or accelerometer sample, else of the first sample of any channel."""
-    imu = [float(c.t[0]) for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
-    rest = [float(c.t[0]) for c in recording.channels.values() if len(c.t)]
-    return min(imu or rest, default=0.0)

@@ -12,7 +12,7 @@ from quadid_replay import write_csv
 
 from quadid.inspection import inspect
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.inspect_tables import parameter_outlook_table
+from quadid.report.inspect_tables import channel_table, parameter_outlook_table
 from quadid.window import Recording
 from tests.replay.synthetic import Flight
 
@@ -111,3 +111,29 @@ def test_motion_is_not_told_where_the_rotors_come_too_slowly() -> None:
         found = inspect(replace(whole, channels={**whole.channels, "rotor_speed": channel}))
         table = parameter_outlook_table(replace(found, excitation=rows))
         assert [row[2] for row in table.rows].count("0.1 %") == shown
+
+
+def test_times_for_people_are_those_of_a_span(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The clock of this log began 1000 s before it: what is printed can be asked for as LOG@from:to."""
+    flown = Flight().recording(seconds=10.0)
+    booted = {name: replace(c, t=c.t + 1000.0) for name, c in flown.channels.items()}
+    path = tmp_path / "late.csv"
+    write_csv(path, replace(flown, channels=booted))
+    assert run(monkeypatch, str(path), "--vehicle", "pelican") == 0
+    out = capsys.readouterr().out
+    assert "flying from-to (s): 0.0-10.0" in out
+    assert "1000.0" not in out
+    assert run(monkeypatch, f"{path}@2:5") == 0
+    assert "flying from-to (s): 2.0-5.0" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["quadid", "identify", f"{path}@1002:1005", "--vehicle", "pelican"])
+    assert app_main() == 2
+    assert "nothing to use between 1002 and 1005 s; allowed: 0.0 to 10.0 s after its first" in capsys.readouterr().err
+
+
+def test_a_long_source_stays_where_it_says_what_the_motors_are() -> None:
+    flown = inspect(Flight().recording(seconds=10.0))
+    source = "vehicle_torque_setpoint (allocated as actuator_motors, normalized)"
+    told = replace(flown, channels=tuple(replace(c, source=source) for c in flown.channels))
+    assert source in channel_table(told).text(120)
