@@ -117,7 +117,8 @@ class Consistency:
 
     def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
         long = max(round(TURN / step), 1)
-        starts = np.arange(0, len(gyro) - long, long)
+        # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
+        starts = np.arange(len(gyro) - long)
         if not len(starts):
             return
         by_gyro = integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step)
@@ -131,7 +132,7 @@ class Consistency:
         rows = np.stack([np.ones_like(change), by_gyro, change, tilt, by_attitude], axis=-1)[good]
         moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
         for axis in np.flatnonzero(moving):
-            self._turns[axis].add(len(rows) * long * step, rows[:, axis].T @ rows[:, axis])
+            self._turns[axis].add(len(rows) * step, rows[:, axis].T @ rows[:, axis] / long)
 
     def factors(self) -> tuple[Factor, ...]:
         """Every factor of which there are data: of the gyro by axis, of the accelerometer."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_replay import open_log
 
 from quadid.online import Phase, Session
 from quadid.online.consistency import ALLOWED, Consistency, Factor
@@ -15,6 +17,7 @@ from quadid.online.resampler import Resampler
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Recording
+from quadid.workflow.loading import load_vehicle
 from studies.poisoning.flying import Poison
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, published, samples
@@ -149,3 +152,17 @@ def test_in_flight_rotor_speeds_cannot_walk_away_from_the_first_set(happened: Ha
     furthest = max(abs(s.parameters["b"].value / TRUE["b"] - 1.0) for s in sets)
     assert 0.01 < furthest < 0.06
     happened(28, f"all rotor speeds drifting, b by 1 % in 4 s up to 12 %: published up to {furthest:+.1%}")
+
+
+def test_sticks_in_step_with_the_readings_are_no_contradiction(data_dir: Path) -> None:
+    """ArduCopter's rates swing at half the rate of telemetry: wherever turns are cut, the factors are 1."""
+    folder = data_dir / "ardupilot_sitl"
+    log, vehicle = open_log(folder / "x.tlog"), load_vehicle(str(folder / "sitl_x.yaml"))
+    for shift in np.arange(0.0, 1.0, 0.14):
+        channels = {}
+        for name in ("gyro", "accel", "attitude", "rotor_speed"):
+            channel = log.channels[name]
+            inside = (channel.t > 66.0) & (channel.t < 76.0)
+            channels[name] = replace(channel, t=channel.t[inside] - 66.0 + shift, values=channel.values[inside])
+        turns = factors_of(Recording("x", "tlog", channels), vehicle)[:2]
+        assert all(f.known and abs(f.value - 1.0) < 0.02 for f in turns), [str(f) for f in turns]
