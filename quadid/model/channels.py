@@ -12,6 +12,13 @@ CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n
 CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 
 
+def channels_of(window: Window) -> int:
+    """Number of residual channels that a window has."""
+    if window.position is not None:
+        return 15
+    return 9 if window.velocity is None else 12
+
+
 def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
     """What a window measured, as the kernel reads it.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
-from quadid.model.channels import measurements
+from quadid.model.channels import channels_of, measurements
 from quadid.model.kernel import Flight
 from quadid.model.layout import places, residual_terms
 from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
@@ -90,9 +90,7 @@ class Rollout:
         self.geometry = np.column_stack([positions[:, :2], vehicle.spins, positions[:, 2] - hub])
         gaps = [float(np.linalg.norm(a - b)) for i, a in enumerate(positions) for b in positions[:i]]
         self.reach = 0.5 * min(gaps)
-        self.channels = 9
-        if window.velocity is not None or window.position is not None:
-            self.channels = 15 if window.position is not None else 12
+        self.channels = channels_of(window)
         self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)
         slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope

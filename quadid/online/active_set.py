@@ -29,6 +29,7 @@ class ActiveSet:
         baseline: set from which creeping is measured: the last one a person approved, else the first.
         approval: auto or manual; a rollback by a person makes it manual.
         seen: end of the data that the set in force rests on [s, session time]; minus infinity for none of this flight.
+        watched: deviance lost to the predecessor so far; gains do not pile up.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class ActiveSet:
             self.in_force = replace(restored, sequence=self._number(), state=SetState.STALE, reason=reason)
         self.baseline = baseline or self.in_force
         self.seen = -math.inf
-        self._watched, self._watch_from = 0.0, math.inf
+        self.watched, self._watch_from = 0.0, math.inf
 
     @property
     def pending(self) -> OnlineSet | None:
@@ -83,7 +84,7 @@ class ActiveSet:
         self._held.clear()
         if self.baseline is None or by != "auto":
             self.baseline = accepted
-        self._watched, self._watch_from, self.seen = 0.0, stop, stop
+        self.watched, self._watch_from, self.seen = 0.0, stop, stop
         return [
             Publish("parameters", accepted),
             Event(t, "info", "accepted", f"set {accepted.sequence} in force: {accepted.reason}"),
@@ -158,13 +159,8 @@ class ActiveSet:
         if start < self._watch_from - 1e-6:
             return False
         self._watch_from = stop
-        self._watched = max(self._watched + loss, 0.0)
+        self.watched = max(self.watched + loss, 0.0)
         return True
-
-    @property
-    def watched(self) -> float:
-        """Deviance lost to the predecessor so far; gains do not pile up."""
-        return self._watched
 
     def _number(self) -> int:
         self._next += 1

@@ -6,7 +6,7 @@ estimate itself, which the gate judges.
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container
 
 import numpy as np
 
@@ -16,22 +16,10 @@ from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 ROOM = 2.0
 """An estimate may lie so far outside the bounds, log scale: b at hover is not the b that was bounded."""
 SIX = len(NOMINAL_NAMES)
-
-
-def channels_of(windows: Sequence[Window]) -> int:
-    """Residual channels that all of these windows have."""
-    return min((_channels(w) for w in windows), default=0)
-
-
-def _channels(window: Window) -> int:
-    if window.position is not None:
-        return 15
-    return 9 if window.velocity is None else 12
 
 
 def is_noise(noise: NoiseModel, channels: Container[int]) -> bool:

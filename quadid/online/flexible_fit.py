@@ -28,7 +28,7 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.priors import Prior, prior_terms
 from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Free, Shooting
-from quadid.model.layout import B, Layout
+from quadid.model.layout import B
 from quadid.model.thrust import ThrustModel
 from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES
@@ -86,10 +86,10 @@ def moving_names(problem: Shooting) -> list[str]:
     return out + losses[1:]
 
 
-def flexible_prior(nominal: Prior, free: Free, vehicle: Vehicle, layout: Layout) -> Prior:
+def flexible_prior(nominal: Prior, free: Free, problem: Shooting) -> Prior:
     """Prior of everything that is free: `nominal` of the nominal six, effects about the vehicle file's values."""
     effects = free.index[len(NOMINAL_NAMES) :]
-    mean = np.concatenate([nominal.mean, layout.initial(vehicle)[effects]])
+    mean = np.concatenate([nominal.mean, problem.layout.initial(problem.vehicle)[effects]])
     return Prior(mean, np.concatenate([nominal.sigma, np.full(len(effects), EFFECT_WIDTH)]))
 
 
@@ -105,10 +105,9 @@ def flexible_fit(
         theta: start, full vector.
         noise: None lets the fit find it, all structure that remains counted as noise.
     """
-    layout = Layout(vehicle)
-    problem = Shooting.cut(windows, vehicle, SEGMENT, noise, layout)
+    problem = Shooting.cut(windows, vehicle, SEGMENT, noise)
     free = problem.free(moving_names(problem))
-    prior = flexible_prior(nominal, free, vehicle, layout)
+    prior = flexible_prior(nominal, free, problem)
     result = polish(problem, theta, free, prior, iterations=12)
     for _ in range(0 if noise is not None else ROUNDS - 1):
         problem = problem.with_noise(residual_noise(problem, result))
@@ -119,9 +118,7 @@ def flexible_fit(
     return problem, free, prior, polish(robust, result.theta, free, prior, result.states, iterations=4)
 
 
-def reduced(
-    start: float, stop: float, layout: Layout, vehicle: Vehicle, free: Free, prior: Prior, result: Polished
-) -> WindowEstimate:
+def reduced(start: float, stop: float, problem: Shooting, free: Free, prior: Prior, result: Polished) -> WindowEstimate:
     """What a window says of the nominal six, whatever the effects are; b is that at hover.
 
     Information counts for less where the scores of segments scatter more than the noise explains (`score_products`).
@@ -131,8 +128,8 @@ def reduced(
     effects = np.arange(len(precision)) >= six
     h, g, scores = lin.information + np.diag(precision * effects), lin.gradient + pull * effects, lin.grad
     z = free.scaled(result.theta[free.index])[:six]
-    if "thrust_curve" not in vehicle.effects:
-        z[B], slopes = _at_hover(layout, vehicle.mass * GRAVITY, free, result.theta)
+    if "thrust_curve" not in problem.vehicle.effects:
+        z[B], slopes = _at_hover(problem, free, result.theta)
         back = np.eye(len(g))
         back[B] = -slopes / slopes[B]
         back[B, B] = 1.0 / slopes[B]
@@ -142,9 +139,7 @@ def reduced(
     own = replace(lin, grad=scores[:, :six] - scores[:, six:] @ gain.T)
     excess = np.sqrt(np.maximum(variance_ratio(own, np.asarray(np.linalg.inv(information)))[0], 1.0))
     information = 0.5 * (information + information.T) / np.outer(excess, excess)
-    return WindowEstimate(
-        start, stop, z, information, information @ step, lin.total_cost, lin.total_rows
-    )  # fmt: skip
+    return WindowEstimate(start, stop, z, information, information @ step, lin.total_cost, lin.total_rows)
 
 
 def halved(window: Window, first: int) -> Window:
@@ -181,8 +176,7 @@ def sampling_error(
         sparse = problem.on([halved(w, first) for w in windows])
         # One linear step tells the size; a descent may refuse every step, and would then tell of no error at all.
         lin = sparse.linearise(best.theta, free, best.states)
-        moved = replace(best, lin=lin)
-        there = reduced(estimate.start, estimate.stop, problem.layout, problem.vehicle, free, prior, moved)
+        there = reduced(estimate.start, estimate.stop, problem, free, prior, replace(best, lin=lin))
         shifts.append(there.optimum - estimate.optimum)
     share = (0.5 * spacing) ** ORDER[windows[0].sampling]
     missed = (share * 0.5 * (shifts[0] - shifts[1])) ** 2 + (share**2 * 0.5 * (shifts[0] + shifts[1])) ** 2
@@ -203,11 +197,12 @@ def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:
     return replace(estimate, information=information, score=information @ step)
 
 
-def _at_hover(layout: Layout, weight: float, free: Free, theta: FloatArray) -> tuple[float, FloatArray]:
+def _at_hover(problem: Shooting, free: Free, theta: FloatArray) -> tuple[float, FloatArray]:
     """Logarithm of the b at hover, and its derivatives to all scaled parameters."""
+    weight = problem.vehicle.mass * GRAVITY
 
     def value(at: FloatArray) -> float:
-        return float(np.log(at[B] * ThrustModel(layout, at).secant(weight)))
+        return float(np.log(at[B] * ThrustModel(problem.layout, at).secant(weight)))
 
     here, steps = value(theta), STEP * np.eye(len(free.entries))
     return here, np.array([(value(free.move(theta, step)) - here) / STEP for step in steps])

@@ -113,7 +113,7 @@ def decide(case: Case, settings: GateSettings) -> Decision:
         reason = check(case, settings)
         if reason is None:
             continue
-        if name == "step_limit" and _step(case, _doubled(settings)) is None:
+        if name == "step_limit" and _step(case, settings, 2.0) is None:
             return Decision(SetState.PENDING, name, f"{reason}: a person must approve it")
         return Decision(SetState.REJECTED, name, reason)
     moved = _reference(case, settings)
@@ -125,22 +125,8 @@ def decide(case: Case, settings: GateSettings) -> Decision:
     return Decision(SetState.ACCEPTED, "approval", story)
 
 
-def _doubled(settings: GateSettings) -> GateSettings:
-    """Limits up to which a person may approve a step."""
-    wide = {name: 2.0 * getattr(settings, name) for name in ("step", "creep")}
-    return settings.model_copy(update=wide)
-
-
-def _sensors(case: Case, settings: GateSettings) -> str | None:
-    return case.unproven or None
-
-
 def _excitation(case: Case, settings: GateSettings) -> str | None:
     return None if case.excited else "the newest window does not reveal roll and pitch dynamics: move the sticks more"
-
-
-def _model(case: Case, settings: GateSettings) -> str | None:
-    return case.unexplained or None
 
 
 def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
@@ -218,10 +204,11 @@ def _is_sharper(case: Case, settings: GateSettings) -> bool:
     )
 
 
-def _step(case: Case, settings: GateSettings) -> str | None:
+def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
+    """Steps beyond so many times the limits: a person may approve up to twice."""
     for reference, limit, what in (
-        (case.in_force, settings.step, "the set in force"),
-        (case.baseline, settings.creep, "the approved baseline"),
+        (case.in_force, times * settings.step, "the set in force"),
+        (case.baseline, times * settings.creep, "the approved baseline"),
     ):
         if reference is None:
             continue
@@ -274,11 +261,11 @@ def _gain_text(case: Case) -> str:
 
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("excitation", _excitation),
-    ("model", _model),
+    ("model", lambda case, _: case.unexplained or None),
     ("physical_bounds", _bounds),
     ("interval_width", _width),
     ("agreement", _agreement),
-    ("sensors", _sensors),
+    ("sensors", lambda case, _: case.unproven or None),
     ("held_out_gain", _held_out),
     ("step_limit", _step),
 )

@@ -58,19 +58,21 @@ class GridBuffer:
         while total - len(self._blocks[0].t) >= self._most:
             total -= len(self._blocks.pop(0).t)
 
+    def _reaching(self, start: float, stop: float) -> list[Rows]:
+        """Blocks with a row between the two, or on either side of them."""
+        return [b for b in self._blocks if b.t[-1] >= start and b.t[0] < stop]
+
     def span(self, start: float, stop: float) -> Rows | None:
         """Rows with start <= t < stop, whatever they hold; None when there are none."""
-        blocks = [b for b in self._blocks if b.t[-1] >= start and b.t[0] < stop]
+        blocks = self._reaching(start, stop)
         if not blocks:
             return None
-        t = np.concatenate([b.t for b in blocks])
+        t, columns = _joined(blocks)
         inside = (t >= start) & (t < stop)
         if not inside.any():
             return None
-        names = list(dict.fromkeys(n for b in blocks for n in b.columns))
-        columns = {name: _stack(blocks, name)[inside] for name in names}
-        last = blocks[-1]
-        return Rows(t[inside], columns, last.sampling, last.source, blocks[0].fresh, last.problem)
+        some, last = {name: values[inside] for name, values in columns.items()}, blocks[-1]
+        return Rows(t[inside], some, last.sampling, last.source, blocks[0].fresh, last.problem)
 
     def onset(self, near: float) -> float:
         """Moment of a step in specific force per squared rotor speed within 1 s of `near` [s], to a row."""
@@ -92,16 +94,15 @@ class GridBuffer:
 
     def cut(self, start: float, stop: float) -> Cut:
         """Windows of the rows with start <= t < stop."""
-        blocks = [b for b in self._blocks if b.t[-1] >= start and b.t[0] < stop]
+        blocks = self._reaching(start, stop)
         problem = next((b.problem for b in reversed(blocks) if b.problem), "")
         pieces: list[list[Rows]] = []
         for block in blocks:
-            if not pieces or block.fresh or not _joins(pieces[-1][-1], block):
+            before = pieces[-1][-1] if pieces else None
+            if before is None or block.fresh or (before.sampling, before.source) != (block.sampling, block.source):
                 pieces.append([])
             pieces[-1].append(block)
-        windows: list[Window] = []
-        for piece in pieces:
-            windows.extend(self._windows(piece, start, stop))
+        windows = [window for piece in pieces for window in self._windows(piece, start, stop)]
         seconds = sum(len(w) for w in windows) * self._step
         gaps = max(len(windows) - 1, 0)
         reason, blocked = self._incomplete(seconds, stop - start, problem, blocks)
@@ -118,9 +119,7 @@ class GridBuffer:
         return f"{seconds:.1f} s of usable data in the last {wanted:.3g} s", False
 
     def _windows(self, piece: list[Rows], start: float, stop: float) -> list[Window]:
-        t = np.concatenate([b.t for b in piece])
-        names = list(dict.fromkeys(n for b in piece for n in b.columns))
-        columns = {name: _stack(piece, name) for name in names}
+        t, columns = _joined(piece)
         if "gyro" not in columns:
             return []
         good: BoolArray = np.isfinite(columns["rotor_speed"]).all(axis=1) & (t >= start) & (t < stop)
@@ -136,14 +135,13 @@ class GridBuffer:
         return out
 
 
-def _joins(before: Rows, after: Rows) -> bool:
-    return before.sampling == after.sampling and before.source == after.source
-
-
-def _stack(blocks: list[Rows], name: str) -> FloatArray:
-    width = next(b.columns[name].shape[1] for b in blocks if name in b.columns)
-    parts = [b.columns[name] if name in b.columns else np.full((len(b.t), width), math.nan) for b in blocks]
-    return np.concatenate(parts)
+def _joined(blocks: list[Rows]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Times of blocks one after the other, and values by channel, NaN where a block has no such channel."""
+    columns = {}
+    for name, width in {name: values.shape[1] for b in blocks for name, values in b.columns.items()}.items():
+        parts = [b.columns[name] if name in b.columns else np.full((len(b.t), width), math.nan) for b in blocks]
+        columns[name] = np.concatenate(parts)
+    return np.concatenate([b.t for b in blocks]), columns
 
 
 def _bridged(good: BoolArray) -> BoolArray:

@@ -16,8 +16,9 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
+from quadid.model.channels import channels_of
 from quadid.model.layout import Layout
-from quadid.online.answered import SIX, channels_of, is_estimate, is_noise, is_vector
+from quadid.online.answered import SIX, is_estimate, is_noise, is_vector
 from quadid.online.flexible_fit import (
     alike,
     flexible_fit,
@@ -119,7 +120,8 @@ class FitRequest(Job):
         """Whether a reply is to this job, and of its form."""
         if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
             return False
-        channels = {channels_of(self.windows), *([] if self.noise is None else [len(self.noise.white)])}
+        channels = {min(map(channels_of, self.windows), default=0)}
+        channels |= set() if self.noise is None else {len(self.noise.white)}
         estimate = reply.estimate
         return (
             all(a is None or a.shape == (SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))
@@ -138,12 +140,12 @@ def prior_of(vehicle: Vehicle) -> Prior:
 
 
 def _fit(request: FitRequest) -> FitReply:
-    layout, theta, noise = Layout(request.vehicle), request.theta, request.noise
-    shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+    theta, noise = request.theta, request.noise
+    shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise)
     if shooting.count == 0:
         return FitReply(request.number, "no stretch is long enough for one segment")
-    free = shooting.free(list(NOMINAL_NAMES))
-    lin, guess = shooting.linearise(theta, free), layout.initial(request.vehicle)
+    free = shooting.free(NOMINAL_NAMES)
+    lin, guess = shooting.linearise(theta, free), shooting.layout.initial(request.vehicle)
     if not np.isfinite(lin.total_cost) and not np.array_equal(theta, guess):
         # A simulation that diverges shows no motion, and would at every later window: begin as with the first one.
         return _fit(replace(request, theta=guess, noise=None, search=True))
@@ -153,13 +155,14 @@ def _fit(request: FitRequest) -> FitReply:
         return FitReply(request.number, excitation=bounds)
     if request.flexible:
         if noise is None:
-            theta, _ = _search(request, layout)
+            theta, _ = _search(request)
         return _flexible(request, theta, None if spoilt else noise)
     sensor = None
     if request.search or noise is None or spoilt:
-        theta, sensor = _search(replace(request, noise=None) if spoilt else request, layout)
-        noise = _missed(request, layout, theta, sensor)
-        shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise, layout)
+        theta, sensor = _search(replace(request, noise=None) if spoilt else request)
+        # What sensors and model together miss over the segments of the fit.
+        noise = _measured(request, FIT_SECONDS, theta, sensor, 8)
+        shooting = shooting.with_noise(noise)
         if spoilt and not is_excited(bounds := bounds_of(shooting.linearise(theta, free).information)):
             return FitReply(request.number, excitation=bounds)
     result = _polish(shooting, theta, free)
@@ -173,7 +176,7 @@ def _fit(request: FitRequest) -> FitReply:
     measured = None
     if request.measure:
         measured = residual_noise(shooting, result)
-        sensor = _sensor_noise(request, layout, result.theta, noise)
+        sensor = _measured(request, SWARM_SECONDS, result.theta, noise, 3)
     reply = FitReply(request.number, "", bounds_of(lin.information), True, estimate, result.theta, noise, measured)
     if sensor is None:
         return reply
@@ -190,11 +193,11 @@ def _share_of(noise: NoiseModel, sensor: NoiseModel) -> FloatArray:
 
 def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) -> FitReply:
     """The fit with every effect that moves the vehicle; `noise` None lets it find the noise."""
-    vehicle, layout, nominal = request.vehicle, Layout(request.vehicle), prior_of(request.vehicle)
-    shooting, free, prior, result = flexible_fit(request.windows, vehicle, nominal, theta, noise)
+    nominal = prior_of(request.vehicle)
+    shooting, free, prior, result = flexible_fit(request.windows, request.vehicle, nominal, theta, noise)
     if not np.isfinite(result.cost):
         return FitReply(request.number, "the simulation diverges at every point tried")
-    estimate = reduced(request.start, request.stop, layout, vehicle, free, prior, result)
+    estimate = reduced(request.start, request.stop, shooting, free, prior, result)
     # What the motion reveals by itself; how well it is known beside everything else, the estimate says.
     bounds = bounds_of(result.lin.information[: len(NOMINAL_NAMES), : len(NOMINAL_NAMES)])
     missed = sampling_error(estimate, shooting, free, prior, result, request.spacing)
@@ -222,25 +225,19 @@ def _noise_is_spoilt(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
     return is_excited(bounds_of(shooting.with_noise(usual).linearise(theta, free).information))
 
 
-def _search(request: FitRequest, layout: Layout) -> tuple[FloatArray, NoiseModel]:
+def _search(request: FitRequest) -> tuple[FloatArray, NoiseModel]:
     """Global search and sensor noise from short segments, all structure counted as noise."""
-    short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, request.noise, layout)
-    free = short.free(list(NOMINAL_NAMES))
+    short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, request.noise)
+    free = short.free(NOMINAL_NAMES)
     theta, _ = swarm_search(short, request.theta, free, SEARCH, PARTICLES, request.seed, lambda stage, share: None)
     short, result = reweighted_fit(short, theta, free, iterations=8)
     return result.theta, residual_noise(short, result)
 
 
-def _missed(request: FitRequest, layout: Layout, theta: FloatArray, sensor: NoiseModel) -> NoiseModel:
-    """What sensors and model together miss over the segments of the fit."""
-    long = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, sensor, layout)
-    return residual_noise(long, polish(long, theta, long.free(list(NOMINAL_NAMES)), iterations=8))
-
-
-def _sensor_noise(request: FitRequest, layout: Layout, theta: FloatArray, noise: NoiseModel) -> NoiseModel:
-    """Sensor noise of this window, from short segments around the optimum."""
-    short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, noise, layout)
-    return residual_noise(short, polish(short, theta, short.free(list(NOMINAL_NAMES)), iterations=3))
+def _measured(request: FitRequest, seconds: float, theta: FloatArray, noise: NoiseModel, iterations: int) -> NoiseModel:
+    """Noise in what a fit to segments of `seconds` [s], from `theta`, leaves: short ones leave that of the sensors."""
+    problem = Shooting.cut(request.windows, request.vehicle, seconds, noise)
+    return residual_noise(problem, polish(problem, theta, problem.free(NOMINAL_NAMES), iterations=iterations))
 
 
 def _polish(shooting: Shooting, theta: FloatArray, free: Free) -> Polished:
@@ -261,8 +258,7 @@ def warm_up(vehicle: Vehicle) -> None:
     attitude, accel = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1)), np.tile([0.0, 0.0, -9.80665], (rows, 1))
     for sampling in ("held", "instant"):
         window = Window(0.0, dt, speed, np.zeros((rows, 3)), attitude, accel, sampling=sampling)
-        layout = Layout(vehicle)
-        request = FitRequest(0, vehicle, (window,), 0.0, 3.0, layout.initial(vehicle), None, True, 0)
-        theta, noise = _search(request, layout)
-        shooting = Shooting.cut((window,), vehicle, FIT_SECONDS, noise, layout)
-        _polish(shooting, theta, shooting.free(list(NOMINAL_NAMES)))
+        request = FitRequest(0, vehicle, (window,), 0.0, 3.0, Layout(vehicle).initial(vehicle), None, True, 0)
+        theta, noise = _search(request)
+        shooting = Shooting.cut((window,), vehicle, FIT_SECONDS, noise)
+        _polish(shooting, theta, shooting.free(NOMINAL_NAMES))

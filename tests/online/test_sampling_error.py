@@ -134,9 +134,9 @@ def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -
     full = flight(24.0, 5).window.slice(0, 300)
     for sampling, order in ORDER.items():
         windows = (replace(full, sampling=sampling),)
-        layout, start = Layout(PELICAN), Layout(PELICAN).initial(PELICAN)
+        start = Layout(PELICAN).initial(PELICAN)
         problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
-        estimate = reduced(0.0, 6.0, layout, PELICAN, free, prior, best)
+        estimate = reduced(0.0, 6.0, problem, free, prior, best)
         whole, half = (
             np.sqrt(np.diag(sampling_error(estimate, problem, free, prior, best, spacing))) for spacing in (1.0, 0.5)
         )
