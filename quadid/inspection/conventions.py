@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -97,39 +98,25 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
     steady = float(np.linalg.norm(np.median(values, axis=0)))
-    numbers = {"length": length, "z": z}
+    check = partial(Check, "gravity", numbers={"length": length, "z": z})
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
     for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
         if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
             fix = f"multiply acceleration by {factor:.6g}"
-            return Check("gravity", CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix, numbers)
+            return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
     if spans and steady < 0.3 * GRAVITY:
-        return Check(
-            "gravity", CheckResult.ERROR, f"{message}: gravity is missing",
-            "log specific force, not linear acceleration", numbers,
-        )  # fmt: skip
+        fix = "log specific force, not linear acceleration"
+        return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
     if not 0.5 < length / GRAVITY < 2.0:
-        return Check(
-            "gravity",
-            CheckResult.ERROR,
-            f"{message}: this is no specific force in m/s^2",
-            "log raw acceleration",
-            numbers,
-        )
+        return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
     if not spans and abs(z) < 0.8 * length:
-        return Check(
-            "gravity", CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log", numbers=numbers
-        )
+        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log")
     if z > 0.5 * length:
-        return Check(
-            "gravity", CheckResult.ERROR, f"{message}: z points up (FLU, as ROS has it) or the sign is reversed",
-            "turn body vectors to FRD: negate y and z", numbers,
-        )  # fmt: skip
+        turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
+        return check(CheckResult.ERROR, turned, "turn body vectors to FRD: negate y and z")
     if z > -0.5 * length:
-        return Check(
-            "gravity", CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU", numbers
-        )
-    return Check("gravity", CheckResult.OK, message, numbers=numbers)
+        return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
+    return check(CheckResult.OK, message)
 
 
 def attitude_check(recording: Recording) -> Check:
@@ -192,33 +179,27 @@ def _likely(reading: str, fit: AxisMap) -> float:
 
 
 def _judge_rates(reading: str, fit: AxisMap) -> Check:
-    numbers = {"scale": fit.scale, "r2": fit.r2}
+    check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
         message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
-        fix = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
-        return Check("gyro_attitude", CheckResult.ERROR, message, fix, numbers)
+        remedy = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
+        return check(CheckResult.ERROR, message, remedy)
     if reading != "as given":
         message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
-        return Check(
-            "gyro_attitude", CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED", numbers
-        )
+        return check(CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED")
     if not fit.straight:
         message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
-        fix = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        remedy = "body axes must be FRD for both; ROS' FLU has y and z reversed"
         if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
-            fix = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
-        return Check("gyro_attitude", CheckResult.ERROR, message, fix, numbers)
+            remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
+        return check(CheckResult.ERROR, message, remedy)
     for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
         if 0.75 < fit.scale / scale < 1.33:
-            return Check(
-                "gyro_attitude", CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})",
-                "convert to radians", numbers,
-            )  # fmt: skip
+            return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
     message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
-    verdict = CheckResult.OK if 0.85 < fit.scale < 1.15 else CheckResult.WARNING
-    return Check(
-        "gyro_attitude", verdict, message, "" if verdict is CheckResult.OK else "check scales and filters", numbers
-    )
+    if 0.85 < fit.scale < 1.15:
+        return check(CheckResult.OK, message)
+    return check(CheckResult.WARNING, message, "check scales and filters")
 
 
 def velocity_check(recording: Recording) -> Check:
@@ -231,17 +212,13 @@ def velocity_check(recording: Recording) -> Check:
     if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
         return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
     fit = fit_axes(derived[:, :2], gained[:, :2])
-    numbers = {"scale": fit.scale, "r2": fit.r2}
+    check = partial(Check, "velocity_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
-        message = f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})"
-        return Check("velocity_attitude", CheckResult.UNKNOWN, message, numbers=numbers)
+        return check(CheckResult.UNKNOWN, f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
     if not fit.straight:
         message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
-        return Check(
-            "velocity_attitude", CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y", numbers
-        )
-    message = f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
-    return Check("velocity_attitude", CheckResult.OK, message, numbers=numbers)
+        return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
+    return check(CheckResult.OK, f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})")
 
 
 def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:

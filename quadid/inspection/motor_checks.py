@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import permutations
 
 import numpy as np
@@ -47,19 +48,19 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
     low, high = guess.limits
     speed = float(np.sqrt(np.mean(speeds**2)))
-    numbers = {"b_from_hover": needed, "speed_rad_s": speed}
+    check = partial(Check, "hover", numbers={"b_from_hover": needed, "speed_rad_s": speed})
     message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
     if low <= needed <= high:
-        return Check("hover", CheckResult.OK, f"{message}; bounds {low:.3g} to {high:.3g}", numbers=numbers)
+        return check(CheckResult.OK, f"{message}; bounds {low:.3g} to {high:.3g}")
     for unit, factor in (("rpm", _RPM), ("rev/s", 2.0 * np.pi)):
         if low <= needed / factor**2 <= high:
-            return Check(
-                "hover", CheckResult.ERROR, f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}",
-                f"multiply rotor speeds by {factor:.6g}, or use the vehicle file of this log", numbers,
-            )  # fmt: skip
+            slip = f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be in {unit}"
+            return check(
+                CheckResult.ERROR, slip, f"multiply rotor speeds by {factor:.6g}, or use the vehicle file of this log"
+            )
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
-    return Check("hover", CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix, numbers)
+    return check(CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)
 
 
 def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
@@ -78,9 +79,9 @@ Lagged = list[tuple[FloatArray, FloatArray]]
 
 def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     """Correlates roll, pitch and yaw torque of every motor order with angular acceleration (of `lagged_motion`)."""
-    return (
-        Check("motor_order", CheckResult.UNKNOWN, lagged) if isinstance(lagged, str) else _judge_order(lagged, vehicle)
-    )
+    if isinstance(lagged, str):
+        return Check("motor_order", CheckResult.UNKNOWN, lagged)
+    return _judge_order(lagged, vehicle)
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
@@ -139,25 +140,17 @@ def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
     own, means = scores[orders.index(tuple(range(rotors)))], scores.mean(axis=1)
     best = int(np.argmax(means))
     numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
+    check = partial(Check, "motor_order", numbers=numbers)
     text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
     if means[best] - own.mean() > _MARGIN and means[best] > _CLEAR:
         order = ", ".join(str(i + 1) for i in orders[best])
-        return Check(
-            "motor_order", CheckResult.ERROR,
-            f"{text}; much better ({means[best]:.2f} on average) with the log's columns in the order {order}",
-            f"reorder the rotors of the vehicle file to take columns {order}", numbers,
-        )  # fmt: skip
+        better = f"{text}; much better ({means[best]:.2f} on average) with the log's columns in the order {order}"
+        return check(CheckResult.ERROR, better, f"reorder the rotors of the vehicle file to take columns {order}")
     if own[2] < -_CLEAR:
-        return Check(
-            "motor_order",
-            CheckResult.ERROR,
-            f"{text}: yaw is reversed",
-            "negate the spins in the vehicle file",
-            numbers,
-        )
+        return check(CheckResult.ERROR, f"{text}: yaw is reversed", "negate the spins in the vehicle file")
     if min(own[0], own[1]) > _CLEAR:
-        return Check("motor_order", CheckResult.OK, text, numbers=numbers)
-    return Check("motor_order", CheckResult.UNKNOWN, f"{text}: too weak to judge", numbers=numbers)
+        return check(CheckResult.OK, text)
+    return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
 
 
 def _orders(rotors: int) -> list[tuple[int, ...]]:
