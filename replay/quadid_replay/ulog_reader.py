@@ -19,7 +19,7 @@ from pyulog.exceptions import ULogException
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IntArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
@@ -219,13 +219,10 @@ def _motor_command(log: _Log, key: tuple[str, int], thrust: FloatArray, how: str
 
 def _allocated(log: _Log) -> list[RawChannel]:
     """Motors as PX4 allocates them, of torque and thrust setpoints of one moment; only where logged motors agree."""
-    torque, thrust, motors = (("vehicle_torque_setpoint", 0), ("vehicle_thrust_setpoint", 0), ("actuator_motors", 0))
+    torque, thrust = ("vehicle_torque_setpoint", 0), ("vehicle_thrust_setpoint", 0)
     mix = allocation(log.parameters)
     columns = (*_XYZ, "timestamp_sample")
     if mix is None or not (_has(log, torque, *columns) and _has(log, thrust, *columns)):
-        return []
-    wanted = tuple(f"control[{i}]" for i in range(len(mix)))
-    if not _has(log, motors, *wanted, "timestamp_sample"):
         return []
     moment, of_torque, of_thrust = np.intersect1d(
         log.topics[torque]["timestamp_sample"], log.topics[thrust]["timestamp_sample"], return_indices=True
@@ -233,12 +230,20 @@ def _allocated(log: _Log) -> list[RawChannel]:
     setpoints = np.hstack([_stack(log.topics[torque], _XYZ)[of_torque], _stack(log.topics[thrust], _XYZ)[of_thrust]])
     values = np.full((len(log.topics[torque]["timestamp"]), len(mix)), np.nan)
     values[of_torque] = allocated(mix, setpoints)
-    _, here, there = np.intersect1d(moment, log.topics[motors]["timestamp_sample"], return_indices=True)
-    off = values[of_torque][here] - _stack(log.topics[motors], wanted)[there]
-    known = np.isfinite(off).all(axis=1)
-    if np.count_nonzero(known) < _FEWEST_COMPARED or not np.quantile(np.abs(off[known]), 0.9) < _ALLOCATED_ALIKE:
+    if not _motors_agree(log, moment, values[of_torque]):
         return []
     return [_motor_command(log, torque, values, "allocated as actuator_motors, normalized")]
+
+
+def _motors_agree(log: _Log, moment: IntArray, thrust: FloatArray) -> bool:
+    """Whether logged motors are those allocated (n, rotors) of setpoints at `moment` (n,), where both are there."""
+    motors, columns = ("actuator_motors", 0), tuple(f"control[{i}]" for i in range(thrust.shape[1]))
+    if not _has(log, motors, *columns, "timestamp_sample"):
+        return False
+    _, here, there = np.intersect1d(moment, log.topics[motors]["timestamp_sample"], return_indices=True)
+    off = thrust[here] - _stack(log.topics[motors], columns)[there]
+    off = off[np.isfinite(off).all(axis=1)]
+    return len(off) >= _FEWEST_COMPARED and bool(np.quantile(np.abs(off), 0.9) < _ALLOCATED_ALIKE)
 
 
 def _actuator_outputs(log: _Log) -> list[RawChannel]:
