@@ -22,7 +22,7 @@ from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
-    A_G, A_S2, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NEXT, R_NOW, R_PAST, R_SPEED, ROTOR,
+    A_G, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NEXT, R_NOW, R_PAST, R_SPEED, ROTOR,
     S_FX, S_P, S_QW, X_P, X_QW,
 )  # fmt: skip
 from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
@@ -174,7 +174,6 @@ def _fly_closed_loop(
     rotors, dt = len(geometry), flight.dt / substeps
     s = cache_aligned(N_ROWS * LANES)
     s[:] = 0.0
-    s[A_S2 : A_S2 + 2 * HALF] = 0.0
     s[A_G : A_G + 2 * LANES] = 1.0
     s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
     rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)

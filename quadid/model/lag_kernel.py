@@ -84,19 +84,24 @@ def _piece(w0, a, slope, tau, e, e1, e2, e3, h):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**inlined)
-def _held_piece(w0, a, e, e1, e3, h):  # type: ignore[no-untyped-def]
-    """As `_piece` for a constant input a."""
+def _held_piece(w0, a, at, s):  # type: ignore[no-untyped-def]
+    """As `_piece` for a constant input a; `at`: which part of the step, and which lane."""
     c = w0 - a
-    part = c * e1
-    i1 = a * h + part
-    return i1, a * (i1 + part) + c * c * e3, a + c * e
+    part = c * s[P_E1 + at]
+    i1 = a * s[P_H + at] + part
+    return i1, a * (i1 + part) + c * c * s[P_E3 + at], a + c * s[P_E + at]
+
+
+@nb.njit(**inlined)
+def _even_piece(w0, a, slope, tau, at, s):  # type: ignore[no-untyped-def]
+    """As `_piece`; `at`: which part of the step, and which lane."""
+    return _piece(w0, a, slope, tau, s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at], s[P_H + at])
 
 
 @nb.njit(**inlined)
 def _sloped_piece(w0, a, slope, tau, at, s):  # type: ignore[no-untyped-def]
-    """As `_piece` for a sample of mean a and this slope; `at`: which part of the step, and which lane."""
-    e, e1, e2, e3, h = s[P_E + at], s[P_E1 + at], s[P_E2 + at], s[P_E3 + at], s[P_H + at]
-    return _piece(w0, a + slope * s[P_AT + at], slope, tau, e, e1, e2, e3, h)
+    """As `_even_piece` for a sample of mean a and this slope."""
+    return _even_piece(w0, a + slope * s[P_AT + at], slope, tau, at, s)
 
 
 @nb.njit(**inlined)
@@ -130,38 +135,32 @@ def _add_rotor(keeps_means, m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep
 
 @nb.njit(**inlined)
 def _held(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Rotor r through one step of constant input a: two pieces, the half steps."""
+    """Rotor r through one step of constant input a: two pieces, the half steps.  Only this way looks at `a`."""
     for lane in range(LANES):
         w0 = rot[r, R_SPEED + lane]
-        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-        m1, m2, wm = _held_piece(w0, a, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-        n1, n2, w1 = _held_piece(wm, a, e, e1, e3, h)
+        m1, m2, wm = _held_piece(w0, a, B + lane, s)
+        n1, n2, w1 = _held_piece(wm, a, D + lane, s)
         rot[r, R_SPEED + lane] = w1
         _add_rotor(keeps_means, m1, m2, w0, n1, n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
 
 @nb.njit(**inlined)
-def _delayed(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+def _delayed(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of held input that switches within the step."""
     for lane in range(LANES):
         w0 = rot[r, R_SPEED + lane]
         a0, a1, a2 = rot[r, R_PAST + lane], rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
         rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
-        e, e1, e3, h = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E3 + A + lane], s[P_H + A + lane]
-        k1, k2, w = _held_piece(w0, a0, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E3 + B + lane], s[P_H + B + lane]
-        m1, m2, wm = _held_piece(w, a1, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E3 + C + lane], s[P_H + C + lane]
-        l1, l2, w = _held_piece(wm, a0, e, e1, e3, h)
-        e, e1, e3, h = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E3 + D + lane], s[P_H + D + lane]
-        n1, n2, w1 = _held_piece(w, a1, e, e1, e3, h)
+        k1, k2, w = _held_piece(w0, a0, A + lane, s)
+        m1, m2, wm = _held_piece(w, a1, B + lane, s)
+        l1, l2, w = _held_piece(wm, a0, C + lane, s)
+        n1, n2, w1 = _held_piece(w, a1, D + lane, s)
         rot[r, R_SPEED + lane] = w1
         _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
 
 @nb.njit(**inlined)
-def _sloped(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+def _sloped(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of held input that runs on within its samples, and switches within the step."""
     for lane in range(LANES):
         w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
@@ -178,7 +177,7 @@ def _sloped(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-u
 
 
 @nb.njit(**inlined)
-def _linear(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+def _linear(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of piecewise linear input that bends within the step."""
     for lane in range(LANES):
         w0, tau = rot[r, R_SPEED + lane], s[C_TAU + lane]
@@ -186,20 +185,10 @@ def _linear(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-u
         rot[r, R_PAST + lane], rot[r, R_NOW + lane] = a1, a2
         s0, s1 = 0.5 * inv * (a1 - a0), 0.5 * inv * (a2 - a1)
         a0 += (a1 - a0) * (1.0 - s[C_PART + lane])
-        e, e1, e2 = s[P_E + A + lane], s[P_E1 + A + lane], s[P_E2 + A + lane]
-        e3, h = s[P_E3 + A + lane], s[P_H + A + lane]
-        k1, k2, w = _piece(w0, a0, s0, tau, e, e1, e2, e3, h)
-        a0 += s0 * h
-        e, e1, e2 = s[P_E + B + lane], s[P_E1 + B + lane], s[P_E2 + B + lane]
-        e3, h = s[P_E3 + B + lane], s[P_H + B + lane]
-        m1, m2, wm = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
-        a1 += s1 * h
-        e, e1, e2 = s[P_E + C + lane], s[P_E1 + C + lane], s[P_E2 + C + lane]
-        e3, h = s[P_E3 + C + lane], s[P_H + C + lane]
-        l1, l2, w = _piece(wm, a0, s0, tau, e, e1, e2, e3, h)
-        e, e1, e2 = s[P_E + D + lane], s[P_E1 + D + lane], s[P_E2 + D + lane]
-        e3, h = s[P_E3 + D + lane], s[P_H + D + lane]
-        n1, n2, w1 = _piece(w, a1, s1, tau, e, e1, e2, e3, h)
+        k1, k2, w = _even_piece(w0, a0, s0, tau, A + lane, s)
+        m1, m2, wm = _even_piece(w, a1, s1, tau, B + lane, s)
+        l1, l2, w = _even_piece(wm, a0 + s0 * s[P_H + A + lane], s0, tau, C + lane, s)
+        n1, n2, w1 = _even_piece(w, a1 + s1 * s[P_H + B + lane], s1, tau, D + lane, s)
         rot[r, R_SPEED + lane] = w1
         _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
@@ -220,7 +209,7 @@ def _uneven_piece(w0, a, slope, at, lane, s):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**inlined)
-def _uneven(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+def _uneven(keeps_means, a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
     """Rotor r through one step of any input (rows T_) where speeding up and slowing down lag differently."""
     for lane in range(LANES):
         w0 = rot[r, R_SPEED + lane]
@@ -233,42 +222,17 @@ def _uneven(keeps_means, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-u
         _add_rotor(keeps_means, k1 + m1, k2 + m2, w0, l1 + n1, l2 + n2, wm, w1, inv, x, y, spin, r, keep, lane, rot, s)
 
 
-def _turns_of(keeps_means: bool) -> tuple[Any, Any, Any, Any, Any]:
-    """The ways of one rotor through a step, by what its input does, that keep the means of its speed or do not."""
-    which = "mean" if keeps_means else "turn"
-    # bool() keeps numba from writing each way anew for each constant.
+def _way(through: Any, keeps_means: bool) -> Any:
+    """One way of a rotor through a step, by what its input does, that keeps the means of its speed or does not."""
 
     @nb.njit(**jit)
-    @variant(which)
-    def held(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
+    @variant(f"{'mean' if keeps_means else 'turn'}{through.__name__}")
+    def way(a, x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
         lane_kernel()
-        _held(bool(keeps_means), a, x, y, spin, r, inv, keep, rot, s)
+        # bool() keeps numba from writing each way anew for each constant.
+        through(bool(keeps_means), a, x, y, spin, r, inv, keep, rot, s)
 
-    @nb.njit(**jit)
-    @variant(which)
-    def delayed(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        lane_kernel()
-        _delayed(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
-
-    @nb.njit(**jit)
-    @variant(which)
-    def sloped(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        lane_kernel()
-        _sloped(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
-
-    @nb.njit(**jit)
-    @variant(which)
-    def linear(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        lane_kernel()
-        _linear(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
-
-    @nb.njit(**jit)
-    @variant(which)
-    def uneven(x, y, spin, r, inv, keep, rot, s):  # type: ignore[no-untyped-def]
-        lane_kernel()
-        _uneven(bool(keeps_means), x, y, spin, r, inv, keep, rot, s)
-
-    return held, delayed, sloped, linear, uneven
+    return way
 
 
 @nb.njit(**jit)
@@ -294,5 +258,6 @@ def uneven_input(r: int, held: bool, sloped: bool, inv: float, rot: FloatArray, 
         rot[r, R_PAST + lane], rot[r, R_NOW + lane] = rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
 
 
-turn_held, turn_delayed, turn_sloped, turn_linear, turn_uneven = _turns_of(False)
-mean_held, mean_delayed, mean_sloped, mean_linear, mean_uneven = _turns_of(True)
+_WAYS = (_held, _delayed, _sloped, _linear, _uneven)
+turn_held, turn_delayed, turn_sloped, turn_linear, turn_uneven = (_way(through, False) for through in _WAYS)
+mean_held, mean_delayed, mean_sloped, mean_linear, mean_uneven = (_way(through, True) for through in _WAYS)

@@ -25,13 +25,12 @@ from quadid.model.kernel import Flight, body_constants, copy, flight_factors, lo
 from quadid.model.lag_kernel import rotor_constants
 from quadid.model.needs_kernel import Needs
 from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
-from quadid.model.rotor_kernel import Drive, input_constants, rotors_start, rotors_step, spread_hub, spread_moments
+from quadid.model.rotor_kernel import PLAIN_MOMENTS, Drive, input_constants, rotors_start, rotors_step, spread_moments
 from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.rows import (
-    A_G, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, N_ROWS, N_STATE, ROTOR, S_FX, X_P,
-    X_QW, X_QX, X_QY, X_QZ,
+    A_G, ALL_MOMENTS, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, N_ROWS, N_STATE, ROTOR, S_FX, X_P, X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 from quadid.model.sensor_kernel import (
     delay_attitude, distort_imu, remember_attitude, sensor_constants, start_filter, step_filter, step_tilt_error,
@@ -99,9 +98,7 @@ def _march(
             k = first + i
             if need.shared:
                 if need.full:
-                    spread_moments(table, k, s)
-                    if need.hub:
-                        spread_hub(table, k, s)
+                    spread_moments(table, k, ALL_MOMENTS if need.hub else PLAIN_MOMENTS, s)
             else:
                 if k == following:
                     copy(rot, ahead)

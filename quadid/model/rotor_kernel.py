@@ -30,9 +30,9 @@ from quadid.types import FloatArray
 
 # isort: off
 from quadid.model.rows import (
-    A_DO, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS,
-    C_GROWTH, C_HOVER, C_ROW, C_SHIFT, C_VOLT, HALF, N_ROWS, R_DRAG, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE,
-    R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED, ROTOR, T_VOLT,
+    A_S2, A_X1, A_XX, A_XY, A_XZ, A_Y1, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS, C_GROWTH, C_HOVER, C_ROW, C_SHIFT,
+    C_VOLT, HALF, N_ROWS, R_DRAG, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST,
+    R_PAST_SLOPE, R_SPEED, ROTOR, T_VOLT,
 )  # fmt: skip
 
 # isort: on
@@ -141,26 +141,26 @@ def turn_rotor(
     if need.uneven:
         uneven_input(r, held, sloped, inv, rot, s)
         if need.means:
-            mean_uneven(x, y, spin, r, inv, keep, rot, s)
+            mean_uneven(a, x, y, spin, r, inv, keep, rot, s)
         else:
-            turn_uneven(x, y, spin, r, inv, keep, rot, s)
+            turn_uneven(a, x, y, spin, r, inv, keep, rot, s)
     elif need.means:
         if plain:
             mean_held(a, x, y, spin, r, inv, keep, rot, s)
         elif sloped:
-            mean_sloped(x, y, spin, r, inv, keep, rot, s)
+            mean_sloped(a, x, y, spin, r, inv, keep, rot, s)
         elif held:
-            mean_delayed(x, y, spin, r, inv, keep, rot, s)
+            mean_delayed(a, x, y, spin, r, inv, keep, rot, s)
         else:
-            mean_linear(x, y, spin, r, inv, keep, rot, s)
+            mean_linear(a, x, y, spin, r, inv, keep, rot, s)
     elif plain:
         turn_held(a, x, y, spin, r, inv, keep, rot, s)
     elif sloped:
-        turn_sloped(x, y, spin, r, inv, keep, rot, s)
+        turn_sloped(a, x, y, spin, r, inv, keep, rot, s)
     elif held:
-        turn_delayed(x, y, spin, r, inv, keep, rot, s)
+        turn_delayed(a, x, y, spin, r, inv, keep, rot, s)
     else:
-        turn_linear(x, y, spin, r, inv, keep, rot, s)
+        turn_linear(a, x, y, spin, r, inv, keep, rot, s)
     if need.hub:
         _add_hub(r, x, y, z, keep, rot, s)
     if need.growth:
@@ -244,27 +244,13 @@ def _table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> N
 
 
 @nb.njit(**jit)
-def spread_hub(table: FloatArray, k: int, s: FloatArray) -> None:
-    """Writes the shared moments of step k that the air at each hub needs into all lanes."""
+def spread_moments(table: FloatArray, k: int, moments: int, s: FloatArray) -> None:
+    """Writes the first so many of the shared moments of step k into all lanes."""
     lane_kernel()
-    for row in range(PLAIN_MOMENTS, ALL_MOMENTS):
+    for row in range(moments):
         first, second, at = table[k, row], table[k, ALL_MOMENTS + row], A_S2 + row * LANES
         for lane in range(LANES):
             s[at + lane], s[at + HALF + lane] = first, second
-
-
-@nb.njit(**jit)
-def spread_moments(table: FloatArray, k: int, s: FloatArray) -> None:
-    """Writes the shared moments of step k into all lanes."""
-    lane_kernel()
-    for lane in range(LANES):
-        s[A_S2 + lane], s[A_S2 + HALF + lane] = table[k, 0], table[k, ALL_MOMENTS]
-        s[A_X2 + lane], s[A_X2 + HALF + lane] = table[k, 1], table[k, ALL_MOMENTS + 1]
-        s[A_Y2 + lane], s[A_Y2 + HALF + lane] = table[k, 2], table[k, ALL_MOMENTS + 2]
-        s[A_Z2 + lane], s[A_Z2 + HALF + lane] = table[k, 3], table[k, ALL_MOMENTS + 3]
-        s[A_O1 + lane], s[A_O1 + HALF + lane] = table[k, 4], table[k, ALL_MOMENTS + 4]
-        s[A_S1 + lane], s[A_S1 + HALF + lane] = table[k, 5], table[k, ALL_MOMENTS + 5]
-        s[A_DO + lane], s[A_DO + HALF + lane] = table[k, 6], table[k, ALL_MOMENTS + 6]
 
 
 def _on_disk(sources: int) -> Any:
