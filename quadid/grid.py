@@ -129,6 +129,11 @@ def grid_recording(
 def _report(
     plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
 ) -> GridReport:
+    period = measured_period(rotor.t, rotor.values)
+    slow = [
+        f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
+        "fast motion cannot be attributed to the rotors"
+    ] if period > 1.5 * plan.step else []  # fmt: skip
     return GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
@@ -138,10 +143,10 @@ def _report(
         dropped=len(dropped),
         seconds_dropped=sum(dropped),
         rotor_source=rotor.source,
-        rotor_rate=1.0 / measured_period(rotor.t, rotor.values),
+        rotor_rate=1.0 / period,
         filtered=plan.filtered,
         bridged=sum(holes(plan.tracks[name].t, plan.step) for name in REQUIRED if name in plan.tracks),
-        notes=(*rotor.notes, *_notes(plan, measured_period(rotor.t, rotor.values))),
+        notes=(*rotor.notes, *slow),
     )
 
 
@@ -201,16 +206,6 @@ def _window(plan: Plan, at: FloatArray, name: str, log_span: Span) -> Window:
 def _log_span(recording: Recording) -> Span:
     ends = [(float(c.t[0]), float(c.t[-1])) for c in recording.channels.values() if len(c.t)]
     return min(a for a, _ in ends), max(b for _, b in ends)
-
-
-def _notes(plan: Plan, period: float) -> list[str]:
-    notes = []
-    if period > 1.5 * plan.step:
-        notes.append(
-            f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
-            "fast motion cannot be attributed to the rotors"
-        )
-    return notes
 
 
 def _nothing_left(

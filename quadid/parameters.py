@@ -131,6 +131,13 @@ class ParameterSet:
         """Values in vector order, shape (n,)."""
         return np.array([p.value for p in self.parameters])
 
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation of the estimates, shape (n, n); zero beside what has no spread."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        scale = np.where(sigma > 0.0, sigma, np.inf)
+        return np.asarray(self.covariance / np.outer(scale, scale))
+
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self.parameters)
 

@@ -35,9 +35,9 @@ def integrated(rate: FloatArray, step: float) -> FloatArray:
 
 
 def down(q: FloatArray) -> FloatArray:
-    """The world's downward direction in body axes, shape (n, 3), of unit quaternions (n, 4), body to world."""
-    w, x, y, z = q.T
-    return np.column_stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+    """The world's downward direction in body axes, shape (..., 3), of unit quaternions (..., 4), body to world."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
 
 
 def rotated(q: FloatArray, v: FloatArray) -> FloatArray:

@@ -124,7 +124,7 @@ def flights(seconds: float, orders: tuple[int, ...]) -> list[str]:
             cells = []
             for loop in LOOPS:
                 model = fit_subspace(method, inputs, outputs, order, loop=loop, feedthrough=FEEDTHROUGH)
-                box = BlackBox(method, model, 1)
+                box = BlackBox(model, 1)
                 cells.append(", ".join(f"{score_black_box(box, [w], pelican, noise):.2f}" for w in windows))
             rows.append(f"| {method}, {order} | {' | '.join(cells)} |")
     return rows

@@ -49,7 +49,7 @@ def reproduce(
 def summary(done: Reproduced, plan: Plan, seed: int, seconds: float, command: str) -> JsonDict:
     """All numbers as JSON, of the form ``quadid.reproduce/1``."""
     from quadid import __version__
-    from quadid.workflow.reproduction import EFFECTS, STABILISER_RATE, correlations
+    from quadid.workflow.reproduction import EFFECTS, STABILISER_RATE
 
     return {
         "schema": "quadid.reproduce/1",
@@ -69,7 +69,7 @@ def summary(done: Reproduced, plan: Plan, seed: int, seconds: float, command: st
         "noise_floor": 1.0,
         "orders": done.orders,
         "parameters": parameters(done),
-        "correlations": correlations(done.fit),
+        "correlations": done.fit.parameters.correlation,
         "verdict": done.diagnosis.verdict.value.replace("_", " "),
         "findings": [finding.to_dict() for finding in done.diagnosis.findings],
         "effort": {

@@ -28,12 +28,10 @@ class BlackBox:
     """A fitted subspace model.
 
     Attributes:
-        method: ``cva`` or ``moesp``.
         model: the model.
         tried: number of orders that were fitted to choose one.
     """
 
-    method: str
     model: SubspaceModel
     tried: int
 
@@ -57,7 +55,7 @@ def fit_black_box(
     sigma, length = _sigma(noise), round(SCORE_SECONDS / windows[0].dt)
     choice = choose_order(method, inputs, outputs, orders, length, sigma, feedthrough=FEEDTHROUGH)
     model = fit_subspace(method, inputs, outputs, choice.order, feedthrough=FEEDTHROUGH)
-    return BlackBox(method, model, len(orders))
+    return BlackBox(model, len(orders))
 
 
 def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, noise: NoiseModel) -> float:

@@ -50,18 +50,6 @@ class HorizonScore:
         return dict(zip(QUANTITIES, self.mean[: self.sum_to].sum(axis=0).tolist(), strict=True))
 
 
-@dataclass(frozen=True)
-class _Tally:
-    """Summed errors and their counts, both (longest, 4), and the number of starts."""
-
-    total: FloatArray
-    count: FloatArray
-    samples: int
-
-    def __add__(self, other: _Tally) -> _Tally:
-        return _Tally(self.total + other.total, self.count + other.count, self.samples + other.samples)
-
-
 def horizon_scores(
     files: Sequence[Sequence[Window]], vehicle: Vehicle, theta: FloatArray, horizons: Sequence[int] = HORIZONS
 ) -> tuple[HorizonScore, list[HorizonScore]]:
@@ -85,31 +73,29 @@ def horizon_scores(
         raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
     longest = max(*wanted, SUM_TO)
     tallies = [_tally(windows, vehicle, theta, longest) for windows in files]
-    pooled = sum(tallies, _empty(longest))
-    if pooled.samples == 0:
+    pooled, starts = np.sum([sums for sums, _ in tallies], axis=0), sum(count for _, count in tallies)
+    if starts == 0:
         raise NotIdentifiableError(
             f"no run of {longest} samples fits: measured rate, and no gap for {longest} samples after it",
             f"stretches longer than {longest} samples with gyro", "log without gaps, or ask for a lower --rate",
         )  # fmt: skip
-    return _score(pooled, wanted), [_score(tally, wanted) for tally in tallies]
+    return _score(pooled, starts, wanted), [_score(*tally, wanted) for tally in tallies]
 
 
-def _empty(longest: int) -> _Tally:
-    return _Tally(np.zeros((longest, 4)), np.zeros((longest, 4)), 0)
-
-
-def _score(tally: _Tally, horizons: tuple[int, ...]) -> HorizonScore:
-    mean = np.divide(tally.total, tally.count, out=np.full_like(tally.total, np.nan), where=tally.count > 0)
+def _score(sums: FloatArray, starts: int, horizons: tuple[int, ...]) -> HorizonScore:
+    total, count = sums
+    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
     mean.setflags(write=False)
-    return HorizonScore(tally.samples, mean, horizons)
+    return HorizonScore(starts, mean, horizons)
 
 
-def _tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> _Tally:
-    tally, at = _empty(longest), 1 + np.arange(longest)
+def _tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> tuple[FloatArray, int]:
+    """Summed errors of all runs and their counts, shape (2, longest, 4), and the number of runs."""
+    sums, starts, at = np.zeros((2, longest, 4)), 0, 1 + np.arange(longest)
     for window in windows:
         for rows, misses in OpenLoop(window, vehicle, longest).parts(theta[None], at):
             errors = lengths(misses[0])
             known = ~np.isnan(errors)
-            total = np.where(known, errors, 0.0).sum(axis=0)
-            tally = tally + _Tally(total, known.sum(axis=0).astype(np.float64), len(rows))
-    return tally
+            sums += np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
+            starts += len(rows)
+    return sums, starts

@@ -17,6 +17,7 @@ from quadid.model.rollout import Rollout
 from quadid.model.rollout import _threads as worker_threads
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
+from quadid.turning import down
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
@@ -127,6 +128,4 @@ def kinematic_acceleration(force: FloatArray, attitude: FloatArray) -> FloatArra
         force: specific force [m/s^2], shape (..., 3).
         attitude: unit quaternions body to world, shape (..., 4).
     """
-    w, x, y, z = np.moveaxis(attitude, -1, 0)
-    down = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z], axis=-1)
-    return np.asarray(force + GRAVITY * down)
+    return np.asarray(force + GRAVITY * down(attitude))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from markupsafe import Markup
+
 from quadid.types import Json
 from quadid.vehicle import Vehicle
 
@@ -26,8 +28,6 @@ def airframe_picture(
         baseline: the same of healthy flights.
         changes: entries of ``quadid.health/1``.
     """
-    from markupsafe import Markup
-
     scale = (0.5 * _SIZE - _MARGIN) / max(abs(c) for r in vehicle.rotors for c in r.position[:2])
     centre = 0.5 * _SIZE
     places = [(centre + scale * r.position[1], centre - scale * r.position[0]) for r in vehicle.rotors]
@@ -54,15 +54,11 @@ def change_value(change: Json, name: str) -> float:
 
 
 def _line(x1: float, y1: float, x2: float, y2: float) -> str:
-    from markupsafe import Markup
-
     return Markup('<line class="arm" x1="{:.0f}" y1="{:.0f}" x2="{:.0f}" y2="{:.0f}"/>').format(x1, y1, x2, y2)
 
 
 def _rotor(j: int, x: float, y: float, more: float, weak: Json | None, centre: float) -> str:
     """One rotor: its healthy disc, its disc now, its number, its load, and its loss where it is damaged."""
-    from markupsafe import Markup
-
     kind = "" if weak is None else " damaged" if weak["confident"] else " suspect"
     radius = _DISC + max(-_LARGEST, min(_LARGEST, 100.0 * more))
     out = [
@@ -80,15 +76,11 @@ def _rotor(j: int, x: float, y: float, more: float, weak: Json | None, centre: f
 
 
 def _text(x: float, y: float, words: str, kind: str) -> str:
-    from markupsafe import Markup
-
     return Markup('<text class="{}" x="{:.0f}" y="{:.0f}">{}</text>').format(kind, x, y, words)
 
 
 def _shift(changes: Sequence[Json], centre: float, scale: float) -> Sequence[str]:
     """An arrow from the centre towards where the CG went, enlarged."""
-    from markupsafe import Markup
-
     found = [c for c in changes if c["effect"] == "cg_offset"]
     if not found:
         return ()

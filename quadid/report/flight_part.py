@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.inspection import flying_spans
+from quadid.inspection.airborne import Spans, flying_spans, within
 from quadid.report.parts import axis, figure, rows_of, section, trace, upright
 from quadid.resample import sample_period
 from quadid.rotor_signal import rotor_channel
@@ -30,7 +30,7 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
         place: of the log among those of the page.
     """
     spans = flying_spans(recording, vehicle)
-    drawn, said = vibration(recording, vehicle, f"log{place}-vibration") if spans else (None, "")
+    drawn, said = _vibration(recording, vehicle, spans, f"log{place}-vibration") if spans else (None, "")
     modes = mode_rows(recording)
     if drawn is None and not modes:
         return None
@@ -52,17 +52,19 @@ def mode_rows(recording: Recording) -> list[list[str]]:
     ]
 
 
-def vibration(recording: Recording, vehicle: Vehicle, identifier: str) -> tuple[dict[str, Any] | None, str]:
+def _vibration(
+    recording: Recording, vehicle: Vehicle, spans: Spans, identifier: str
+) -> tuple[dict[str, Any] | None, str]:
     """Amplitude spectrum of the accelerometer in the air, and a sentence about where the rotors are in it."""
     accel = recording.channels.get("accel")
-    found = None if accel is None else spectrum(accel, flying_spans(recording, vehicle))
+    found = None if accel is None else spectrum(accel, spans)
     if found is None:
         return None, ""
     frequency, density = found
     data = [
         trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(zip(_ROLES, _AXES, strict=True))
     ]
-    turning, said = _turning(recording, vehicle, float(frequency[-1]))
+    turning, said = _turning(recording, vehicle, spans, float(frequency[-1]))
     layout = {
         "xaxis": axis("frequency (Hz)"),
         "yaxis": axis("(m/s²)/√Hz", type="log"),
@@ -71,7 +73,7 @@ def vibration(recording: Recording, vehicle: Vehicle, identifier: str) -> tuple[
     return figure(identifier, "Vibration in the air", data, layout, 300), said
 
 
-def spectrum(accel: Channel, spans: tuple[tuple[float, float], ...]) -> tuple[FloatArray, FloatArray] | None:
+def spectrum(accel: Channel, spans: Spans) -> tuple[FloatArray, FloatArray] | None:
     """Amplitude spectral density of the specific force, averaged over the flight (Welch).
 
     Args:
@@ -96,14 +98,12 @@ def spectrum(accel: Channel, spans: tuple[tuple[float, float], ...]) -> tuple[Fl
     return each[0][0][keep], np.sqrt(power[keep])
 
 
-def _turning(recording: Recording, vehicle: Vehicle, highest: float) -> tuple[float | None, str]:
+def _turning(recording: Recording, vehicle: Vehicle, spans: Spans, highest: float) -> tuple[float | None, str]:
     """Where the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
     rotors, _ = rotor_channel(recording, vehicle)
-    spans = flying_spans(recording, vehicle)
-    if rotors is None or rotors.name != "rotor_speed" or not spans:
+    if rotors is None or rotors.name != "rotor_speed":
         return None, "The rotor speed is not logged; peaks are most often rotors out of balance."
-    inside = np.any([(rotors.t >= a) & (rotors.t <= b) for a, b in spans], axis=0)
-    turns = float(np.mean(rotors.values[inside])) / (2.0 * np.pi)
+    turns = float(np.mean(rotors.values[within(rotors.t, spans)])) / (2.0 * np.pi)
     if turns <= highest:
         return turns, f"The rotors turn {turns:.0f} times a second (dashed): a peak there is imbalance."
     folded = abs(turns - 2.0 * highest * round(turns / (2.0 * highest)))

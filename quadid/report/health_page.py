@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from quadid.health.comparison import LEAST_CHANCE
@@ -154,8 +155,6 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
         provenance: rows of name and value.
         history: figures of the baseline and the flights in question.
     """
-    from dataclasses import asdict
-
     n, m = len(result["logs"]), len(result["baseline"])
     intro = _INTROS["lacking" if result["baseline_lacking"] else result["verdict"]]
     caption = (

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
@@ -95,11 +93,7 @@ def noise_rows(noise: NoiseModel) -> list[dict[str, Any]]:
 
 def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
     """Correlations of the parameters: near 1 or -1, the flight hardly separates two of them."""
-    covariance = np.asarray(parameters.covariance)
-    sigma = np.sqrt(np.diag(covariance))
-    scale = np.where(sigma > 0.0, sigma, np.inf)
-    correlation = covariance / np.outer(scale, scale)
-    names = list(parameters.names)
+    correlation, names = parameters.correlation, list(parameters.names)
     rows = [
         [name, *(f"{correlation[i, j]:+.2f}" if i != j else "1" for j in range(len(names)))]
         for i, name in enumerate(names)

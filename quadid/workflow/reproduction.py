@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -258,10 +256,3 @@ def extended_sigma(diagnosis: Diagnosis) -> dict[str, float]:
 
     told = Vehicle.from_yaml(diagnosis.vehicle_yaml).parameters
     return {name: prior.sigma if prior.sigma is not None else float("nan") for name, prior in told.items()}
-
-
-def correlations(fit: Fit) -> FloatArray:
-    """Correlation of the estimates of the six parameters, shape (6, 6)."""
-    covariance = fit.uncertainty.covariance
-    sigma = np.sqrt(np.diag(covariance))
-    return np.asarray(covariance / np.outer(sigma, sigma))
