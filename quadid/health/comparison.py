@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -135,9 +136,31 @@ def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Veh
     points of a Sobol sequence in the predictive distribution of the spread.
     """
     offered = hypotheses(vehicle, healthy.shares, healthy.mean)
-    points = _healthy_points(*healthy.freedom) * healthy.predictive(flights)
-    evidence = _changed_over_unchanged(exact(np.vstack([change, points])), healthy, flights, offered)
-    return float((evidence >= evidence[0]).mean())
+    drawn = _evidence_of_draws(_Asked(_bytes(healthy, offered), healthy, flights, tuple(offered)))
+    own = _changed_over_unchanged(exact(change)[None], healthy, flights, offered)
+    return float((1 + np.count_nonzero(drawn >= own)) / (len(drawn) + 1))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the evidence of draws follows from, and the bytes of it that tell one such question from another."""
+
+    key: tuple[bytes, ...]
+    healthy: Healthy = field(compare=False)
+    flights: int
+    offered: tuple[Hypothesis, ...] = field(compare=False)
+
+
+def _bytes(healthy: Healthy, offered: Sequence[Hypothesis]) -> tuple[bytes, ...]:
+    numbers = [healthy.mean, healthy.deviation, healthy.freedom, healthy.predictive(1), healthy.shares]
+    return tuple(part.tobytes() for part in (*numbers, *(one.effect for one in offered)))
+
+
+@lru_cache(maxsize=32)
+def _evidence_of_draws(asked: _Asked) -> FloatArray:
+    """Evidence of change in draws of healthy flights, which all flights after one baseline share, shape (draws,)."""
+    points = _healthy_points(*asked.healthy.freedom) * asked.healthy.predictive(asked.flights)
+    return _changed_over_unchanged(exact(points), asked.healthy, asked.flights, asked.offered)
 
 
 @cache

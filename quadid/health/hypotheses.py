@@ -81,12 +81,13 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
     for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
         chosen = list(combinations(rotors, count))
         odds = np.log(_KINDS["weak_rotor"] * _ANOTHER ** (count - 1) / len(chosen))
+        blocks = [np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]]) for apart, _ in DRAG_APART]
+        priors = [np.kron(np.eye(count), block) for block in blocks]
         for group in chosen:
             effect = np.hstack([single[j] for j in group])
             positive = tuple(range(0, 2 * count, 2))
-            for apart, part in DRAG_APART:
-                block = np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]])
-                prior, log_odds = np.kron(np.eye(count), block), float(odds + np.log(part))
+            for prior, (_, part) in zip(priors, DRAG_APART, strict=True):
+                log_odds = float(odds + np.log(part))
                 out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, log_odds))
     return [*out, *_of_mass()]
 

@@ -58,7 +58,7 @@ def test_without_quick_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(found.values()) > 0.2, found
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
     """Quick motion without the cause would count it as a random moment."""
     found = diagnosed(seed, cg_offset={"x": 0.01, "y": -0.01})

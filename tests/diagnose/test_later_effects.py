@@ -38,9 +38,9 @@ FLOWN: dict[str, tuple[Vehicle, tuple[str, ...], dict[str, dict[str, float]]]] =
 
 
 def diagnosed(craft: Vehicle, extras: tuple[str, ...], hidden: dict[str, dict[str, float]]) -> Diagnosis:
-    """Diagnosis of a minute with hidden effects, from a poor guess."""
-    truth = draw_truth(craft, SEED)
-    train, unseen = (fly(craft, truth, 60.0, SEED + k, effects=hidden, extras=extras).window for k in range(2))
+    """Diagnosis of a flight with hidden effects, from a poor guess."""
+    truth, seconds = draw_truth(craft, SEED), 60.0 if "weak_rotor" in hidden else 40.0
+    train, unseen = (fly(craft, truth, seconds, SEED + k, effects=hidden, extras=extras).window for k in range(2))
     vehicle = craft.model_copy(update={"parameters": guessed(truth, SEED).parameters})
     return diagnose([train], vehicle, [unseen], seed=SEED, predict=False)[0]
 

@@ -11,7 +11,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 from studies.rotorpy_flight import RotorpyFlight, fly, hummingbird
 
 pytest.importorskip("rotorpy", reason="pip install rotorpy (extra dev)")
-SECONDS = 20.0
+SECONDS = 12.0
 
 
 def diagnosed(flight: RotorpyFlight) -> tuple[dict[str, dict[str, float]], dict[str, float], Diagnosis]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quadid.errors import NotIdentifiableError
-from quadid.health import Health, assess, flight_trim, healthy_spread
+from quadid.health import Health, assess, comparison, flight_trim, healthy_spread
 from quadid.health.comparison import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
 from quadid.health.trims import trim_directions, trim_of_load
@@ -61,6 +61,17 @@ def test_a_flight_far_from_its_only_baseline_in_every_trim_is_not_called_unchang
     another = baseline._replace(mean=baseline.mean + [0.02, 0.03, 0.11, 0.54])
     found = assess([another], [baseline], PELICAN_X)
     assert (found.verdict, found.changes) == ("unknown", ())
+
+
+def test_what_draws_of_healthy_flights_show_is_found_once_for_all_flights_after_a_baseline() -> None:
+    """A fleet compares each flight of a vehicle with the same first ones; each alone would draw them again."""
+    baseline = [flight_trim(hover(PELICAN_X, seed=1000 + k), PELICAN_X) for k in range(5)]
+    comparison._evidence_of_draws.cache_clear()
+    found = [assess([flight_trim(hover(PELICAN_X, seed=k), PELICAN_X)], baseline, PELICAN_X) for k in range(3)]
+    assert comparison._evidence_of_draws.cache_info().misses == 1
+    for one in found:
+        comparison._evidence_of_draws.cache_clear()
+        assert p_unchanged(one.trim - one.healthy.mean, one.healthy, 1, PELICAN_X) == one.p_value
 
 
 def test_a_change_that_two_baseline_flights_cannot_show_is_not_called_unchanged() -> None:

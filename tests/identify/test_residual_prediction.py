@@ -26,8 +26,8 @@ PELICAN = Vehicle.shipped("pelican")
 @pytest.fixture(scope="module")
 def answer(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     folder, out = data_dir / NANODRONE, tmp_path_factory.mktemp("prediction")
-    arguments = ["diagnose", f"{folder / 'random_run1.csv'}@0:30",
-                 "--validate", f"{folder / 'random_run2.csv'}@0:20",
+    arguments = ["diagnose", f"{folder / 'random_run1.csv'}@0:20",
+                 "--validate", f"{folder / 'random_run2.csv'}@0:10",
                  "--vehicle", str(folder / "vehicle.yaml"), "--out", str(out),
                  "--json", str(out / "r.json")]  # fmt: skip
     done = CliRunner().invoke(app, arguments)
@@ -57,7 +57,7 @@ def test_it_predicts_a_flight_it_has_not_seen_better_than_the_physics(answer: di
 
 def test_without_velocity_only_moments_are_learnt(data_dir: Path) -> None:
     vehicle = Vehicle.from_yaml((data_dir / NANODRONE / "vehicle.yaml").read_text())
-    windows, _ = grid_recording(open_log(data_dir / NANODRONE / "random_run1.csv"), vehicle, 50.0, [(0.0, 25.0)])
+    windows, _ = grid_recording(open_log(data_dir / NANODRONE / "random_run1.csv"), vehicle, 50.0, [(0.0, 15.0)])
     bare = [replace(w, velocity=None, position=None) for w in windows]
     learnt = learn_prediction(bare, vehicle)
     assert learnt is not None
