@@ -57,7 +57,7 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
         signal = RotorSignal(channel.t, channel.values, "instant" if measured else vehicle.command.sampling, source)
     else:
         if not described:
-            raise _needs_command_kind(recording, channel, vehicle)
+            raise _needs_command_kind(recording, channel, vehicle, notes)
         _check_unit(recording, channel, vehicle)
         values = vehicle.command.to_rotor_speed(channel.values)
         signal = RotorSignal(channel.t, values, vehicle.command.sampling, source, notes)
@@ -91,7 +91,7 @@ def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channe
 def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | None) -> str:
     """Why measured speeds are not used; empty where they are."""
     if not np.any(speed.values):
-        return "are all zero: the ESCs do not report"
+        return "are all zero: the motors are off, or the ESCs do not report"
     if command is None or vehicle is None or vehicle.command.kind == "rotor_speed":
         return ""
     if vehicle.command.kind == "pwm" and _looks_like_pwm(command):
@@ -143,8 +143,17 @@ def _check_speeds(recording: Recording, speed: Channel) -> None:
         )  # fmt: skip
 
 
-def _needs_command_kind(recording: Recording, command: Channel, vehicle: Vehicle) -> LogError:
+def _needs_command_kind(
+    recording: Recording, command: Channel, vehicle: Vehicle, passed_over: tuple[str, ...]
+) -> LogError:
+    """Commands are there, but the vehicle file describes none; speeds that all are zero may be those of a stand."""
     kind = "pwm" if _looks_like_pwm(command) else "normalized"
+    if passed_over:
+        return LogError(
+            f"{recording.name}: {'; '.join(passed_over)}", f"rotor speeds above zero, as '{vehicle.name}' expects them",
+            "fly; if the ESCs never report, "
+            f"write command: {{kind: {kind}, max_speed: <rad/s at full command>}} in the vehicle file",
+        )  # fmt: skip
     return LogError(
         f"{recording.name}: holds motor commands ({command.source}) but '{vehicle.name}' expects rotor speeds",
         "a vehicle file whose `command` fits the log",

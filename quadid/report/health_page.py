@@ -18,6 +18,9 @@ _WORDS = {
     "mass_change": "mass", "cg_offset": "centre of gravity", "thrust_drop": "thrust of all rotors",
     "weak_rotor": "rotor",
 }  # fmt: skip
+_LARGE = 0.2
+"""Change of effort (log of command per force) from which the flights may be of two vehicles."""
+_ONE_VEHICLE = "Check that all flights are of one vehicle, and their motors logged in one way."
 _INTROS = {
     "changed": "", "unknown": "Nothing that has a name.", "lacking": "Not known. If anything:",
     "unchanged": "Nothing beyond what healthy flights differ by. If anything:",
@@ -71,13 +74,13 @@ def health_verdict(result: Json) -> Verdict:
         headline = f"{n} {flights} not show whether the vehicle has changed."
         details += [f"With {more} more, spread like these, it would be a change{f': {suspects}' if suspects else ''}."]
         step = f"Record {more} healthy flight{'s' * (more != 1)} or more, and compare again."
-        return Verdict("fair", headline, tuple(details), (step,))
+        return Verdict("fair", headline, tuple(details), (*_first(result), step))
     if verdict == "unchanged":
         details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
         return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
     if verdict == "unknown":
         checks = (
-            "Check that all flights are of one vehicle, and their motors logged in one way.",
+            _ONE_VEHICLE,
             "Look the vehicle over; compare with `quadid diagnose`, which fits the motion.",
         )
         return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), checks)
@@ -87,8 +90,14 @@ def health_verdict(result: Json) -> Verdict:
     if not changes[0]["confident"]:
         details.append("Other explanations are nearly as probable, see below.")
     details += [f"Less certain: {'; '.join(change_words(c) for c in rest)}."] if rest else []
-    steps = dict.fromkeys(_step(c) for c in sure)
+    steps = dict.fromkeys([*_first(result), *(_step(c) for c in sure)])
     return Verdict(_LEVELS[verdict], headline, tuple(details), tuple(steps))
+
+
+def _first(result: Json) -> tuple[str, ...]:
+    """What to check before anything else, where the change is as large as between two vehicles."""
+    (effort,) = (t["value"] - t["baseline"] for t in result["trim"] if t["name"] == "effort")
+    return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
 
 
 def _chance(p_value: float) -> str:

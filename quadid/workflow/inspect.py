@@ -28,6 +28,20 @@ class Inspected(Outcome):
     found: Inspection
 
     @property
+    def heading(self) -> str:
+        """Name, format, length, and when it flies."""
+        from quadid.report.inspect_tables import heading
+
+        return heading(self.found)
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the checks found, what is missing, and whether the log can be used."""
+        from quadid.report.inspect_tables import sentences
+
+        return [cell.text for cell in sentences(self.found)]
+
+    @property
     def warnings(self) -> list[str]:
         """What the reader had to say, and what to leave out of the log."""
         use = self.result["use"]

@@ -222,13 +222,17 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> Check
 
     found, doubts = inspect(recording, vehicle), []
     flown = flown_parts(recording, found.flying, cut)
+    # Rotors at a speed that cannot carry this vehicle: what else is wrong about them is that of another one.
+    stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
     for check in found.checks:
         # A check without numbers could not be made; what comes next says why, and better.
         if check.verdict is CheckResult.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
+            of_rotors = stranger if check.name in ("motor_order", "rotor_timing") else ""
+            fix = f"use the vehicle file of this log; else {fix}" if of_rotors else fix
             parts = " ".join(names_of(cut, flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
-            raise LogError(f"{recording.name}: {check.message}", fix=fix)
+            raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
         if check.verdict in (CheckResult.ERROR, CheckResult.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
     return Checked(tuple(doubts), flown)

@@ -70,7 +70,8 @@ class Settled:
     @property
     def warnings(self) -> list[str]:
         """The notes, and what is wrong with the logs."""
-        return [*self.notes, *(text for log in (*self.train, *self.held) for text in log.warnings)]
+        found = [*self.notes, *(text for log in (*self.train, *self.held) for text in log.warnings)]
+        return list(dict.fromkeys(found))  # parts of one log repeat them
 
 
 def settled(logs: Given, validate: Given, vehicle: str | Path | Vehicle | None) -> Settled:

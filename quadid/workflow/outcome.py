@@ -37,13 +37,26 @@ class Outcome(ABC):
         return None
 
     @property
+    def heading(self) -> str:
+        """What stands above the tables."""
+        return ""
+
+    @property
+    def sentences(self) -> list[str]:
+        """What stands below the tables, a sentence each."""
+        return []
+
+    @property
     def warnings(self) -> list[str]:
         """What a user should know, from logs and from the work itself."""
         return list(self.result.get("warnings", ()))
 
     def text(self, width: int = 100) -> str:
         """Tables, verdict and warnings, for a page of `width` columns."""
-        parts = [table.text(width) for table in self.tables()]
+        parts = [self.heading] if self.heading else []
+        parts += [table.text(width) for table in self.tables()]
+        if self.sentences:
+            parts.append("\n".join(self.sentences))
         if self.verdict is not None:
             parts.append("\n".join(self.verdict.lines()))
         parts += [f"warning: {warning}" for warning in self.warnings]
@@ -53,7 +66,9 @@ class Outcome(ABC):
         return self.text()
 
     def _repr_html_(self) -> str:
-        parts = [table.html() for table in self.tables()]
+        parts = [f"<p><b>{escape(self.heading)}</b></p>"] if self.heading else []
+        parts += [table.html() for table in self.tables()]
+        parts += [f"<p>{escape(line)}</p>" for line in self.sentences]
         if self.verdict is not None:
             head, *more = (escape(line) for line in self.verdict.lines())
             parts.append(f"<p><b>{head}</b></p>" + "".join(f"<p>{line}</p>" for line in more))

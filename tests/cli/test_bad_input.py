@@ -289,3 +289,12 @@ def test_control_characters_in_names_do_not_reach_the_terminal(inside: Cli, tmp_
     assert "\x1b" not in run.err
     one_line(run, 2)
     happened(20, "ANSI and line ends in a file name: none on the terminal, one line")
+
+
+def test_the_vehicle_file_of_a_vehicle_thirty_times_as_heavy(inside: Cli, tmp_path: Path, data_dir: Path) -> None:
+    """Its rotors stand in another order as well, but that is not what to mend."""
+    log = data_dir / "crazyflie_rpm" / "figure8_17.csv"
+    run = inside("identify", log, "--vehicle", "pelican", "--out", tmp_path)
+    line = one_line(run, 2)
+    assert "so b would be 1.26e-06" in line
+    assert "fix: use the vehicle file of this log; else reorder the rotors" in line

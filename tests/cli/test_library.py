@@ -16,6 +16,7 @@ from quadid_replay import write_csv
 import quadid
 from quadid.errors import QuadidError, VehicleError
 from quadid.jsonable import jsonable
+from quadid.workflow.logs import settled
 from tests.cli.conftest import Cli, Flights, one_line
 
 WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "log", "manoeuvre_file")
@@ -182,3 +183,22 @@ def test_a_fitted_file_knows_the_voltage_that_it_was_fitted_at(tmp_path: Path) -
     volts = np.concatenate([np.ravel(w.battery) for w in log.windows if w.battery is not None])
     fit = quadid.identify(log)
     assert fit.vehicle.reference_voltage == pytest.approx(np.nanmean(volts), rel=1e-3)
+
+
+def test_an_inspection_prints_what_its_command_prints(logs: dict[str, str]) -> None:
+    found = quadid.inspect(logs["good"], vehicle="pelican")
+    for text in (found.text(), found._repr_html_()):
+        assert "flying from-to (s)" in text
+        assert "rotor speed: the rotors agree with each other" in text
+        assert "usable for identification" in text
+
+
+def test_parts_of_a_log_warn_of_it_once(logs: dict[str, str], tmp_path: Path) -> None:
+    log = tmp_path / "torn.csv"
+    write_csv(log, load(logs["good"]).recording)
+    lines = log.read_text(encoding="utf-8").splitlines()
+    log.write_text("\n".join([*lines[:-1], lines[-1][:9], ""]), encoding="utf-8")
+    given = settled(load(f"{log}@0:8"), load(f"{log}@8:16"), None)
+    torn = [text for text in given.warnings if "torn.csv" in text]
+    assert torn
+    assert len(torn) == len(set(torn))

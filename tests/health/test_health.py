@@ -237,3 +237,13 @@ def test_partial_channels_are_enough() -> None:
 def test_too_little_flight_is_refused_with_what_is_needed() -> None:
     with pytest.raises(NotIdentifiableError, match="5 s or more between take-off and landing"):
         flight_trim(hover(PELICAN_X, seconds=4.0), PELICAN_X)
+
+
+@pytest.mark.parametrize(("added", "asked"), [(0.05, False), (0.5, True)])
+@pytest.mark.parametrize("baselines", [1, 6])
+def test_a_change_as_between_two_vehicles_asks_first_whether_they_are_one(
+    added: float, asked: bool, baselines: int
+) -> None:
+    found = judged(PELICAN_X, Wrong(mass=added * PELICAN_X.mass), seed=1, baselines=baselines)
+    verdict = health_verdict({**found.to_dict(), "baseline": ["a"] * baselines})
+    assert any(step.startswith("Check that all flights are of one vehicle") for step in verdict.next_steps) == asked

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 
+from quadid.errors import LogError
 from quadid.inspection import Check, CheckResult, inspect
+from quadid.rotor_signal import rotor_signal
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
@@ -136,3 +138,15 @@ def test_the_recorded_dead_sensor_is_refused_and_its_sisters_are_not(
     if not usable:
         check = next(c for c in found.checks if c.name == "rotor_speed")
         assert "rotor 1 reads nothing" in check.message
+
+
+def test_speeds_that_are_all_zero_do_not_advise_another_vehicle_file(flight: tuple[Recording, Vehicle]) -> None:
+    """As before take-off: the file describes rotor speeds, and they come as soon as the rotors turn."""
+    recording, vehicle = flight
+    speed = recording.channels["rotor_speed"]
+    still = replace(speed, values=np.zeros_like(speed.values))
+    pulses = Channel("motor_command", speed.t, np.full_like(speed.values, 1000.0), "RCOU")
+    channels = {**recording.channels, "rotor_speed": still, "motor_command": pulses}
+    with pytest.raises(LogError, match="all zero: the motors are off, or the ESCs do not report") as caught:
+        rotor_signal(replace(recording, channels=channels), vehicle)
+    assert str(caught.value.fix).startswith("fly; if the ESCs never report, write command: {kind: pwm")

@@ -64,7 +64,7 @@ class Facts:
         """Says whether a nominal parameter came from data, or from whoever stated its uncertainty in the file."""
         prior = self.vehicle.parameters[name]
         if prior.sigma is None:
-            return "not from data: the guess of the vehicle file"
+            return "not from data: as the vehicle file has it, without a sigma"
         return f"fitted, or given with its uncertainty: 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
 
     @cached_property
