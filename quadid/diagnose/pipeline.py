@@ -13,7 +13,7 @@ from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
 from quadid.diagnose.cross_validation import BLOCKS
 from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, free_names, refit, without
-from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
+from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnose.result import Diagnosis, Explanation, describe
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
@@ -98,7 +98,7 @@ def diagnose(
     doubted = {label: m for label, m in fewer.items() if label in doubts}
     parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
     parameters, moved = possible_moments(parameters)
-    weak = late_unknown(model, parameters) | slight_changes(model)
+    weak = late_unknown(model, parameters) | slight_causes(model)
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
     findings = describe(decisive, search, worth, [] if verdict is Explanation.UNKNOWN else believed)

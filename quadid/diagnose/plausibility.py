@@ -40,14 +40,23 @@ def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str
     return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
 
 
-def slight_changes(model: Model) -> dict[str, str]:
-    """Causes of `model` that begin at a moment and are no event, by label, and why.
+def slight_causes(model: Model) -> dict[str, str]:
+    """Causes of `model` that something on any vehicle passes for while they are small, by label, and what.
 
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
-    thrust differs by as much on any vehicle, and a step at the border takes that up.
+    thrust differs, and a step at the border takes that up.  A tilted vertical of the attitude pushes as a wind does.
     """
-    reason = f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what such a change typically is"
-    return {c.label: reason for c in model.causes if c.timed is not None and untidy_sized(model, c)}
+    told = {}
+    for cause in model.causes:
+        if not untidy_sized(model, cause):
+            continue
+        if cause.timed is not None:
+            told[cause.label] = (
+                f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what it typically is"
+            )
+        elif cause.effect == "wind":
+            told[cause.label] = "in still air, a vertical of the attitude that is off by a degree does the same"
+    return told
 
 
 def impossible(model: Model, cause: Candidate) -> str:

@@ -8,9 +8,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from quadid.diagnose.hypotheses import candidates
 from quadid.diagnose.model import Model, Start, extend, free_names, without
 from quadid.diagnose.pipeline import _nominal_parameters
-from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_changes
+from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
 from quadid.diagnose.result import Explanation
 from quadid.identify.answer import possible_moments
@@ -162,14 +163,21 @@ def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> 
     assert late_unknown(model, one) == {}
 
 
-@pytest.mark.parametrize(("fraction", "believed"), [(0.015, False), (-0.015, False), (0.05, True)])
-def test_a_change_as_between_parts_of_any_flight_is_no_event(fraction: float, believed: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "believed"),
+    [
+        ("thrust_drop.fraction", 0.015, False), ("thrust_drop.fraction", -0.015, False),
+        ("thrust_drop.fraction", 0.05, True), ("wind.north", 0.4, False), ("wind.east", -2.0, True),
+    ],
+)  # fmt: skip
+def test_what_any_flight_may_have_is_no_event_and_no_wind(name: str, value: float, believed: bool) -> None:
     problem = clean()
-    drop = cause(problem, "thrust_drop")
+    layout = problem.shooting.layout
+    (found,) = (c for c in candidates(layout, True, True) if c.label == name.split(".")[0])
     theta = problem.nominal.theta.copy()
-    theta[problem.shooting.layout.entry("thrust_drop.fraction").index] = fraction
-    model = replace(problem.nominal, theta=theta, causes=(drop,), free=problem.shooting.free(free_names((drop,))))
-    assert (slight_changes(model) == {}) == believed
+    theta[layout.entry(name).index] = value
+    model = replace(problem.nominal, theta=theta, causes=(found,), free=problem.shooting.free(free_names((found,))))
+    assert (slight_causes(model) == {}) == believed
 
 
 def test_without_gyroscopic_coupling_yaw_inertia_is_known_relative_to_the_drag_torque() -> None:
