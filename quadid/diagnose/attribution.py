@@ -203,7 +203,8 @@ def _second_halves(nominal: Identified, model: Model, logs: Sequence[Window]) ->
 
     None where nothing belongs to a flight, or no log is long enough.
     """
-    scorer, per_log = scored_problem(logs, nominal.vehicle, nominal.noise), model.per_log_names
+    scorer = scored_problem(logs, nominal.vehicle, nominal.noise)
+    per_log = [n for c in model.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
     totals: list[tuple[Tally, Tally]] = []
     for window in logs:
         middle = len(window) // 2

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.diagnose.cross_validation import held_out
 from quadid.diagnose.hypotheses import Candidate
-from quadid.effects import EFFECTS, NEVER
+from quadid.effects import NEVER
 from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
 from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
@@ -80,11 +80,6 @@ class Model(Polished):
     def finds_velocity(self) -> bool:
         """Whether airspeed matters and is not measured, so that the segments' initial velocities are fitted."""
         return bool(np.any(self.lin.occam))
-
-    @property
-    def per_log_names(self) -> list[str]:
-        """Entries that belong to one flight and can be refitted on another; not changes at a moment."""
-        return [n for c in self.causes if EFFECTS[c.effect].per_log and c.timed is None for n in c.names]
 
     @property
     def effects(self) -> set[str]:

@@ -46,17 +46,10 @@ def slight_causes(model: Model) -> dict[str, str]:
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
     thrust differs, and a step at the border takes that up.  A tilted vertical of the attitude pushes as a wind does.
     """
-    told = {}
-    for cause in model.causes:
-        if not untidy_sized(model, cause):
-            continue
-        if cause.timed is not None:
-            told[cause.label] = (
-                f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what it typically is"
-            )
-        elif cause.effect == "wind":
-            told[cause.label] = "in still air, a vertical of the attitude that is off by a degree does the same"
-    return told
+    step = f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what it typically is"
+    push = "in still air, a vertical of the attitude that is off by a degree does the same"
+    small = [c for c in model.causes if untidy_sized(model, c)]
+    return {c.label: push if c.timed is None else step for c in small if c.timed is not None or c.effect == "wind"}
 
 
 def impossible(model: Model, cause: Candidate) -> str:
