@@ -17,6 +17,7 @@ from quadid.report.programs import FORMATS, export
 from quadid.residual import ResidualTerm
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command, ParameterPrior
+from quadid.workflow.init import init as begin
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0
@@ -106,8 +107,8 @@ def test_px4_geometry_and_hover(vehicle: Vehicle) -> None:
     assert values["CA_ROTOR2_PX"] == pytest.approx(0.21 - 0.01)
     assert values["CA_ROTOR1_KM"] == pytest.approx(4e-7 / 2.3e-5)
     assert values["CA_ROTOR0_KM"] < 0.0
-    assert values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY / (4 * 2.3e-5 * SPEED**2))
-    assert values["CA_ROTOR0_CT"] * 4 * values["MPC_THR_HOVER"] == pytest.approx(1.3 * GRAVITY)
+    assert values["MPC_THR_HOVER"] * SPEED == pytest.approx(np.sqrt(1.3 * GRAVITY / (4 * 2.3e-5)))
+    assert values["CA_ROTOR0_CT"] * 4 * values["MPC_THR_HOVER"] ** 2 == pytest.approx(1.3 * GRAVITY)
     assert "gyro_scale" in text
     assert "b = 2.3e-05 N s^2/rad^2: fitted, or given with its uncertainty: 95 % within 0.85 %" in text
     assert "J_xx = 0.008 kg m^2: not from data" in text
@@ -166,7 +167,8 @@ def test_full_and_hover_thrust_follow_the_thrust_curve_and_weak_rotors(vehicle: 
     assert [values[f"CA_ROTOR{i}_CT"] for i in range(4)] == pytest.approx([full, 0.9 * full, full, full])
     assert values["SIH_T_MAX"] == pytest.approx(3.9 / 4.0 * full)
     hover = 1.3 * GRAVITY / (3.9 * full)
-    assert values["MPC_THR_HOVER"] == pytest.approx(hover)
+    at_hover = 120.0 + np.sqrt(1.3 * GRAVITY / (3.9 * 2.3e-5))
+    assert values["MPC_THR_HOVER"] == pytest.approx(at_hover / SPEED)
     assert f'ctrlrange="0 {full:.8g}"' in export(curved, "mujoco", "x")[".mjcf.xml"]
     parameters = export(curved, "ardupilot", "x")[".param"]
     assert float(next(line for line in parameters.splitlines() if "THST_HOVER" in line)[15:]) == pytest.approx(hover)
@@ -279,3 +281,11 @@ def test_isaac_lab_ranges_are_the_intervals(vehicle: Vehicle) -> None:
     thrust, moment = _wrench(vehicle, speeds)
     force = np.array(space["ALLOCATION_MATRIX"]) @ (2.3e-5 * speeds**2)
     np.testing.assert_allclose(force, [0.0, 0.0, thrust, *moment * [1.0, -1.0, -1.0]], rtol=1e-6, atol=1e-9)
+
+
+def test_px4_hover_is_what_px4_itself_learned_in_a_recorded_flight(data_dir: Path) -> None:
+    """Its THR_MDL_FAC is 0, its estimate of MPC_THR_HOVER in the air 0.48 (hover_thrust_estimate)."""
+    log = data_dir / "px4" / "ascend_cubeorange_test.ulg"
+    text = export(Vehicle.from_yaml(begin("mine", log).text), "px4", "x")[".params"]
+    hover = next(float(line.split("\t")[3]) for line in text.splitlines() if "\tMPC_THR_HOVER\t" in line)
+    assert hover == pytest.approx(0.482, abs=0.02)

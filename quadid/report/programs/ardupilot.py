@@ -23,6 +23,11 @@ def ardupilot_parameters(facts: Facts) -> str:
     expo = thrust_expo(facts)
     if expo is not None:
         lines.append(f"MOT_THST_EXPO,{expo:.6g}")
+    elif facts.hover_command is not None:
+        lines.append(
+            "# MOT_THST_HOVER is that of MOT_THST_EXPO 1, thrust as the square of command; for E set "
+            f"(1 - E) c + E c^2, c = {facts.hover_command:.4g}."
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -24,7 +24,9 @@ def px4(facts: Facts) -> str:
     """Returns the parameter file (tab separated: system, component, name, value, type).
 
     CA_ROTORn_KM is torque over thrust [m], positive for rotors that turn counterclockwise seen from above, as ours of
-    spin +1 do; CA_ROTORn_CT is the thrust at full command [N], which needs the full rotor speed.
+    spin +1 do; CA_ROTORn_CT is the thrust at full command [N], which needs the full rotor speed.  PX4 sends its thrust
+    setpoint to the ESCs as it is unless THR_MDL_FAC says otherwise, so MPC_THR_HOVER is a share of command, not of
+    thrust.
     """
     # Losses of single rotors stand in CA_ROTORn_CT, which needs the full rotor speed.
     carried = CARRIED if facts.max_speed is not None else tuple(n for n in CARRIED if n != "weak_rotor")
@@ -36,13 +38,13 @@ def px4(facts: Facts) -> str:
         rows.append((f"CA_ROTOR{i}_KM", rotor.spin * facts.torque_per_thrust, _FLOAT))
         if facts.full_thrust is not None:
             rows.append((f"CA_ROTOR{i}_CT", float(facts.full_thrust[i]), _FLOAT))
-    if facts.hover_thrust is None:
-        lines.append("# No CA_ROTORn_CT, THR_MDL_FAC, MPC_THR_HOVER: the rotor speed at full command is not known")
+    if facts.hover_command is None:
+        lines.append("# No CA_ROTORn_CT, MPC_THR_HOVER: the rotor speed at full command is not known")
         lines.append("# (command.max_speed in the vehicle file).")
     else:
-        rows.append(("MPC_THR_HOVER", facts.hover_thrust, _FLOAT))
-        if "thrust_curve" not in facts.vehicle.effects:
-            lines.append("# No THR_MDL_FAC: no thrust curve was fitted.")
+        rows.append(("MPC_THR_HOVER", facts.hover_command, _FLOAT))
+        if facts.vehicle.command.kind != "thrust":
+            lines.append("# MPC_THR_HOVER h is that of THR_MDL_FAC 0, the default; for F set F h^2 + (1 - F) h.")
     rows += [(name, value, _FLOAT) for name, value in (*_in_hardware(facts), *_drag_fusion(facts))]
     lines += [f"1\t1\t{name}\t{value:.8g}\t{kind}" for name, value, kind in rows]
     return "\n".join(lines) + "\n"
