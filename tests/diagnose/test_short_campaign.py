@@ -9,11 +9,9 @@ from quadid.flight import OUTSIDE
 from quadid.parameters import NOMINAL_NAMES
 from tests.diagnose.hidden import SECONDS, answer, confident, number, of_class, require_named, require_nothing, single
 
-QUICK = (
-    "motor_lag", "attitude_delay", "rotor_drag", "weak_rotor", "mass_change", "battery_sag", "accel_bias",
-    "imu_lever_arm",
-)  # fmt: skip
+QUICK = ("attitude_delay", "mass_change", "battery_sag", "accel_bias", "imu_lever_arm")
 OTHERS = (
+    "motor_lag", "rotor_drag", "weak_rotor",  # `test_later_effects` has them quickly
     "command_delay", "imu_lag", "rotor_drag_moment", "rate_damping", "axial_inflow", "wind", "cg_offset", "thrust_drop",
     "thrust_curve", "product_of_inertia", "rotor_spin_up", "gyro_bias", "gyro_scale", "imu_misalignment",
     "ahrs_acceleration_error",

@@ -80,13 +80,14 @@ def _last(work: Iterator[None]) -> Seen | None:
 
 
 FLIGHTS = [
-    ("x.tlog", "sitl_x.yaml"),
-    ("quad_sq.bin", "quad_sq.yaml"),
+    pytest.param("x.tlog", "sitl_x.yaml", marks=pytest.mark.slow),
+    pytest.param("quad_sq.bin", "quad_sq.yaml", marks=pytest.mark.slow),
     ("quad_sq.tlog", "quad_sq.yaml"),
     ("quad_sq_pwm.tlog", "quad_sq_pwm.yaml"),
     ("x_zero_rpm.tlog", "sitl_x_pwm.yaml"),
     ("x.bin", "sitl_x.yaml"),
 ]
+"""Both formats and both frames at once, the others of the two vehicles with the slow tests."""
 
 
 @pytest.mark.parametrize(("log", "file"), FLIGHTS)
