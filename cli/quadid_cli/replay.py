@@ -31,7 +31,9 @@ class ReplayError(QuadidError):
 
 
 def replay(
-    log: Annotated[str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV.")],
+    log: Annotated[
+        str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV. LOG@76:216: a span.")
+    ],
     vehicle: VehicleName,
     speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Multiple of real time, or max.")] = "max",
     out: Annotated[
@@ -72,6 +74,7 @@ def replay(
     from quadid_replay import open_log
 
     from quadid.workflow.loading import load_vehicle, parse_columns
+    from quadid.workflow.parts import parse_cut
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -80,7 +83,10 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
-    recording = open_log(log, preset, described.columns | parse_columns(columns or []))
+    cut = parse_cut(log)
+    if as_recorded and cut.path != Path(log):
+        raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
+    recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))
     if as_recorded:
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle
@@ -244,7 +250,7 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         if event["level"] != "info" or event["kind"] == "accepted":
             console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", markup=False, soft_wrap=True)
     for check, count in result["refused"].items():
-        console.print(f"{count} estimates not published: {check.replace('_', ' ')}", markup=False)
+        console.print(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}", markup=False)
     if not result["published"]:
         status = result["status"]
         console.print(f"nothing published: {status['phase']}: {status['reason']}", markup=False, soft_wrap=True)

@@ -256,7 +256,7 @@ def _gain_text(case: Case) -> str:
     total, n = float(np.sum(case.held_out)), len(case.held_out)
     if n == 0:
         return "narrower intervals than before"
-    return f"deviance on {n} unseen windows {total:+.1f} better than before"
+    return f"deviance on {n} unseen window{'s' * (n != 1)} {total:+.1f} better than before"
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (

@@ -144,5 +144,6 @@ def _partial(left: list[str]) -> list[str]:
         there = [name for name in group if name in left]
         missing = [name for name in group if name not in left]
         if there and missing:
-            out.append(f"{channel}: {', '.join(missing)} is missing, so {', '.join(there)} is not used")
+            lack, rest = (f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}" for names in (missing, there))
+            out.append(f"{channel}: {lack} missing, so {rest} not used")
     return out

@@ -81,6 +81,15 @@ def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: C
     assert json.loads(again.out)["published"] == result["published"], "the same bits every time"
 
 
+def test_a_span_of_a_log_is_played(log: Path, run: Callable[..., Ran]) -> None:
+    done = run("replay", f"{log}@2:6", "--vehicle", "pelican", "--diagnose", "0", "--json", "-")
+    assert done.code == 3, "too short to publish anything, as the whole log does"
+    assert json.loads(done.out)["published"] == []
+    whole = run("replay", f"{log}@2:6", "--vehicle", "pelican", "--as-recorded")
+    assert whole.code == 2
+    assert "a part; allowed: whole recordings" in whole.err
+
+
 def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, run: Callable[..., Ran]) -> None:
     path = tmp_path / "hover.mcap"
     write_mcap(path, flight(20.0, 7, "hover").recording)
