@@ -107,7 +107,7 @@ def grid_recording(
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
     spans = _spans(plan)
     shortest = SHORTEST if rate is not None else 0.0
-    log_span = _log_span(recording)
+    log_span = recording.span
     windows: list[Window] = []
     dropped: list[float] = []
     for span in spans:
@@ -203,18 +203,13 @@ def _window(plan: Plan, at: FloatArray, name: str, log_span: Span) -> Window:
     return Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, name=name, log_span=log_span)
 
 
-def _log_span(recording: Recording) -> Span:
-    ends = [(float(c.t[0]), float(c.t[-1])) for c in recording.channels.values() if len(c.t)]
-    return min(a for a, _ in ends), max(b for _, b in ends)
-
-
 def _nothing_left(
     recording: Recording, longest: float, needed: float, parts: Sequence[Span]
 ) -> LogError | NotIdentifiableError:
     if tuple(parts) != (WHOLE,):
         # In the time in which people ask for a part.
         zero = recording.first_imu_time
-        first, last = (t - zero for t in _log_span(recording))
+        first, last = (t - zero for t in recording.span)
         asked = " nor ".join(f"{a - zero:g} and {b - zero:g} s" for a, b in parts)
         return LogError(
             f"{recording.name}: nothing to use between {asked}",

@@ -153,10 +153,16 @@ class Recording:
     modes: tuple[tuple[float, str], ...] = ()
 
     @property
+    def span(self) -> tuple[float, float]:
+        """First and last time of any channel [s]; both 0 where there is no sample."""
+        ends = [(float(c.t[0]), float(c.t[-1])) for c in self.channels.values() if len(c.t)] or [(0.0, 0.0)]
+        return min(a for a, _ in ends), max(b for _, b in ends)
+
+    @property
     def first_imu_time(self) -> float:
         """Time [s] of the first gyro or accelerometer sample, else of the first of any channel: LOG@0 begins there."""
-        first = {name: float(c.t[0]) for name, c in self.channels.items() if len(c.t)}
-        return min([t for name, t in first.items() if name in ("gyro", "accel")] or first.values(), default=0.0)
+        imu = (self.channels[name].t for name in ("gyro", "accel") if name in self.channels)
+        return min((float(t[0]) for t in imu if len(t)), default=self.span[0])
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def _identified(job: Job, log: Log) -> Row:
 
 def _when(recording: Recording) -> Row:
     """Date of the flight, where the log's clock knows dates."""
-    first = min((float(c.t[0]) for c in recording.channels.values() if len(c.t)), default=0.0)
+    first, _ = recording.span
     return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
 
 

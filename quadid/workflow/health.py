@@ -177,11 +177,5 @@ def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None
 
 def _overlap(one: Recording, other: Recording) -> bool:
     """Whether two parts of a log share time."""
-    (a, b), (c, d) = _span(one), _span(other)
+    (a, b), (c, d) = one.span, other.span
     return a < d and c < b
-
-
-def _span(recording: Recording) -> tuple[float, float]:
-    """First and last time of any channel [s]."""
-    times = [t for c in recording.channels.values() if len(c.t) for t in (float(c.t[0]), float(c.t[-1]))]
-    return min(times), max(times)

@@ -51,11 +51,11 @@ class Cut:
     def _empty(self, recording: Recording) -> LogError:
         """Nothing is there: which span was asked for, and which there is."""
         zero = recording.first_imu_time
-        times = [float(t) - zero for c in recording.channels.values() if len(c.t) for t in (c.t[0], c.t[-1])]
+        first, last = recording.span
         asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
         if self.start is None:
             asked = f"before {self.stop} s"
-        there = f", {min(times):.1f} to {max(times):.1f} s" if times else ""
+        there = f", {first - zero:.1f} to {last - zero:.1f} s" if last > first else ""
         return LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
 
 

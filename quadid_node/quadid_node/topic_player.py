@@ -84,7 +84,7 @@ def epoch_of(recording: Recording, stamps: str) -> int:
     """Nanoseconds to add to recording time: the log's own UNIX time, or such that the log begins now."""
     if stamps == "log":
         return base_seconds(recording) * 10**9
-    first = min(float(c.t[0]) for c in recording.channels.values() if len(c.t))
+    first, _ = recording.span
     return (time.time_ns() // 10**6) * 10**6 - round(first * 1e9)
 
 
