@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from quadid.resample import copied
 from quadid.saturation import at_limit
-from quadid.types import BoolArray, FloatArray
+from quadid.types import FloatArray
 from quadid.window import Window
 
 LEAST_COPIES = 0.03
@@ -57,7 +58,7 @@ def without_copies(windows: Sequence[Window]) -> list[Window]:
             values = getattr(window, name)
             if values is None:
                 continue
-            copies = np.flatnonzero(_copied(values)) + 1
+            copies = np.flatnonzero(copied(values)) + 1
             if len(copies) >= LEAST_COPIES * len(values):
                 kept = values.copy()
                 kept[copies] = np.nan
@@ -77,13 +78,8 @@ def _saturated(name: str, unit: str, values: FloatArray) -> list[DataFault]:
     return found
 
 
-def _copied(values: FloatArray) -> BoolArray:
-    """Which rows, from the second on, equal the row before exactly, shape (n - 1,)."""
-    return np.asarray(np.all(values[1:] == values[:-1], axis=1))
-
-
 def _repeated(name: str, parts: Sequence[FloatArray]) -> list[DataFault]:
-    same = sum(int(np.count_nonzero(_copied(p))) for p in parts)
+    same = sum(int(np.count_nonzero(copied(p))) for p in parts)
     rows = sum(max(len(p) - 1, 0) for p in parts)
     share = same / max(rows, 1)
     if share < LEAST_COPIES:

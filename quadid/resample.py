@@ -237,6 +237,11 @@ def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
     return edges[::2], edges[1::2]
 
 
+def copied(values: FloatArray) -> BoolArray:
+    """Which rows of (n, columns), from the second on, equal the row before exactly, shape (n - 1,)."""
+    return np.asarray(np.all(values[1:] == values[:-1], axis=1))
+
+
 def fresh_rows(values: FloatArray) -> IndexArray:
     """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
 
@@ -246,7 +251,7 @@ def fresh_rows(values: FloatArray) -> IndexArray:
     """
     if len(values) < 20:
         return np.arange(len(values))
-    start = np.concatenate([[0], np.flatnonzero(np.any(np.diff(values, axis=0) != 0.0, axis=1)) + 1])
+    start = np.concatenate([[0], np.flatnonzero(~copied(values)) + 1])
     run = np.diff(np.append(start, len(values)))
     usual = median(run.astype(np.float64))
     if usual < 2.0 or len(start) < 0.02 * len(values):

@@ -6,7 +6,7 @@ import numpy as np
 
 from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import ChannelFacts, Check, CheckResult
-from quadid.resample import measured_period, true_runs
+from quadid.resample import copied, measured_period, true_runs
 from quadid.resampling_plan import holes, longest_step
 from quadid.saturation import at_limit
 from quadid.types import BoolArray, FloatArray
@@ -37,7 +37,7 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
     median = float(np.median(steps)) if len(steps) else np.nan
     long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
     usual = steps[~long]
-    same = np.all(np.diff(channel.values, axis=0) == 0.0, axis=1)
+    same = copied(channel.values)
     return ChannelFacts(
         name=channel.name,
         unit=CHANNELS[channel.name][1],

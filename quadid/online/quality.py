@@ -11,7 +11,7 @@ from quadid.inspection.findings import CheckResult
 from quadid.inspection.motor_checks import lagged_of, motor_order_check
 from quadid.model.thrust import ThrustModel
 from quadid.online.grid_buffer import Cut
-from quadid.resample import true_runs
+from quadid.resample import copied, true_runs
 from quadid.saturation import at_limit
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -69,16 +69,12 @@ def _broken(window: Window) -> str:
         if values is None:
             continue
         rows = values[np.isfinite(values).all(axis=1)]
-        if len(rows) > still and _longest_repeat(rows) > still:
+        first, end = true_runs(copied(rows))
+        if np.max(end - first, initial=0) > still:
             return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
         if name in ("gyro", "accel") and (ends := at_limit(rows)):
             return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
     return ""
-
-
-def _longest_repeat(rows: FloatArray) -> int:
-    first, end = true_runs(np.all(rows[1:] == rows[:-1], axis=1))
-    return int(np.max(end - first, initial=0))
 
 
 def mistake(cut: Cut, vehicle: Vehicle, known: bool) -> str:
