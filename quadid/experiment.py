@@ -17,6 +17,7 @@ from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
 from quadid.identify.excitation import excitation
 from quadid.identify.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
+from quadid.rotation import down
 from quadid.types import FloatArray
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def peaks(flight: Flight) -> Limits:
     q, gyro = flight.window.attitude, flight.window.gyro
     assert q is not None
     assert gyro is not None
-    tilt = np.arccos(np.clip(1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1.0, 1.0))
+    tilt = np.arccos(np.clip(down(q)[:, 2], -1.0, 1.0))
     return Limits(float(np.nanmax(tilt)), float(np.nanmax(np.abs(gyro))))
 
 

@@ -14,6 +14,7 @@ from quadid.baselines.subspace import fit_subspace
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, expected_squares, scored_problem
 from quadid.model.layout import Layout
+from quadid.rotation import conjugate, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -91,10 +92,8 @@ def _sigma(noise: NoiseModel) -> FloatArray:
 def _error(predicted: FloatArray, measured: FloatArray) -> FloatArray:
     """Predicted minus measured, attitude as a body rotation vector as in the physical model; shape (..., 9)."""
     error = predicted - measured
-    a, b = _quaternion(measured[..., 3:6]), _quaternion(predicted[..., 3:6])
-    scalar = np.sum(a * b, axis=-1, keepdims=True)
-    vector = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
-    error[..., 3:6] = 2.0 * np.where(scalar >= 0.0, vector, -vector)
+    turned = product(conjugate(_quaternion(measured[..., 3:6])), _quaternion(predicted[..., 3:6]))
+    error[..., 3:6] = 2.0 * np.where(turned[..., :1] >= 0.0, turned[..., 1:], -turned[..., 1:])
     return np.asarray(error)
 
 

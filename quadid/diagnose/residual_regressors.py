@@ -23,7 +23,7 @@ from quadid.diagnose.model import Model
 from quadid.identify.schur_complement import freed
 from quadid.identify.segment_jacobian import Columns
 from quadid.identify.shooting import Shooting
-from quadid.turning import product
+from quadid.rotation import product
 from quadid.types import FloatArray
 
 ERRORS = 2.5

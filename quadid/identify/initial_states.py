@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
-from quadid.turning import rotated
+from quadid.rotation import rotated
 from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Window

@@ -16,8 +16,7 @@ from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Linearised, Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.rotation import euler
-from quadid.turning import product
+from quadid.rotation import euler, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -13,7 +13,7 @@ from quadid.model.layout import Layout, residual_terms
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
-from quadid.turning import turn
+from quadid.rotation import turn
 from quadid.types import FloatArray, IndexArray, SingleArray
 from quadid.vehicle import GRAVITY, Vehicle
 

@@ -12,7 +12,7 @@ from quadid.inspection.airborne import Spans, within
 from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import linear, sample_period
 from quadid.resampling_plan import GAP
-from quadid.turning import conjugate, rotated, turn
+from quadid.rotation import conjugate, rotated, turn
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY
 from quadid.window import Channel, Recording

@@ -17,7 +17,7 @@ from quadid.model.rollout import Rollout
 from quadid.model.rollout import _threads as worker_threads
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
-from quadid.turning import down
+from quadid.rotation import down
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.online.rows import Rows
-from quadid.turning import down, integrated, turn
+from quadid.rotation import down, integrated, turn
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 

@@ -21,7 +21,7 @@ import numpy as np
 from quadid.model.layout import Layout
 from quadid.online.rows import Rows
 from quadid.resample import median
-from quadid.turning import conjugate, rotated
+from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 

@@ -22,7 +22,7 @@ from quadid.identify.shooting import Shooting
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
 from quadid.report.parts import axis, figure, level, trace
-from quadid.turning import conjugate, rotated
+from quadid.rotation import conjugate, rotated
 from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window, beginning

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.errors import LogError
 from quadid.resample import linear
-from quadid.turning import conjugate, rotated
+from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler

@@ -19,7 +19,7 @@ from quadid.online.flight_state import FlightState, Velocity, step_beside
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.resampler import Resampler
 from quadid.online.rows import Rows
-from quadid.turning import conjugate, rotated
+from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
