@@ -85,7 +85,7 @@ def identify_verdict(result: Json) -> Verdict:
     details = (*([rest] if before else []), *lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
-        found = "The parameters absorb missing effects: values and intervals are wrong, however narrow."
+        found = "Parameters absorb missing effects: values and intervals may be wrong, however narrow."
         details = (found, *_details(known, judged)[1:]) if known else details
     steps = _next_steps(result, open_ones, stuck, ratio)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)

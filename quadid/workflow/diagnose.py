@@ -105,6 +105,22 @@ class Diagnosed(Reported):
             *([parameter_table(parameters)] if parameters else []),
         ]
 
+    @property
+    def columns(self) -> list[str]:
+        """Those of `records`."""
+        return [
+            "effect",
+            "confident",
+            "parameter",
+            "unit",
+            "value",
+            "low",
+            "high",
+            "mse_before",
+            "mse_after",
+            "p_value",
+        ]
+
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a finding."""
         return [

@@ -56,6 +56,11 @@ class HealthOutcome(Reported):
         changes = [change_table(self.result["changes"])] if self.result["changes"] else []
         return [*changes, trim_table(self.result)]
 
+    @property
+    def columns(self) -> list[str]:
+        """Those of `records`."""
+        return ["effect", "confident", "parameter", "unit", "value", "low", "high", "p_value"]
+
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a change."""
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,7 +84,12 @@ class Outcome(ABC):
 
     def to_frame(self) -> pd.DataFrame:
         """The main table with plain numbers as a pandas data frame."""
-        return data_frame(self.records())
+        return data_frame(self.records(), self.columns)
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Columns of a main table that may have no row; else those of its rows."""
+        return ()
 
     @abstractmethod
     def records(self) -> list[dict[str, Any]]:
@@ -95,10 +101,10 @@ def json_text(result: Any) -> str:
     return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def data_frame(records: list[dict[str, Any]]) -> pd.DataFrame:
-    """Rows as a data frame; raises QuadidError where pandas is not installed."""
+def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:
+    """Rows as a data frame, without rows with these columns; raises QuadidError where pandas is not installed."""
     try:
         import pandas
     except ImportError as error:
         raise QuadidError("pandas is not installed", fix="pip install 'quadid[notebook]', or use .records()") from error
-    return pandas.DataFrame(records)
+    return pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))

@@ -15,8 +15,12 @@ from quadid_replay import write_csv
 
 import quadid
 from quadid.errors import QuadidError, VehicleError
+from quadid.health import assess, flight_trim
 from quadid.jsonable import jsonable
+from quadid.vehicle import Vehicle
+from quadid.workflow.health import HealthOutcome
 from quadid.workflow.logs import settled
+from studies.health.flights import hover
 from tests.cli.conftest import Cli, Flights, one_line
 
 WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "log", "manoeuvre_file")
@@ -202,3 +206,14 @@ def test_parts_of_a_log_warn_of_it_once(logs: dict[str, str], tmp_path: Path) ->
     torn = [text for text in given.warnings if "torn.csv" in text]
     assert torn
     assert len(torn) == len(set(torn))
+
+
+def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
+    trims = [flight_trim(hover(Vehicle.shipped("pelican_x"), seed=k), Vehicle.shipped("pelican_x")) for k in range(7)]
+    found = assess(trims[:1], trims[1:], Vehicle.shipped("pelican_x"))
+    none = HealthOutcome({"changes": []}, found, Vehicle.shipped("pelican_x"), ())
+    some = {"effect": "thrust_drop", "confident": True, "p_value": 0.1, "parameters": [
+        {"name": "fraction", "unit": "", "value": 0.1, "ci95": None}]}  # fmt: skip
+    one = HealthOutcome({"changes": [some]}, found, Vehicle.shipped("pelican_x"), ())
+    assert len(none.to_frame()) == 0
+    assert list(none.to_frame()) == list(one.to_frame())

@@ -78,7 +78,7 @@ class Facts:
         """Inertia tensor about the CG, FRD [kg m^2], shape (3, 3)."""
         out = np.diag([self.value("J_xx"), self.value("J_yy"), self.value("J_zz")])
         for (i, j), key in (((0, 1), "J_xy"), ((0, 2), "J_xz"), ((1, 2), "J_yz")):
-            out[i, j] = out[j, i] = -self.effect("product_of_inertia", key)
+            out[i, j] = out[j, i] = 0.0 - self.effect("product_of_inertia", key)
         return out
 
     @cached_property
