@@ -213,7 +213,7 @@ def _nothing_left(
         asked = " nor ".join(f"{a - zero:g} and {b - zero:g} s" for a, b in parts)
         return LogError(
             f"{recording.name}: nothing to use between {asked}",
-            f"{first:.1f} to {last:.1f} s after its first IMU sample", "see `quadid inspect` for the flying spans",
+            f"{first:z.1f} to {last:z.1f} s after its first IMU sample", "see `quadid inspect` for the flying spans",
         )  # fmt: skip
     return NotIdentifiableError(
         f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",
