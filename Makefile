@@ -166,7 +166,7 @@ chaos: $(MESSAGES) ## random faults at the running service for 20 min, into docs
 # Allows a reader less memory than coverage itself needs in it.
 TOO_NARROW := tests/replay/test_reading.py::test_more_memory_than_allowed_is_refused
 # What holds quadid/: the node's tests are waited for by clocks, and bring little to it.
-COVERED_BY := $(filter-out tests/node tests/ros tests/fuzz tests/browser tests/packaging tests/examples tests/docs,$(patsubst %/,%,$(wildcard tests/*/)))
+COVERED_BY := $(filter-out tests/node tests/ros tests/fuzz tests/browser tests/packaging tests/examples tests/documents,$(patsubst %/,%,$(wildcard tests/*/)))
 
 .PHONY: coverage mutation audit sbom pins
 coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into docs/results/coverage.md (10 min)

@@ -14,7 +14,7 @@ from quadid.report.figures import MODELS, MOST_LOGS, channel_figures, error_figu
 from quadid.report.identify_page import noise_rows, parameter_row
 from quadid.report.page import number
 from quadid.report.residual_maps import ResidualMap, map_figure
-from quadid.report.verdict import Level, Verdict, percent
+from quadid.report.verdict import NOISE_LEVEL, Level, Verdict, percent
 from quadid.types import Json
 
 HELD_OUT = "held-out blocks"
@@ -43,10 +43,11 @@ def diagnose_verdict(result: Json) -> Verdict:
     deciding = v.get("deciding")
     if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
         details = (*details, f"Over runs of {deciding['seconds']:g} s, which decided, it {_change(deciding, True)}.")
-    level = _LEVELS[verdict]
+    level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
     steps = _next_steps(result)
+    if level == "good" and (v.get("on") == HELD_OUT or left is None or left > NOISE_LEVEL):
+        level = "fair"
     if v.get("on") == HELD_OUT:
-        level = "fair" if level == "good" else level
         details = (*details, "Not validated: no unseen flight was given.")
         steps = ("To validate it, add another flight with --validate.", *steps)
     return Verdict(level, headline, details, steps)

@@ -40,18 +40,18 @@ class UnprovenError(QuadidError):
 
 
 def export(
-    vehicle: str | Path | Vehicle, form: str = "yaml", *, source: str | None = None, anyway: bool = False
+    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, anyway: bool = False
 ) -> Exported:
     """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
-        form: one of `quadid.report.programs.FORMATS`.
+        format: one of `quadid.report.programs.FORMATS`.
         source: where the values come from, for the file; default the vehicle's file or name.
         anyway: write the values of a fit that is not proven; the file says so at its top.
 
     Raises:
-        ParameterError: an unknown form.
+        ParameterError: an unknown format.
         UnprovenError: the values are those of a fit that nothing proves.
         VehicleError: no such vehicle.
     """
@@ -64,15 +64,15 @@ def export(
             f"{origin} is not proven: {described.proof.lacking}", "values that predict an unseen flight",
             "`quadid identify LOG --validate OTHER`, or `quadid diagnose`; insist with --anyway",
         )  # fmt: skip
-    texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, form, origin).items()}
+    texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, format, origin).items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
     warnings = (
         [f"not from data, but as the vehicle file has them, without a sigma: {', '.join(guessed)}"] if guessed else []
     )
-    if form in ("px4", "ardupilot") and described.command.max_speed is None:
+    if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
     result = {
-        "schema": "quadid.export/1", "vehicle": described.name, "format": form, "files": [], "warnings": warnings,
+        "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
     }  # fmt: skip
     return Exported(result, texts)
 

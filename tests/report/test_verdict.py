@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from quadid.effects import EFFECTS
-from quadid.report.diagnose_page import diagnose_verdict
+from quadid.report.diagnose_page import HELD_OUT, diagnose_verdict
 from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason, score_verdict
 
 
@@ -147,7 +147,7 @@ def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mend
     ]
     validation = {"mse_nominal": 9.0, "mse_extended": 1.0}
     result = {
-        "verdict": "explained", "statement": "These causes explain all of the model error.", "findings": findings,
+        "verdict": "explained", "statement": "These causes explain the model error.", "findings": findings,
         "validation": validation, "unexplained": {},
     }  # fmt: skip
     verdict = diagnose_verdict(result)
@@ -155,3 +155,20 @@ def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mend
     assert [step.split(":")[0] for step in verdict.next_steps if ":" in step] == ["Parasitic drag"]
     alone = diagnose_verdict({**result, "findings": findings[1:2]})
     assert alone.headline.startswith("Found: no larger than on most vehicles: cg offset. ")
+
+
+@pytest.mark.parametrize(
+    ("validation", "level"),
+    [
+        ({"mse_extended": 1.1}, "good"), ({"mse_extended": 2.9}, "fair"), ({"mse_extended": None}, "fair"),
+        ({"mse_extended": 2.9, "mse_extended_refitted": 1.1}, "good"), ({"mse_extended": 1.1, "on": HELD_OUT}, "fair"),
+    ],
+)  # fmt: skip
+def test_a_diagnosis_is_green_where_an_unseen_flight_is_predicted_down_to_the_noise(
+    validation: dict[str, Any], level: str
+) -> None:
+    result = {
+        "verdict": "explained", "statement": "These causes explain the model error.", "findings": [],
+        "validation": {"mse_nominal": 400.0, **validation}, "unexplained": {},
+    }  # fmt: skip
+    assert diagnose_verdict(result).level == level
