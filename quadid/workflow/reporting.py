@@ -108,15 +108,11 @@ def provenance(logs: Sequence[Log], command: str = LIBRARY) -> list[dict[str, st
     """Files with hashes, versions, command line and time."""
     from quadid import __version__
 
-    rows = [{"name": "command", "value": command}]
-    rows.append({"name": "made", "value": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")})
     versions = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
-    rows.append(
-        {
-            "name": "versions",
-            "value": f"quadid {__version__}, Python {platform.python_version()}, " + ", ".join(versions),
-        }
-    )
-    for log in logs:
-        rows.append({"name": log.recording.name, "value": f"{log.path}  sha256 {log.recording.sha256 or 'unknown'}"})
-    return rows
+    rows = [
+        ("command", command),
+        ("made", f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S UTC}"),
+        ("versions", ", ".join([f"quadid {__version__}", f"Python {platform.python_version()}", *versions])),
+        *((log.name, f"{log.path}  sha256 {log.recording.sha256 or 'unknown'}") for log in logs),
+    ]
+    return [{"name": name, "value": value} for name, value in rows]

@@ -128,13 +128,11 @@ def parse_effects(
 def _numbers(text: str, rest: str) -> dict[str, float]:
     values: dict[str, float] = {}
     for part in filter(None, rest.split(",")):
-        key, sign, number = part.partition("=")
+        key, _, number = part.partition("=")
         try:
             values[key.strip()] = float(number)
         except ValueError as error:
             raise ParameterError(f"cannot read '{part}' in '{text}'", "NAME:KEY=NUMBER,KEY=NUMBER") from error
-        if not sign:
-            raise ParameterError(f"'{part}' in '{text}' has no value", "NAME:KEY=NUMBER,KEY=NUMBER")
     return values
 
 
@@ -165,11 +163,11 @@ def read_manoeuvre(path: Path) -> list[Segment]:
 def summary(flight: Flight, seed: int, profile: str) -> dict[str, Any]:
     """What was flown, as JSON: the truth, the effects, the stabiliser's gains and how much the vehicle moved."""
     from quadid.parameters import NOMINAL_UNITS
+    from quadid.rotation import down
 
     truth = flight.truth
     parameters = truth.parameters.as_dict()
-    w, x, y, z = truth.quaternion.T
-    down = 1.0 - 2.0 * (x**2 + y**2)
+    upright = float(down(truth.quaternion)[:, 2].min())
     squares = (flight.window.rotor_speed**2).sum(axis=1)
     return {
         "schema": "quadid.simulate/1",
@@ -186,7 +184,7 @@ def summary(flight: Flight, seed: int, profile: str) -> dict[str, Any]:
         "stabiliser": {"gains": dict(flight.gains)},
         "excitation": {
             "rates_rms": truth.rates.std(axis=0),
-            "tilt_max": float(math.acos(max(-1.0, min(1.0, float(down.min()))))),
+            "tilt_max": math.acos(max(-1.0, min(1.0, upright))),
             "thrust_variation": float(squares.std() / squares.mean()),
         },
     }
