@@ -117,10 +117,6 @@ class Estimator:
         """A nominal parameter, the best at hand."""
         return float(self.theta[NOMINAL_NAMES.index(name)])
 
-    @property
-    def _stated(self) -> dict[str, tuple[float, float]]:
-        return {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
-
     def start_from(self, known: OnlineSet) -> None:
         """Starts the search from a restored set instead of the vehicle file's guess."""
         for p in known.parameters:
@@ -162,13 +158,9 @@ class Estimator:
         assert fused is not None
         best = reply.theta if reply.excited or not self.learned else self.theta
         self.theta, self.learned = self._free.placed(best, fused.z), True
-        self.theta[B] = self._tangent(self.theta)
-
-    def _tangent(self, theta: FloatArray) -> float:
-        """The b of the thrust curve in `theta`, whose b is that at hover unless the vehicle file knows the curve."""
-        if "thrust_curve" in self.vehicle.effects:
-            return float(theta[B])
-        return ThrustModel(self._layout, theta).tangent(float(theta[B]), self.vehicle.mass * GRAVITY)
+        if "thrust_curve" not in self.vehicle.effects:  # then windows tell the b at hover of a curve they fit along
+            weight = self.vehicle.mass * GRAVITY
+            self.theta[B] = ThrustModel(self._layout, self.theta).tangent(self.value("b"), weight)
 
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
@@ -240,10 +232,11 @@ class Estimator:
         agreeing, odd = self.fusion.agreement(most)
         disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
         missed = () if reply.between_rows is None else zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)
+        stated = {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
         return Case(
             parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
             self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
-            self.fusion.counted - sets.seen, stated=self._stated, walked=self._walked(most), between_rows=dict(missed),
+            self.fusion.counted - sets.seen, stated=stated, walked=self._walked(most), between_rows=dict(missed),
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:

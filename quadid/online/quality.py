@@ -12,6 +12,7 @@ from quadid.inspection.motor_checks import lagged_of, motor_order_check
 from quadid.model.thrust import ThrustModel
 from quadid.online.grid_buffer import Cut
 from quadid.resample import copied, true_runs
+from quadid.rotation import down
 from quadid.saturation import at_limit
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -132,10 +133,8 @@ def _not_flying(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> str:
     A flying vehicle is upright, and its specific force follows its thrust; on the ground the floor carries the rest and
     the accelerometer reads gravity whatever the rotors do.
     """
-    if window.attitude is not None and np.isfinite(window.attitude).any():
-        x, y = window.attitude[:, 1], window.attitude[:, 2]
-        if float(np.nanmin(1.0 - 2.0 * (x * x + y * y))) < TUMBLED:
-            return "tumbled, or lying on its side"
+    if window.attitude is not None and np.any(down(window.attitude)[:, 2] < TUMBLED):
+        return "tumbled, or lying on its side"
     if window.accel is None or not np.isfinite(window.accel).any():
         return ""
     if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:

@@ -11,6 +11,7 @@ from quadid.online.background_diagnosis import BackgroundDiagnosis
 from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.fusion import WindowEstimate
 from quadid.online.gate import GateSettings, decide
 from quadid.online.outbox import Outbox
 from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
@@ -91,7 +92,7 @@ class Supervisor:
         self._disagrees_since = None
         self._estimator.take(request, reply)
         yield
-        if not self._rolled_back(reply):
+        if not self._rolled_back(reply.estimate):
             self._judge(request, reply)
 
     def _join(self, request: FitRequest, reply: FitReply) -> None:
@@ -116,10 +117,10 @@ class Supervisor:
         self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(request.start, "the vehicle has changed")
 
-    def _rolled_back(self, reply: FitReply) -> bool:
+    def _rolled_back(self, estimate: WindowEstimate) -> bool:
         """Watches the set in force; rolls it back when its predecessor predicts new windows better."""
-        estimate, active_set = reply.estimate, self._active_set
-        if estimate is None or active_set.predecessor is None:
+        active_set = self._active_set
+        if active_set.predecessor is None:
             return False
         loss = self._estimator.deviance(estimate, active_set.in_force) - self._estimator.deviance(
             estimate, active_set.predecessor
