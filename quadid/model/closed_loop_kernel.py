@@ -124,7 +124,7 @@ def _fly(
             else:
                 step_core(dt, s)
             if need.ahrs:
-                step_tilt_error(dt, s)
+                step_tilt_error(s)
                 tilt_attitude(s)
             _keep_half(2 * sub, substeps, F1_X, force, s)
             _keep_half(2 * sub + 1, substeps, F2_X, force, s)

@@ -145,7 +145,7 @@ def _march(
                 use_filter(s)
             if scored:
                 if need.ahrs:
-                    step_tilt_error(dt, s)
+                    step_tilt_error(s)
                 if need.att_delay:
                     delay_attitude(i, dt, past, s)
                 if need.ahrs:

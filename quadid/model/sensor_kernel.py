@@ -143,7 +143,7 @@ def _turn(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**jit)
-def step_tilt_error(dt: float, s: FloatArray) -> None:
+def step_tilt_error(s: FloatArray) -> None:
     """Advances the AHRS tilt error over a step: it turns towards the accelerometer's level with gain k.
 
     The filter adds k n x d to its body rate, n being down as the accelerometer sees it and d as the filter does
