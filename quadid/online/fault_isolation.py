@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -114,7 +114,7 @@ def _causes(request: ChangeRequest) -> list[_Cause]:
         _Cause("mass_change", ("mass_change.fraction",), (float(np.clip(np.expm1(-size), -0.5, 0.8)),)),
         _Cause("thrust_drop", ("thrust_drop.fraction",), (float(np.clip(-np.expm1(size), -0.5, 0.5)),)),
         _Cause("cg_offset", ("cg_offset.x", "cg_offset.y"), (0.0, 0.0)),
-        _Cause("mass_change", ("mass_change.fraction", "cg_offset.x", "cg_offset.y"), (0.0, 0.0, 0.0), rotor=-1),
+        _Cause("mass_change", ("mass_change.fraction", "cg_offset.x", "cg_offset.y"), (0.0, 0.0, 0.0)),
         *(_Cause("weak_rotor", (f"weak_rotor.loss_{i + 1}",), (0.05,), i + 1) for i in range(rotors)),
     ]
 
@@ -143,7 +143,7 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: Init
         loaded = [NOMINAL_NAMES.index(n) for n in ("J_xx", "J_yy", "J_zz")]
         known[loaded] = np.hypot(request.z_sigma[loaded], LOADED)
     width = EFFECT_SIGMA / free.scale[len(NOMINAL_NAMES) :]
-    if cause.effect == "cg_offset" or cause.rotor < 0:
+    if "cg_offset.x" in cause.names:
         width[-2:] = 20.0
     prior = Prior(
         np.concatenate([request.theta[: len(NOMINAL_NAMES)], np.zeros(len(place))]), np.concatenate([known, width])
@@ -166,10 +166,16 @@ def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]
     values, sigma, units = _numbers(request, best)
     p_value = min(1.0, survival(drop, len(best.cause.names)) * len(outcomes))
     alternatives = tuple(Alternative(name, r.mse) for name, r in rivals.items())
-    finding = OnlineFinding(
-        best.cause.effect, values, sigma, units, nothing.mse, best.mse, p_value, alternatives, "", lead > CLEAR
-    )  # fmt: skip
-    return replace(finding, evidence=_evidence(request, finding))
+    seen = request.change
+    text = (
+        f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
+        f"residual {nothing.mse:.2f} falls to {best.mse:.2f} with {best.cause.effect}"
+    )
+    if rivals:
+        text += f", to {min(r.mse for r in rivals.values()):.2f} with the next look-alike"
+    return OnlineFinding(
+        best.cause.effect, values, sigma, units, nothing.mse, best.mse, p_value, alternatives, text, lead > CLEAR
+    )
 
 
 def _numbers(request: ChangeRequest, best: _Outcome) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
@@ -185,14 +191,3 @@ def _numbers(request: ChangeRequest, best: _Outcome) -> tuple[dict[str, float], 
     place = ix.MASS_FRACTION if cause.effect == "mass_change" else ix.DROP_FRACTION
     values = {"time": request.time, "fraction": float(best.theta[place])}
     return values, {"time": 0.05, "fraction": float(best.sigma[0])}, {"time": "s", "fraction": ""}
-
-
-def _evidence(request: ChangeRequest, finding: OnlineFinding) -> str:
-    seen = request.change
-    text = (
-        f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
-        f"residual {finding.mse_before:.2f} falls to {finding.mse_after:.2f} with {finding.effect}"
-    )
-    if finding.alternatives:
-        text += f", to {min(a.mse_after for a in finding.alternatives):.2f} with the next look-alike"
-    return text
