@@ -134,10 +134,13 @@ bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (h
 # One process a group of files, in the order of tests/conftest.py: long ones first.
 XDIST := --dist loadgroup --no-loadscope-reorder
 # Four workers for two cores: tests of the service wait for processes and clocks. Kernels are compiled once before.
-.PHONY: test test-browser test-slow lint typecheck format
-test: $(MESSAGES) lint typecheck ## lint, types, and all tests but the slow and the browser's
+.PHONY: test pytest test-browser test-slow lint typecheck format
+test: $(MESSAGES) ## lint, types, and all tests but the slow and the browser's
+	+$(MAKE) --no-print-directory -j 3 lint typecheck pytest
+
+pytest: $(MESSAGES)
 	$(BIN)/quadid warmup
-	$(BIN)/pytest -n 4 $(XDIST) -m "not browser and not slow"
+	MAKEFLAGS= $(BIN)/pytest -n 4 $(XDIST) -m "not browser and not slow"
 
 test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
 	$(BIN)/pytest -m browser tests/browser
