@@ -76,13 +76,13 @@ def _parameters(singles: Sequence[Graded]) -> str:
     ]
     for effect, values in errors.items():
         held = inside.get(effect)
-        if max(values) < NEAR and held and held.k == held.n:
+        if max(values) < NEAR and held and held.k + 1 >= held.n:
             continue
         rows.append(f"| {effect} | {_sizes(values)} | {_count(held) if held else '–'} |")
     everything = [e for v in errors.values() for e in v]
     total = summary.Share(sum(s.k for s in inside.values()), sum(s.n for s in inside.values()))
     rows.append(f"| **all** | {_sizes(everything)} | {total} |")
-    head = f"Effects always found within {NEAR:.0%} and inside their intervals are left out."
+    head = f"Effects always found within {NEAR:.0%}, at most one number outside its interval, are left out."
     return f"## Parameters of the effects\n\n{head}\n\n" + "\n".join(rows) + "\n"
 
 

@@ -163,6 +163,5 @@ def text(judged: Sequence[Judged]) -> str:
 _WHY = """
 
 Flights outside of what one healthy flight in a hundred shows, of those whose log has the channel; none by {}.
-Propellers with unlike blades shake, others no more than healthy ones, and every rotor of an X frame shakes roll and
-pitch alike. As evidence of a propeller, shaking would mend {} of the wrong answers. Of the {} large cuts that fly like
-healthy flights, {} are outside in any row. A weight's inertia is lost in the spread of acceleration per command."""
+Propellers with unlike blades shake, others no more than healthy ones; as evidence of a propeller this would mend {} of
+the wrong answers. Of the {} large cuts that fly like healthy flights, {} are outside in any row."""

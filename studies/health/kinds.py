@@ -178,6 +178,5 @@ def _farthest(kinds: Kinds) -> str:
 _WHY = """At best: a test that knows spread and sizes, to which weights are as likely as cuts. Who always says
 propeller is right in {always} of {count}.
 
-{far}: mass alone does not. A body in the slipstream takes thrust by its download and reaction torque from the swirl;
-momentum theory puts the yaw that it adds per lost thrust on either side of a cut's (`studies/health/kinds.py`). As a
-further explanation this names no more of them."""
+{far}: mass alone does not. The slipstream on a body takes reaction torque too, on either side of a
+cut's (`studies/health/kinds.py`); as a further explanation this names no more of them."""
