@@ -93,7 +93,7 @@ class Rollout:
         self.channels = channels_of(window)
         self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)
-        slope = np.empty((0, rotors)) if window.rotor_slope is None else window.rotor_slope
+        slope = window.rotor_speed[:0] if window.rotor_slope is None else window.rotor_slope
         self.drive = Drive(
             window.rotor_speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
             window.dt,
@@ -272,6 +272,7 @@ class Rollout:
         self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, scale: FloatArray,
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
+        x0 = x0 if x0.flags.writeable else x0.copy()  # of read-only states numba would compile the kernel once more
         roll_segments(
             self.drive, self._terms, self.flight, lanes.table, self.measured, scale, lanes.memory, segments.starts,
             n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length, basis is not None,

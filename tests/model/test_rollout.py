@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
+import numba as nb
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from quadid.model import layout as ix
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
+from quadid.model.rollout_kernel import roll_segments
 from quadid.model.segments import Segments
 from quadid.model.shared_rollout import shared_rollout
 from quadid.model.simd import LANES
@@ -199,3 +202,19 @@ def test_a_rollout_is_shared_while_somebody_uses_it() -> None:
     assert shared_rollout(window, VEHICLE) is one
     assert shared_rollout(window, VEHICLE.model_copy()) is not one
     assert shared_rollout(noisy_window(), VEHICLE) is not one
+
+
+def test_speeds_that_run_on_and_read_only_states_need_no_kernel_of_their_own() -> None:
+    """numba compiles one for every type, half a minute each, that `quadid warmup` does not know of."""
+    window = noisy_window(60)
+    running = replace(window, rotor_slope=np.zeros(window.rotor_speed.shape), sampling="held")
+    kinds = [nb.typeof(Rollout(w, VEHICLE).drive) for w in (running, window)]  # type: ignore[no-untyped-call]
+    assert kinds[0] == kinds[1]
+    rollout, segments = Rollout(window, VEHICLE), Segments.cut(60, 20)
+    x0 = rollout.initial_states(segments)
+    theta = Layout(VEHICLE).initial(VEHICLE)[None]
+    rollout.roll(segments, theta, x0)
+    known = len(roll_segments.signatures)
+    x0.setflags(write=False)
+    rollout.roll(segments, theta, x0)
+    assert len(roll_segments.signatures) == known
