@@ -93,9 +93,11 @@ class Rollout:
         self.channels = channels_of(window)
         self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)
-        slope = window.rotor_speed[:0] if window.rotor_slope is None else window.rotor_slope
+        speed = window.rotor_speed.view()
+        slope = speed[:0] if window.rotor_slope is None else window.rotor_slope.view()
+        speed.flags.writeable = slope.flags.writeable = False  # those of a window that was pickled can be written to
         self.drive = Drive(
-            window.rotor_speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
+            speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
             window.dt,
         )  # fmt: skip
         self.flight = Flight(self.mass, self.reach, hub, plan, window.t0, window.dt, *window.log_span)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -204,12 +205,13 @@ def test_a_rollout_is_shared_while_somebody_uses_it() -> None:
     assert shared_rollout(noisy_window(), VEHICLE) is not one
 
 
-def test_speeds_that_run_on_and_read_only_states_need_no_kernel_of_their_own() -> None:
+def test_running_speeds_pickled_windows_and_read_only_states_need_no_kernel_of_their_own() -> None:
     """numba compiles one for every type, half a minute each, that `quadid warmup` does not know of."""
     window = noisy_window(60)
     running = replace(window, rotor_slope=np.zeros(window.rotor_speed.shape), sampling="held")
-    kinds = [nb.typeof(Rollout(w, VEHICLE).drive) for w in (running, window)]  # type: ignore[no-untyped-call]
-    assert kinds[0] == kinds[1]
+    windows = (window, running, pickle.loads(pickle.dumps(window)))
+    kinds = {nb.typeof(Rollout(w, VEHICLE).drive) for w in windows}  # type: ignore[no-untyped-call]
+    assert len(kinds) == 1
     rollout, segments = Rollout(window, VEHICLE), Segments.cut(60, 20)
     x0 = rollout.initial_states(segments)
     theta = Layout(VEHICLE).initial(VEHICLE)[None]
