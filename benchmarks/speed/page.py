@@ -13,8 +13,7 @@ SHOWN = ("nominal, cost", "motor lag, one a particle, cost", "rotor drag, cost",
 """Cases of the kernel in the table."""
 INTRODUCTION = (
     "Medians of interleaved runs; compare ratios, since other programs share the machine. In brackets: processor time "
-    "of all threads and child processes. `speed.json` has every value. Limits: the arithmetic peak, both cores busy, "
-    "least squares alone, disk and SHA-256, Python's start."
+    "of all threads and child processes. `speed.json` has every value."
 )
 
 
