@@ -15,7 +15,7 @@ from quadid.flight.outside_log import LogRows
 from quadid.flight.sensors import SensorNoise
 from quadid.flight.setup import Effects, Setup
 from quadid.flight.truth import TruthParameters
-from quadid.rotation import continuous_sign, exponential, product
+from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Window
@@ -139,7 +139,7 @@ def _sensor_rows(flown: Flown, rotor: FloatArray) -> LogRows:
     hover = setup.air.hover_sum / rotor.shape[1]
     gyro = sensors.read_gyro(track, plan, setup.on_board, setup.imu_cutoff, steps)
     accel = sensors.read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
-    attitude = product(lagged, exponential(flown.tilt_noise[at]))
+    attitude = sensors.quaternion_multiply(lagged, sensors.quaternion_exp(flown.tilt_noise[at]))
     rows = LogRows(
         gyro=gyro + flown.gyro_noise[at],
         accel=accel + flown.noise("accel", flown.sensor.accel, 3),
