@@ -40,11 +40,13 @@ class ThrustModel:
         """Sum over the rotors [N], shape (n,), of speeds [rad/s], shape (n, rotors)."""
         return np.asarray(self.single(rotor_speed).sum(axis=1))
 
+    def hover_speed(self, weight: float) -> float:
+        """Speed [rad/s] at which the rotors, all alike, carry `weight` [N]."""
+        return self._dead_speed + math.sqrt(max(self._each(weight) - self._offset, 1e-9) / self._b)
+
     def secant(self, weight: float) -> float:
         """Share of `b` that a model without the curve has: exact where the rotors carry `weight` [N]."""
-        each = self._each(weight)
-        hover = self._dead_speed + math.sqrt(max(each - self._offset, 1e-9) / self._b)
-        return each / (self._b * hover**2)
+        return self._each(weight) / (self._b * self.hover_speed(weight) ** 2)
 
     def tangent(self, secant: float, weight: float) -> float:
         """The `b` of this curve whose b at hover is `secant` [N s^2/rad^2]."""

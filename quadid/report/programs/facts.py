@@ -149,20 +149,15 @@ class Facts:
         """Share of the full thrust that hovers, where the full rotor speed is known."""
         return None if self.full_thrust is None else self.vehicle.mass * GRAVITY / float(self.full_thrust.sum())
 
-    @cached_property
+    @property
     def hover_command(self) -> float | None:
         """Share of full command that hovers, all rotors alike, where the full rotor speed is known.
 
         Of a flight controller that undoes the curve of its motors (kind ``thrust``) that is the share of thrust.
         """
-        if self.max_speed is None or self.hover_thrust is None or self.vehicle.command.kind == "thrust":
+        if self.max_speed is None or self.vehicle.command.kind == "thrust":
             return self.hover_thrust
-        weight, model = self.vehicle.mass * GRAVITY, ThrustModel.stated(self.vehicle)
-        low, high = 0.0, self.max_speed * max(1.0, self.hover_thrust)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if float(model.at_speed(middle).sum()) > weight else (middle, high)
-        return high / self.max_speed
+        return ThrustModel.stated(self.vehicle).hover_speed(self.vehicle.mass * GRAVITY) / self.max_speed
 
     @property
     def unproven(self) -> str:
