@@ -64,10 +64,9 @@ def turn(before: FloatArray, after: FloatArray) -> FloatArray:
 
     Both are unit quaternions, body to world, shape (n, 4).
     """
-    w, v = before[:, :1], before[:, 1:]
-    scalar = np.sum(after * before, axis=1)
-    vector = w * after[:, 1:] - after[:, :1] * v - np.cross(v, after[:, 1:])
-    vector *= np.where(scalar < 0.0, -1.0, 1.0)[:, None]
+    between = product(conjugate(before), after)
+    scalar = between[:, 0]
+    vector = between[:, 1:] * np.where(scalar < 0.0, -1.0, 1.0)[:, None]
     sine = np.linalg.norm(vector, axis=1)
     angle = 2.0 * np.arctan2(sine, np.abs(scalar))
     return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)[:, None])
