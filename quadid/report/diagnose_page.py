@@ -37,7 +37,8 @@ def diagnose_verdict(result: Json) -> Verdict:
         found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []
         headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
-    where = "held-out blocks of the same flight" if v.get("on") == HELD_OUT else "unseen flights"
+    held_out = v.get("on") == HELD_OUT
+    where = "held-out blocks of the same flight" if held_out else "unseen flights"
     change = _change(v, bool(result["findings"]))
     details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
     deciding = v.get("deciding")
@@ -45,9 +46,9 @@ def diagnose_verdict(result: Json) -> Verdict:
         details = (*details, f"Over runs of {deciding['seconds']:g} s, which decided, it {_change(deciding, True)}.")
     level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
     steps = _next_steps(result)
-    if level == "good" and (v.get("on") == HELD_OUT or left is None or left > NOISE_LEVEL):
+    if level == "good" and (held_out or left is None or left > NOISE_LEVEL):
         level = "fair"
-    if v.get("on") == HELD_OUT:
+    if held_out:
         details = (*details, "Not validated: no unseen flight was given.")
         steps = ("To validate it, add another flight with --validate.", *steps)
     return Verdict(level, headline, details, steps)

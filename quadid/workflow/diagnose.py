@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from quadid.workflow.files import file_name
 from quadid.workflow.identify import origin_remark, out_of_reach, proven
 from quadid.workflow.logs import Given, settled
+from quadid.workflow.outcome import NUMBER_COLUMNS, number_rows
 from quadid.workflow.progress import Advance, silent
 from quadid.workflow.reporting import LIBRARY, Reported, provenance, quality
 from quadid.workflow.searching import OPTIMIZERS, search
@@ -106,31 +107,16 @@ class Diagnosed(Reported):
         ]
 
     @property
-    def columns(self) -> list[str]:
+    def columns(self) -> tuple[str, ...]:
         """Those of `records`."""
-        return [
-            "effect",
-            "confident",
-            "parameter",
-            "unit",
-            "value",
-            "low",
-            "high",
-            "mse_before",
-            "mse_after",
-            "p_value",
-        ]
+        return (*NUMBER_COLUMNS, "mse_before", "mse_after", "p_value")
 
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a finding."""
         return [
-            {"effect": f["effect"], "confident": f["confident"], "parameter": p["name"], "unit": p["unit"],
-             "value": p["value"], "low": low, "high": high, "mse_before": f["gain"]["mse_before"],
-             "mse_after": f["gain"]["mse_after"], "p_value": f["p_value"]}
-            for f in self.result["findings"]
-            for p in f["parameters"]
-            for low, high in [p["ci95"] or (None, None)]
-        ]  # fmt: skip
+            dict(zip(self.columns, (*row, f["gain"]["mse_before"], f["gain"]["mse_after"], f["p_value"]), strict=True))
+            for f, row in number_rows(self.result["findings"])
+        ]
 
     def plot(self, log: int = -1, group: str = "rates") -> Any:
         """Measured and simulated outputs of one log, without and with the findings, as a plotly figure."""

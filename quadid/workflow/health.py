@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.workflow.loading import Log, check_conventions, open_recording
 from quadid.workflow.logs import Flight, Given, listed, vehicle_of
+from quadid.workflow.outcome import NUMBER_COLUMNS, number_rows
 from quadid.workflow.parts import parse_cut
 from quadid.workflow.reporting import LIBRARY, Reported, provenance
 
@@ -57,19 +58,15 @@ class HealthOutcome(Reported):
         return [*changes, trim_table(self.result)]
 
     @property
-    def columns(self) -> list[str]:
+    def columns(self) -> tuple[str, ...]:
         """Those of `records`."""
-        return ["effect", "confident", "parameter", "unit", "value", "low", "high", "p_value"]
+        return (*NUMBER_COLUMNS, "p_value")
 
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a change."""
         return [
-            {"effect": c["effect"], "confident": c["confident"], "parameter": p["name"], "unit": p["unit"],
-             "value": p["value"], "low": low, "high": high, "p_value": c["p_value"]}
-            for c in self.result["changes"]
-            for p in c["parameters"]
-            for low, high in [p["ci95"] or (None, None)]
-        ]  # fmt: skip
+            dict(zip(self.columns, (*row, c["p_value"]), strict=True)) for c, row in number_rows(self.result["changes"])
+        ]
 
     def page(self, command: str = LIBRARY) -> str:
         """The page: what changed, a picture of the airframe, how far each flight is from healthy ones."""

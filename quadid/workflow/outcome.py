@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
 from quadid.jsonable import jsonable
+from quadid.types import Json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,6 +95,18 @@ class Outcome(ABC):
     @abstractmethod
     def records(self) -> list[dict[str, Any]]:
         """Rows of the main table with plain numbers."""
+
+
+NUMBER_COLUMNS = ("effect", "confident", "parameter", "unit", "value", "low", "high")
+"""Columns of a table with one row a number of a finding."""
+
+
+def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]:
+    """Each finding with each of its numbers, as `NUMBER_COLUMNS`."""
+    for one in found:
+        for p in one["parameters"]:
+            low, high = p["ci95"] or (None, None)
+            yield one, (one["effect"], one["confident"], p["name"], p["unit"], p["value"], low, high)
 
 
 def json_text(result: Any) -> str:
