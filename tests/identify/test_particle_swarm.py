@@ -53,6 +53,13 @@ def test_sphere_converges_from_every_seed() -> None:
         np.testing.assert_allclose(swarm.best, 0.0, atol=1e-3)
 
 
+def test_rastrigin_finds_the_global_minimum_in_most_runs() -> None:
+    options = SwarmOptions(iterations=500, patience=None)
+    costs = [run(Swarm(*box(4, 5.12), 80, seed, options), rastrigin).best_cost for seed in range(10)]
+    assert sum(cost < 1e-6 for cost in costs) >= 8
+    assert max(costs) < 2.0  # one component in the neighbouring basin costs 0.995
+
+
 def test_rosenbrock_in_two_dimensions_reaches_the_optimum_from_every_seed() -> None:
     options = SwarmOptions(iterations=1000, patience=None)
     for seed in range(10):
