@@ -17,11 +17,11 @@ from typing import NamedTuple
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from quadid_paper.black_box import BlackBox, score_black_box
+from quadid_paper.quadrotor_io import FEEDTHROUGH, quadrotor_io
+from quadid_paper.subspace import METHODS, Loop, fit_subspace
 from scipy.linalg import expm
 
-from quadid.baselines.black_box import BlackBox, score_black_box
-from quadid.baselines.quadrotor_io import FEEDTHROUGH, quadrotor_io
-from quadid.baselines.subspace import METHODS, Loop, fit_subspace
 from quadid.flight import fly
 from quadid.identify.noise_model import NoiseModel
 from quadid.types import ComplexArray, FloatArray

@@ -12,12 +12,12 @@ import numpy as np
 from benchmarks.kernel import numpy_moments, numpy_step
 from benchmarks.speed.flights import flight
 from benchmarks.speed.timing import interleaved
-from quadid.baselines.optimisers import minimise
 from quadid.identify.fit import SWARM_SECONDS
 from quadid.identify.global_search import SWARM_SEGMENTS, projected_cost
 from quadid.identify.particle_swarm import Swarm, SwarmOptions
 from quadid.identify.shooting import Shooting
 from quadid.identify.shooting_objective import BoxProblem
+from quadid.optimisers.minimise import minimise
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

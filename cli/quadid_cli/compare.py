@@ -44,7 +44,8 @@ def compare(
     out: options.OutFolder = Path(),
 ) -> None:
     """Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side."""
-    from quadid.workflow import compare as work
+    from quadid_paper import compare as work
+
     from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
 

@@ -119,5 +119,5 @@ def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd
     try:
         import pandas
     except ImportError as error:
-        raise QuadidError("pandas is not installed", fix="pip install 'quadid[notebook]', or use .records()") from error
+        raise QuadidError("pandas is not installed", fix="pip install pandas, or use .records()") from error
     return pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))

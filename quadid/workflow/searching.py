@@ -41,9 +41,9 @@ def search(
 
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
-    from quadid.baselines.optimisers import minimise
     from quadid.identify.answer import final_answer
     from quadid.identify.shooting_objective import BoxProblem
+    from quadid.optimisers.minimise import minimise
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
     advance(name, 0.0)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.baselines.optimisers import NAMES, minimise
 from quadid.flight import draw_truth, fly
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.model.rollout import NUMBERS, Rollout
 from quadid.model.segments import Segments
+from quadid.optimisers.minimise import NAMES, minimise
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from quadid_paper.comparison import METHODS
 
-from quadid.baselines.comparison import METHODS
 from tests.cli.conftest import Cli, Flights, one_line, table, write_table
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_cli.reproduce import summary, write
+from quadid_cli.reproduce import write
+from quadid_paper.protocol import Plan, reproduce
+from quadid_paper.result import summary
+from quadid_paper.tables import PAPER_GAIN, PAPER_MSE
 
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.paper_tables import PAPER_GAIN, PAPER_MSE
-from quadid.workflow.reproduction import Plan, reproduce
 
 pytestmark = pytest.mark.timeout(900)
 

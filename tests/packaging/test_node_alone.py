@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "nfoursid", "dask", "pyarrow"}
+LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "dask", "pandas", "pyarrow"}
 """Plots, reports, other optimisers, many logs at once."""
-IMPORTED = (*sorted(LEFT_OUT), "distributed", "pandas")
+IMPORTED = (*sorted(LEFT_OUT), "distributed")
 NEEDS_ROS = ("quadid_node.node", "quadid_node.polling", "quadid_node.speaker", "quadid_node.topic_player")
 
 

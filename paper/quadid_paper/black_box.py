@@ -7,10 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.baselines.order import choose_order
-from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, quadrotor_io
-from quadid.baselines.state_space import SubspaceModel, predict
-from quadid.baselines.subspace import fit_subspace
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import SCORE_SECONDS, expected_squares, scored_problem
 from quadid.model.layout import Layout
@@ -18,6 +14,10 @@ from quadid.rotation import conjugate, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
+from quadid_paper.order import choose_order
+from quadid_paper.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, quadrotor_io
+from quadid_paper.state_space import SubspaceModel, predict
+from quadid_paper.subspace import fit_subspace
 
 ORDERS = tuple(range(4, 25, 2))
 """Numbers of states that are tried."""

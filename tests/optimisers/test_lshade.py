@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quadid.baselines.lshade import LShade, LShadeOptions, Stop
 from quadid.errors import ParameterError
+from quadid.optimisers.lshade import LShade, LShadeOptions, Stop
 from quadid.types import FloatArray
 
 Cost = Callable[[FloatArray], FloatArray]

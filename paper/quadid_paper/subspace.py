@@ -21,10 +21,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadid.baselines.hankel import Triangle, as_records, stack, triangular
-from quadid.baselines.state_space import SubspaceModel
 from quadid.errors import ParameterError, nearest
 from quadid.types import BoolArray, FloatArray, IntArray
+from quadid_paper.hankel import Triangle, as_records, stack, triangular
+from quadid_paper.state_space import SubspaceModel
 
 Loop = Literal["closed", "open"]
 METHODS = ("cva", "moesp")

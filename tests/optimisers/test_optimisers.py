@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadid.baselines.optimisers import NAMES, NEED_RESIDUAL, Result, Stop, minimise
 from quadid.errors import ParameterError
+from quadid.optimisers.minimise import NAMES, NEED_RESIDUAL, Result, Stop, minimise
 from quadid.types import FloatArray
 
 Batch = Callable[[FloatArray], FloatArray]

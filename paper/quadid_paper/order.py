@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadid.baselines.hankel import as_records
-from quadid.baselines.state_space import predict
-from quadid.baselines.subspace import fit_orders
 from quadid.errors import NotIdentifiableError
 from quadid.types import FloatArray
+from quadid_paper.hankel import as_records
+from quadid_paper.state_space import predict
+from quadid_paper.subspace import fit_orders
 
 HELD_OUT = 0.3
 """Last part of each record that judges the orders fitted to the rest."""
@@ -50,7 +50,7 @@ def choose_order(
     No record but those given is looked at.
 
     Args:
-        method: this and all that is not explained here: as `quadid.baselines.subspace.fit_subspace`.
+        method: this and all that is not explained here: as `quadid_paper.subspace.fit_subspace`.
         inputs: (rows, m) a record.
         outputs: (rows, p) a record.
         orders: candidates.

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from quadid.baselines.optimisers import NAMES as OPTIMISERS
-from quadid.baselines.optimisers import Result, minimise
-from quadid.baselines.subspace import METHODS as SUBSPACE
 from quadid.errors import ParameterError, nearest
+from quadid.optimisers.minimise import NAMES as OPTIMISERS
+from quadid.optimisers.minimise import Result, minimise
 from quadid.types import FloatArray, JsonDict
+from quadid_paper.subspace import METHODS as SUBSPACE
 
 METHODS = (
     "initial", "quasi_newton", "least_squares", "pso", "pso_polish", "cma_es", "l_shade", "differential_evolution",

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadid.baselines.ledger import WORST, Batch, BudgetSpentError, Ledger, NoGradientError
-from quadid.baselines.lshade import SMALLEST_POPULATION, LShade, LShadeOptions
-from quadid.baselines.lshade import Stop as LShadeStop
 from quadid.errors import ParameterError, nearest
 from quadid.identify.particle_swarm import Stop as SwarmStop
 from quadid.identify.particle_swarm import Swarm, SwarmOptions, checked_box, read_only
+from quadid.optimisers.ledger import WORST, Batch, BudgetSpentError, Ledger, NoGradientError
+from quadid.optimisers.lshade import SMALLEST_POPULATION, LShade, LShadeOptions
+from quadid.optimisers.lshade import Stop as LShadeStop
 from quadid.types import FloatArray
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_paper.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
+from quadid_paper.state_space import predict
+from quadid_paper.subspace import METHODS, fit_subspace
 
-from quadid.baselines.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
-from quadid.baselines.state_space import predict
-from quadid.baselines.subspace import METHODS, fit_subspace
 from quadid.errors import WindowError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle

@@ -16,11 +16,11 @@ from quadid.workflow.progress import Advance, silent
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from quadid.baselines.comparison import Problem, Tried
     from quadid.identify.controller_gains import Autopilot
     from quadid.identify.noise_model import NoiseModel
     from quadid.vehicle import Vehicle
     from quadid.window import Window
+    from quadid_paper.comparison import Problem, Tried
 
 OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
@@ -28,7 +28,7 @@ OBJECTIVES = ("shooting", "closed_loop")
 
 def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
     """The methods to run; raises ParameterError for an unknown method or objective."""
-    from quadid.baselines.comparison import METHODS, check_methods
+    from quadid_paper.comparison import METHODS, check_methods
 
     names = check_methods(methods or METHODS)
     if objective not in OBJECTIVES:
@@ -57,10 +57,10 @@ def compare(
         ParameterError: an unknown method or objective.
         NotIdentifiableError: too little data, or no stabiliser for the closed loop.
     """
-    from quadid.baselines import comparison
-    from quadid.baselines.subspace import METHODS as BLACK_BOXES
     from quadid.identify.controller_gains import find_autopilot
     from quadid.identify.fit import FitOptions, fit
+    from quadid_paper import comparison
+    from quadid_paper.subspace import METHODS as BLACK_BOXES
 
     names = check_names(methods, objective)
     given = settled(logs, validate, vehicle)
@@ -121,10 +121,10 @@ class Judge:
 
     def optimiser(self, method: Tried, lowest: float, problem: Problem) -> JsonDict:
         """One optimiser's entry of the result."""
-        from quadid.baselines.comparison import Scores, optimiser_entry
         from quadid.identify.paper_objective import paper_score
         from quadid.identify.score import mse_score
         from quadid.parameters import NOMINAL_NAMES
+        from quadid_paper.comparison import Scores, optimiser_entry
 
         theta = problem.theta(method.typical.found.x)
         sets = (self.train, *self.unseen)
@@ -137,9 +137,9 @@ class Judge:
 
     def black_box(self, name: str) -> JsonDict:
         """Fits and scores one subspace method; one that cannot be fitted to these data has failed, and says why."""
-        from quadid.baselines.black_box import fit_black_box, score_black_box
-        from quadid.baselines.comparison import Scores, black_box_entry, failed_entry
         from quadid.errors import QuadidError
+        from quadid_paper.black_box import fit_black_box, score_black_box
+        from quadid_paper.comparison import Scores, black_box_entry, failed_entry
 
         begin = time.perf_counter()
         try:

@@ -7,16 +7,16 @@ import math
 
 import numpy as np
 import pytest
+from quadid_paper import comparison
+from quadid_paper.black_box import fit_black_box, score_black_box
+from quadid_paper.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
 
-from quadid.baselines import comparison
-from quadid.baselines.black_box import fit_black_box, score_black_box
-from quadid.baselines.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
-from quadid.baselines.optimisers import Result, Stop
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import fly
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import mse_score
 from quadid.model.layout import Layout
+from quadid.optimisers.minimise import Result, Stop
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

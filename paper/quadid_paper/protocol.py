@@ -180,7 +180,7 @@ def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
 
 def _searches(problem: PaperProblem, plan: Plan, seed: int, advance: Advance) -> dict[str, Column]:
     """The paper's columns, all on its objective: initial guess, quasi-Newton, its swarm; and the swarm polished."""
-    from quadid.baselines.optimisers import minimise
+    from quadid.optimisers.minimise import minimise
 
     columns = {"initial": Column(problem.theta(problem.start))}
     for i, name in enumerate(("quasi_newton", "pso_polish")):
@@ -238,8 +238,8 @@ def _own(flown: Protocol, seed: int, advance: Advance) -> tuple[Fit, Diagnosis, 
 
 
 def _black_boxes(flown: Protocol, noise: NoiseModel, advance: Advance) -> tuple[dict[str, list[float]], dict[str, int]]:
-    from quadid.baselines.black_box import fit_black_box, score_black_box
-    from quadid.baselines.subspace import METHODS
+    from quadid_paper.black_box import fit_black_box, score_black_box
+    from quadid_paper.subspace import METHODS
 
     scores, orders = {}, {}
     for i, method in enumerate(METHODS):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
+from quadid.report.text_table import Column, TextTable
 from quadid.types import Json
 
 PAPER_MSE: dict[str, tuple[float, float, float]] = {
@@ -32,14 +32,6 @@ COLUMN_NAMES = {
 """Models by name, for people."""
 
 
-class Table(NamedTuple):
-    """A title, column headings, and rows of text; the first cell of a row names it."""
-
-    title: str
-    head: list[str]
-    rows: list[list[str]]
-
-
 def text(value: float | None, digits: int = 4) -> str:
     """A number with `digits` that matter, or a dash."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
@@ -55,7 +47,7 @@ def set_name(i: int) -> str:
     return f"set {i + 1} ({'training' if i == 0 else 'validation'})"
 
 
-def table_1(result: Json) -> Table:
+def table_1(result: Json) -> TextTable:
     """The paper's Table 1 with our numbers beside it."""
     mse = result["mse_paper"]
     head = ["set (paper, here)", *(COLUMN_NAMES[n] for n in PAPER_MSE)]
@@ -68,26 +60,26 @@ def table_1(result: Json) -> Table:
         for name, gains in PAPER_GAIN.items():
             row.append(f"{percent(gains[i])}, {percent(1.0 - mse['pso'][i] / mse[name][i])}")
         rows.append(row)
-    return Table("Table 1: mean squared error of the closed-loop simulation", head, rows)
+    return _table("Table 1: mean squared error of the closed-loop simulation", head, rows)
 
 
-def table_1_more(result: Json) -> Table:
+def table_1_more(result: Json) -> TextTable:
     """The same error of models the paper does not have."""
     names = ("quasi_newton", "pso", "pso_polish", "identified", "true_nominal", "extended", "perfect")
     rows = [[set_name(i), *(text(result["mse_paper"][n][i]) for n in names)] for i in range(3)]
-    return Table("Remaining error", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
+    return _table("Remaining error", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
 
 
-def table_segments(result: Json) -> Table:
+def table_segments(result: Json) -> TextTable:
     """Prediction over 1 s in units of the noise, subspace models too."""
     names = (
         "initial", "quasi_newton", "pso", "pso_polish", "identified", "cva", "moesp", "extended", "perfect",
     )  # fmt: skip
     rows = [[set_name(i), *(text(result["mse"][n][i]) for n in names)] for i in range(3)]
-    return Table("Prediction over 1 s (1 = noise floor)", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
+    return _table("Prediction over 1 s (1 = noise floor)", ["set", *(COLUMN_NAMES[n] for n in names)], rows)
 
 
-def table_2(result: Json) -> Table:
+def table_2(result: Json) -> TextTable:
     """The paper's Table 2, with what it lacks: the truth, intervals, status, spread over seeds."""
     head = [
         "parameter", "unit", "paper", "true here", "initial", "quasi-Newton", "PSO: median (range) of seeds",
@@ -103,23 +95,23 @@ def table_2(result: Json) -> Table:
             name, NOMINAL_UNITS[name], text(PAPER_PARAMETERS[name]), text(p["truth"]), text(p["initial"]),
             text(p["quasi_newton"]), swarm, nominal, extended,
         ])  # fmt: skip
-    return Table("Table 2: parameters", head, rows)
+    return _table("Table 2: parameters", head, rows)
 
 
 def _interval(pair: Sequence[float]) -> str:
     return f"{text(pair[0])} … {text(pair[1])}"
 
 
-def table_correlations(result: Json) -> Table:
+def table_correlations(result: Json) -> TextTable:
     """Correlation of the estimates: what the data can only tell together."""
     rows = [
         [name, *(f"{value:+.2f}" for value in row)]
         for name, row in zip(NOMINAL_NAMES, result["correlations"], strict=True)
     ]
-    return Table("Correlation of the estimates (nominal model, set 1)", ["", *NOMINAL_NAMES], rows)
+    return _table("Correlation of the estimates (nominal model, set 1)", ["", *NOMINAL_NAMES], rows)
 
 
-def table_findings(result: Json) -> Table:
+def table_findings(result: Json) -> TextTable:
     """What the diagnosis found, beside what was flown."""
     rows = []
     for finding in result["findings"]:
@@ -130,17 +122,28 @@ def table_findings(result: Json) -> Table:
                 _interval(p["ci95"]), f"{text(finding['gain']['mse_before'])} → {text(finding['gain']['mse_after'])}",
             ])  # fmt: skip
     head = ["cause", "unit", "flown", "found", "95 % interval", "error without → with"]
-    return Table("What the nominal model lacks (error on sets 2 and 3, 1 = noise floor)", head, rows)
+    return _table("What the nominal model lacks (error on sets 2 and 3, 1 = noise floor)", head, rows)
 
 
-def all_tables(result: Json) -> list[Table]:
+def all_tables(result: Json) -> list[TextTable]:
     """Every table in the order of the page."""
     makers = (table_1, table_1_more, table_segments, table_2, table_findings, table_correlations)
     return [maker(result) for maker in makers]
 
 
-def markdown(table: Table) -> str:
+def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> TextTable:
+    """Rows of text; the first cell of a row names it."""
+    return TextTable(title, tuple(Column(h, right=i > 0) for i, h in enumerate(head)), tuple(map(tuple, rows)))
+
+
+def headings(table: TextTable) -> list[str]:
+    """Its column headings."""
+    return [column.heading for column in table.columns]
+
+
+def markdown(table: TextTable) -> str:
     """A table as Markdown."""
-    lines = [f"| {' | '.join(table.head)} |", f"|{'---|' * len(table.head)}"]
-    lines += [f"| {' | '.join(row)} |" for row in table.rows]
+    head = headings(table)
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines += [f"| {' | '.join(map(str, row))} |" for row in table.rows]
     return "\n".join(lines)
