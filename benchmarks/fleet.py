@@ -29,11 +29,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quadid_replay import write_mcap
+from quadid_workflow.fleet import Job
 
 from benchmarks.speed.timing import child
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from quadid.workflow.fleet import Job
 
 SECONDS = 10.0
 FLOWN = 10
@@ -60,7 +60,7 @@ HEAD = (
 )  # fmt: skip
 PLAIN = """
 import json, pickle, sys, time
-from quadid.workflow.fleet import identify_one
+from quadid_workflow.fleet import identify_one
 jobs = pickle.load(open(sys.argv[1], "rb"))
 identify_one(jobs[0])  # loads the kernels
 begin = time.process_time()

@@ -22,9 +22,8 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser, CDPSession, sync_playwright
 from plotly.offline import get_plotlyjs
-
-from quadid.report import plotly_source
-from quadid.workflow.demo import html, run
+from quadid_report import plotly_source
+from quadid_workflow.demo import html, run
 
 
 class Opening(NamedTuple):
@@ -118,7 +117,7 @@ def told(seconds: float, sizes: list[float], rows: list[list[Opening]], version:
     lines += [
         "",
         "Figures are drawn as they come near the window, all of them before printing. The page carries the modules of",
-        "plotly.js that its kinds of trace reach (`quadid.report.plotly_source`); the whole has maps and 3-D, which a",
+        "plotly.js that its kinds of trace reach (`quadid_report.plotly_source`); the whole has maps and 3-D, which a",
         "browser reads, compiles and starts before the first figure.",
         "",
     ]

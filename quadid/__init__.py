@@ -16,28 +16,29 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from quadid_workflow.diagnose import diagnose as diagnose
+    from quadid_workflow.export import export as export
+    from quadid_workflow.health import health as health
+    from quadid_workflow.identify import identify as identify
+    from quadid_workflow.inspect import inspect as inspect
+    from quadid_workflow.loading import load as load
+    from quadid_workflow.score import score as score
+    from quadid_workflow.simulate import simulate as simulate
+
     from quadid.parameters import ParameterSet as ParameterSet
     from quadid.vehicle import Vehicle as Vehicle
-    from quadid.workflow.diagnose import diagnose as diagnose
-    from quadid.workflow.export import export as export
-    from quadid.workflow.health import health as health
-    from quadid.workflow.identify import identify as identify
-    from quadid.workflow.inspect import inspect as inspect
-    from quadid.workflow.loading import load as load
-    from quadid.workflow.score import score as score
-    from quadid.workflow.simulate import simulate as simulate
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "load": "quadid.workflow.loading",
-    "inspect": "quadid.workflow.inspect",
-    "identify": "quadid.workflow.identify",
-    "diagnose": "quadid.workflow.diagnose",
-    "health": "quadid.workflow.health",
-    "score": "quadid.workflow.score",
-    "simulate": "quadid.workflow.simulate",
-    "export": "quadid.workflow.export",
+    "load": "quadid_workflow.loading",
+    "inspect": "quadid_workflow.inspect",
+    "identify": "quadid_workflow.identify",
+    "diagnose": "quadid_workflow.diagnose",
+    "health": "quadid_workflow.health",
+    "score": "quadid_workflow.score",
+    "simulate": "quadid_workflow.simulate",
+    "export": "quadid_workflow.export",
     "Vehicle": "quadid.vehicle",
     "ParameterSet": "quadid.parameters",
 }

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def make_callable(room: str) -> None:
-    """Makes a call of the package `room` a call of the function of that name in `quadid.workflow`.
+    """Makes a call of the package `room` a call of the function of that name in `quadid_workflow`.
 
     The function is looked up when it is called: a room does not import what stands above it.
     """
@@ -17,6 +17,6 @@ def make_callable(room: str) -> None:
 
     class Room(ModuleType):
         def __call__(self, *arguments: Any, **options: Any) -> Any:
-            return getattr(importlib.import_module(f"quadid.workflow.{name}"), name)(*arguments, **options)
+            return getattr(importlib.import_module(f"quadid_workflow.{name}"), name)(*arguments, **options)
 
     sys.modules[room].__class__ = Room

@@ -19,7 +19,7 @@ class FittedFlight(BaseModel):
         log: its file name.
         seconds: length of the part that was fitted.
         begin: UNIX time of its first sample [s]; None where its clock has no date.
-        marks: short hashes of some stretches of its gyro, see `quadid.workflow.overlap`.
+        marks: short hashes of some stretches of its gyro, see `quadid_workflow.overlap`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

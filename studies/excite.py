@@ -18,6 +18,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from quadid_workflow.excite import knowledge
 
 from quadid.experiment import Limits, Proposal, Simulator, propose
 from quadid.flight import Flight, draw_truth, fly
@@ -28,7 +29,6 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.workflow.excite import knowledge
 from studies.page import put_section
 from studies.truth import poor_guess
 

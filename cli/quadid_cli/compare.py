@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from quadid_workflow.loading import GRID
 
 from quadid.types import JsonDict
-from quadid.workflow.loading import GRID
 from quadid_cli import options
 
 
@@ -45,8 +45,8 @@ def compare(
 ) -> None:
     """Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side."""
     from quadid_paper import compare as work
+    from quadid_workflow.loading import load_vehicle
 
-    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -66,8 +66,9 @@ def compare(
 
 def show(result: JsonDict, quiet: bool) -> None:
     """Prints the table for people."""
-    from quadid.report.result_tables import number
-    from quadid.report.text_table import Column, TextTable
+    from quadid_report.result_tables import number
+    from quadid_report.text_table import Column, TextTable
+
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)

@@ -11,19 +11,19 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from quadid.workflow.progress import Advance
+    from quadid_workflow.progress import Advance
 
 STAGE = "compiling, once on this machine"
-_CHILD = "from quadid.workflow.kernels import compiled; compiled({!r}, lambda done: print(done, flush=True))"
+_CHILD = "from quadid_workflow.kernels import compiled; compiled({!r}, lambda done: print(done, flush=True))"
 
 
 def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
-    """Compiles what is missing of these parts of `quadid.workflow.kernels`, a process each; returns which were.
+    """Compiles what is missing of these parts of `quadid_workflow.kernels`, a process each; returns which were.
 
     Compiling holds a lock within a process, so only processes make use of more than one core.  What a process fails
     to compile, the work itself compiles, and says why it cannot.
     """
-    from quadid.workflow.kernels import PARTS, missing
+    from quadid_workflow.kernels import PARTS, missing
 
     wanted = missing(tuple(parts))
     done = dict.fromkeys(wanted, 0)

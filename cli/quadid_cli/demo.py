@@ -10,7 +10,7 @@ import typer
 from quadid_cli.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
-    from quadid.workflow.demo import Shown
+    from quadid_workflow.demo import Shown
 
 
 def demo(
@@ -20,7 +20,8 @@ def demo(
     out: OutFolder = Path(),
 ) -> None:
     """Fly three Pelican flights, identify on the first, validate on the others, diagnose; write logs and a report."""
-    from quadid.workflow import demo as work
+    from quadid_workflow import demo as work
+
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -37,7 +38,8 @@ def demo(
 
 def show(shown: Shown, page: Path, quiet: bool) -> None:
     """Prints both results beside the truth, and where the files are."""
-    from quadid.workflow.demo import HIDDEN_SECTION, TRUE_SECTION
+    from quadid_workflow.demo import HIDDEN_SECTION, TRUE_SECTION
+
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)

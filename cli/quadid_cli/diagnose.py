@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from quadid.workflow.loading import GRID
+from quadid_workflow.loading import GRID
+
 from quadid_cli import options
 
 
@@ -25,9 +26,10 @@ def diagnose(
     out: options.OutFolder = Path(),
 ) -> None:
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
-    from quadid.workflow import diagnose as work
-    from quadid.workflow.loading import load_vehicle
-    from quadid.workflow.series import check_kinds
+    from quadid_workflow import diagnose as work
+    from quadid_workflow.loading import load_vehicle
+    from quadid_workflow.series import check_kinds
+
     from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
 

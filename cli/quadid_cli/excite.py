@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from quadid_workflow.loading import GRID
 
-from quadid.workflow.loading import GRID
 from quadid_cli.options import (
     Columns,
     JsonTarget,
@@ -53,8 +53,9 @@ def excite(
     out: OutFolder = Path(),
 ) -> None:
     """Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it."""
-    from quadid.workflow.excite import check_forms, check_limits, parse_height, propose
-    from quadid.workflow.loading import load_vehicle
+    from quadid_workflow.excite import check_forms, check_limits, parse_height, propose
+    from quadid_workflow.loading import load_vehicle
+
     from quadid_cli import output, terminal
 
     check_limits(seconds, tilt, rate_limit, battery)
@@ -74,7 +75,7 @@ def excite(
     first, *others = done.save(folder, forms or ())
     result["manoeuvre_file"], result["files"] = str(first), [str(path) for path in others]
     if report is not None:
-        from quadid.report.excite_page import excite_html
+        from quadid_report.excite_page import excite_html
 
         result["report"] = str(output.write_text(report, excite_html(result, done.proposal.flight.window)))
     output.write_json(result, json)
@@ -84,9 +85,10 @@ def excite(
 
 def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
+    from quadid_report.manoeuvres.plan import half_width
+    from quadid_report.text_table import Column, TextTable
+
     from quadid.experiment import BLOCK
-    from quadid.report.manoeuvres.plan import half_width
-    from quadid.report.text_table import Column, TextTable
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)

@@ -24,7 +24,7 @@ def explained(report: Path | None, what: str, texts: Sequence[str], vehicle: Veh
         vehicle: its description.
         preset: topic names of ROS logs.
     """
-    from quadid.workflow.identify import UnansweredError
+    from quadid_workflow.identify import UnansweredError
 
     try:
         yield
@@ -32,7 +32,8 @@ def explained(report: Path | None, what: str, texts: Sequence[str], vehicle: Veh
         raise  # it has a report of its own
     except QuadidError as error:
         if report is not None:
-            from quadid.workflow.reporting import failure_html
+            from quadid_workflow.reporting import failure_html
+
             from quadid_cli.output import command_line, write_text
             from quadid_cli.terminal import warn
 

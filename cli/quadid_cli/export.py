@@ -43,8 +43,9 @@ def export(
     out: OutFolder = Path(),
 ) -> None:
     """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
-    from quadid.workflow.export import export as exported
-    from quadid.workflow.loading import load_vehicle
+    from quadid_workflow.export import export as exported
+    from quadid_workflow.loading import load_vehicle
+
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -73,8 +74,9 @@ def export(
 
 def listed(json: str | None) -> None:
     """Prints what each form carries."""
-    from quadid.report.programs import FORMS
-    from quadid.workflow.export import forms
+    from quadid_report.programs import FORMS
+    from quadid_workflow.export import forms
+
     from quadid_cli import output, tables, terminal
 
     carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from quadid_workflow.loading import GRID
 
-from quadid.workflow.loading import GRID
 from quadid_cli.options import Columns, JsonTarget, OutFolder, Rate, Seed
 
 if TYPE_CHECKING:
-    from quadid.workflow.fleet import Job
-    from quadid.workflow.progress import Advance
+    from quadid_workflow.fleet import Job
+    from quadid_workflow.progress import Advance
+
     from quadid_cli.fleet_folder import Found
     from quadid_cli.fleet_store import Store
 
@@ -52,7 +53,8 @@ def fleet(
     out: OutFolder = Path(),
 ) -> None:
     """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
-    from quadid.workflow.loading import load_vehicle, parse_columns
+    from quadid_workflow.loading import load_vehicle, parse_columns
+
     from quadid_cli import fleet_folder, output, terminal
     from quadid_cli.fleet_store import open_store
 
@@ -101,11 +103,12 @@ def work(
 
 def conclude(store: Store, found: Found, target: Path, worked: int, seconds: float) -> dict[str, Any]:
     """Writes Parquet files and the report; returns the result as JSON has it."""
-    from quadid.report.fleet_page import fleet_page
-    from quadid.report.fleet_summary import summarise
-    from quadid.report.page import render
-    from quadid.workflow.fleet_health import health_trend
-    from quadid.workflow.reporting import provenance
+    from quadid_report.fleet_page import fleet_page
+    from quadid_report.fleet_summary import summarise
+    from quadid_report.page import render
+    from quadid_workflow.fleet_health import health_trend
+    from quadid_workflow.reporting import provenance
+
     from quadid_cli import output
 
     logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
@@ -122,9 +125,10 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints counts, vehicles, reasons of failures, and where the files are."""
-    from quadid.report.fleet_page import fleet_verdict
-    from quadid.report.result_tables import number
-    from quadid.report.text_table import Column, TextTable
+    from quadid_report.fleet_page import fleet_verdict
+    from quadid_report.result_tables import number
+    from quadid_report.text_table import Column, TextTable
+
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)

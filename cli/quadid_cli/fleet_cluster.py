@@ -13,8 +13,9 @@ from multiprocessing.process import BaseProcess
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from quadid_workflow.fleet import Job, Row, blank, identify_one
+
 from quadid.errors import QuadidError
-from quadid.workflow.fleet import Job, Row, blank, identify_one
 
 AHEAD = 4
 """Jobs handed out for each worker, so that the scheduler's memory does not grow with the number of logs."""
@@ -28,7 +29,7 @@ _QUIET = {
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
-    "distributed", "distributed.nanny", "quadid.workflow.fleet", "quadid.workflow.identify", "quadid.health.stored",
+    "distributed", "distributed.nanny", "quadid_workflow.fleet", "quadid_workflow.identify", "quadid.health.stored",
     "quadid.health.trims", "quadid_replay.mcap_reader",
 )  # fmt: skip
 """What a process has imported from which all workers are forked, those that replace dead ones too."""

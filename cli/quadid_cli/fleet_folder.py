@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from quadid_workflow.fleet import Job
+
 from quadid.errors import LogError, VehicleError
-from quadid.workflow.fleet import Job
 
 VEHICLE_FILE = "vehicle.yaml"
 SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
@@ -118,7 +119,7 @@ def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Pat
         if file in texts:
             return texts[file]
         if file.is_file():
-            from quadid.workflow.loading import load_vehicle
+            from quadid_workflow.loading import load_vehicle
 
             texts[file] = load_vehicle(str(file)).to_yaml()
             return texts[file]

@@ -25,8 +25,9 @@ def health(
     out: OutFolder = Path(),
 ) -> None:
     """What changed since the baseline flights: which rotor, mass, centre of gravity, thrust, how much, how sure."""
-    from quadid.workflow import health as work
-    from quadid.workflow.loading import load_vehicle
+    from quadid_workflow import health as work
+    from quadid_workflow.loading import load_vehicle
+
     from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from quadid_report.result_tables import number
+from quadid_report.text_table import Column, TextTable
 
-from quadid.report.result_tables import number
-from quadid.report.text_table import Column, TextTable
 from quadid_cli.options import JsonTarget, shipped_names
 
 
@@ -37,9 +37,9 @@ def history(
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
     from quadid_node.store import default_path
     from quadid_node.store_file import StoreError, read_history
+    from quadid_workflow.loading import load_vehicle
 
     from quadid.errors import VehicleError
-    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output
 
     output.check_file(json, "--json")

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from quadid_workflow.loading import GRID
+from quadid_workflow.searching import OPTIMIZERS
 
-from quadid.workflow.loading import GRID
-from quadid.workflow.searching import OPTIMIZERS
 from quadid_cli import options
 
 if TYPE_CHECKING:
+    from quadid_workflow.identify import Identified
+
     from quadid.vehicle import Vehicle
-    from quadid.workflow.identify import Identified
 
 
 def identify(
@@ -37,10 +38,11 @@ def identify(
     out: options.OutFolder = Path(),
 ) -> None:
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
-    from quadid.workflow import identify as work
-    from quadid.workflow.loading import load_vehicle
-    from quadid.workflow.searching import check_optimizer
-    from quadid.workflow.series import check_kinds
+    from quadid_workflow import identify as work
+    from quadid_workflow.loading import load_vehicle
+    from quadid_workflow.searching import check_optimizer
+    from quadid_workflow.series import check_kinds
+
     from quadid_cli import output, terminal
     from quadid_cli.explaining import explained
 
@@ -74,7 +76,8 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
 
 def conclude(done: Identified, target: Path, report: Path | None, series: Sequence[str], json: str | None) -> None:
     """Writes the vehicle file, the report, series and JSON, and prints the result."""
-    from quadid.workflow.reporting import known
+    from quadid_workflow.reporting import known
+
     from quadid_cli import output, tables, terminal
 
     done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))

@@ -25,7 +25,8 @@ def init(
     out: OutFolder = Path(),
 ) -> None:
     """Write a vehicle file to fill in; with a log, filled with what the autopilot's logged parameters describe."""
-    from quadid.workflow import init as work
+    from quadid_workflow import init as work
+
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")

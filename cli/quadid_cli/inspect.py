@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from quadid_report.text_table import Cell
 
-from quadid.report.text_table import Cell
 from quadid_cli.options import Columns, JsonTarget, Preset, Start, Stop
 
 if TYPE_CHECKING:
-    from quadid.workflow.inspect import Inspected
+    from quadid_workflow.inspect import Inspected
 
 
 def inspect(
@@ -36,8 +36,9 @@ def inspect(
     columns: Columns = None,
 ) -> None:
     """What a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing."""
-    from quadid.workflow.inspect import inspect as inspected
-    from quadid.workflow.loading import parse_columns
+    from quadid_workflow.inspect import inspect as inspected
+    from quadid_workflow.loading import parse_columns
+
     from quadid_cli.output import check_file, json_text, out_folder, write_json, write_text
 
     check_file(json, "--json")
@@ -53,7 +54,8 @@ def inspect(
 
 def show(done: Inspected, quiet: bool) -> None:
     """Prints the tables, then what the checks found and what is missing."""
-    from quadid.report.inspect_tables import heading, sentences
+    from quadid_report.inspect_tables import heading, sentences
+
     from quadid.sanitise import LONGEST_LINE, plain
     from quadid_cli import tables, terminal
 

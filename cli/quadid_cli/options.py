@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from quadid_workflow.loading import Log
+
     from quadid.vehicle import Vehicle
-    from quadid.workflow.loading import Log
 
 Logs = Annotated[
     list[str],
@@ -89,8 +90,9 @@ def reader(
     vehicle: Vehicle, rate: float | None, start: float | None, stop: float | None, preset: str, unchecked: bool,
     columns: Sequence[str] | None,
 ) -> Callable[[Sequence[str]], list[Log]]:  # fmt: skip
-    """What reads the logs of a command whose options these are; see `quadid.workflow.loading.load`."""
-    from quadid.workflow.loading import load, parse_columns
+    """What reads the logs of a command whose options these are; see `quadid_workflow.loading.load`."""
+    from quadid_workflow.loading import load, parse_columns
+
     from quadid_cli import terminal
 
     named = parse_columns(columns or [])

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from quadid.workflow.files import OutputError as OutputError
-from quadid.workflow.files import file_name as file_name
-from quadid.workflow.files import write_text as write_text
-from quadid.workflow.outcome import json_text as json_text
+from quadid_workflow.files import OutputError as OutputError
+from quadid_workflow.files import file_name as file_name
+from quadid_workflow.files import write_text as write_text
+from quadid_workflow.outcome import json_text as json_text
 
 
 def out_folder(folder: Path) -> Path:

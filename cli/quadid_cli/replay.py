@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from quadid_node.publication import Output
     from quadid_node.recorder import Beginning
     from quadid_node.service import Service
+    from quadid_workflow.progress import Advance
 
     from quadid.window import Recording, Sample
-    from quadid.workflow.progress import Advance
 
 BATCH = 200
 """Samples between two looks at the session."""
@@ -72,9 +72,9 @@ def replay(
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
     from quadid_replay import open_log
+    from quadid_workflow.loading import load_vehicle, parse_columns
+    from quadid_workflow.parts import parse_cut
 
-    from quadid.workflow.loading import load_vehicle, parse_columns
-    from quadid.workflow.parts import parse_cut
     from quadid_cli import output, terminal
 
     output.check_file(json, "--json")
@@ -242,7 +242,8 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints what was published, refused and found."""
-    from quadid.report.result_tables import parameter_table
+    from quadid_report.result_tables import parameter_table
+
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet=quiet)

@@ -49,8 +49,8 @@ def write(done: Reproduced, result: JsonDict, folder: Path) -> list[str]:
     """Writes pictures, Markdown and HTML; returns their absolute paths."""
     from quadid_paper.figures import FIGURES, draw, interactive
     from quadid_paper.page import paper_markdown, paper_sections
+    from quadid_report.page import render
 
-    from quadid.report.page import render
     from quadid_cli.output import out_folder, write_text
 
     pictures, files = out_folder(folder / _FIGURES), []

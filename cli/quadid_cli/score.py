@@ -26,8 +26,9 @@ def score(
     out: options.OutFolder = Path(),
 ) -> None:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
-    from quadid.workflow import score as work
-    from quadid.workflow.loading import load_vehicle
+    from quadid_workflow import score as work
+    from quadid_workflow.loading import load_vehicle
+
     from quadid_cli import output, tables, terminal
 
     output.check_file(json, "--json")

@@ -74,8 +74,8 @@ def serve(
     from quadid_node.store import Store, default_path
     from quadid_node.worker import ProcessWorker
     from quadid_node.workers import with_ground
+    from quadid_workflow.loading import load_vehicle
 
-    from quadid.workflow.loading import load_vehicle
     from quadid_cli import output, terminal
     from quadid_cli.replay import parse_pairs
 

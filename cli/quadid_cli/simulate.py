@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from quadid_workflow.simulate import SimulateError, check_suffix
 
-from quadid.workflow.simulate import SimulateError, check_suffix
 from quadid_cli.options import JsonTarget, Seed, VehicleName
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ def simulate(
     json: JsonTarget = None,
 ) -> None:
     """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz."""
-    from quadid.workflow.simulate import simulate as fly
+    from quadid_workflow.simulate import simulate as fly
+
     from quadid_cli.output import check_file, write_json
 
     check_target(out)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from quadid.report.text_table import SPACE, Cell, TextTable
+from quadid_report.text_table import SPACE, Cell, TextTable
 
 if TYPE_CHECKING:
+    from quadid_report.verdict import Verdict
+    from quadid_workflow.outcome import Outcome
     from rich.console import Console
-
-    from quadid.report.verdict import Verdict
-    from quadid.workflow.outcome import Outcome
 
 _STYLES = {"": "", "good": "green", "fair": "yellow", "poor": "red", "title": "bold", "head": "underline", "dim": "dim"}
 

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from quadid_workflow.progress import Advance as Advance
+from quadid_workflow.progress import silent
+
 from quadid.sanitise import one_line
-from quadid.workflow.progress import Advance as Advance
-from quadid.workflow.progress import silent
 from quadid_cli.compiling import prepare
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def progress(compiled: Sequence[str] = ("simulation", "statistics")) -> Iterator
     """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
 
     Args:
-        compiled: kernels that the block needs (`quadid.workflow.kernels.PARTS`), compiled first where they are not.
+        compiled: kernels that the block needs (`quadid_workflow.kernels.PARTS`), compiled first where they are not.
     """
     if not sys.stderr.isatty():
         prepare(compiled, silent)

@@ -7,8 +7,9 @@ from quadid_cli.options import JsonTarget
 
 def vehicles(json: JsonTarget = None) -> None:
     """List the vehicles that ship; each name may be given to --vehicle."""
-    from quadid.report.text_table import Column, TextTable
-    from quadid.workflow.init import shipped
+    from quadid_report.text_table import Column, TextTable
+    from quadid_workflow.init import shipped
+
     from quadid_cli import output, tables, terminal
 
     output.check_file(json, "--json")

@@ -11,7 +11,8 @@ from quadid_cli.options import JsonTarget
 
 def warmup(json: JsonTarget = None) -> None:
     """Compile all kernels for this machine's processor, in processes side by side; nothing to do where that is done."""
-    from quadid.workflow.kernels import PARTS
+    from quadid_workflow.kernels import PARTS
+
     from quadid_cli import output
 
     begin = time.perf_counter()

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from quadid_workflow.logs import Given, settled
+from quadid_workflow.progress import Advance, silent
+
 from quadid.errors import ParameterError, nearest
 from quadid.types import JsonDict
-from quadid.workflow.logs import Given, settled
-from quadid.workflow.progress import Advance, silent
 
 if TYPE_CHECKING:
     from pathlib import Path

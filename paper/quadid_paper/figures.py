@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from quadid_report.figures import LABELS, liveliest
+from quadid_report.parts import axis, trace
 
 from quadid.identify.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
-from quadid.report.figures import LABELS, liveliest
-from quadid.report.parts import axis, trace
 from quadid.types import FloatArray, JsonDict
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def draw(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> Fig
 
 
 def interactive(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> JsonDict:
-    """The same figure for `quadid.report.page.render`: one view a set."""
+    """The same figure for `quadid_report.page.render`: one view a set."""
     outputs = range(9)[GROUPS[figure.group][1]]
     views = []
     for number in figure.sets:

@@ -1,12 +1,13 @@
-"""The page of `quadid reproduce`: as Markdown, and as what `quadid.report.page.render` shows."""
+"""The page of `quadid reproduce`: as Markdown, and as what `quadid_report.page.render` shows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from quadid.report.parts import rows_of, section
-from quadid.report.words import effects_words
+from quadid_report.parts import rows_of, section
+from quadid_report.words import effects_words
+
 from quadid.types import Json
 from quadid_paper.figures import FIGURES
 from quadid_paper.tables import all_tables, headings, markdown

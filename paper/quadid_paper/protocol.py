@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from quadid_workflow.progress import Advance
+
     from quadid.diagnose import Diagnosis
     from quadid.identify.fit import Fit
     from quadid.identify.noise_model import NoiseModel
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
     from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
     from quadid.window import Window
-    from quadid.workflow.progress import Advance
 
 VEHICLE = "pelican"
 EFFECTS = {
@@ -149,12 +150,13 @@ def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduc
 
 def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
     """Flies the three sets, writes them as logs, and reads them back as any other log."""
+    from quadid_workflow.files import write_text
+    from quadid_workflow.loading import GRID, load, load_vehicle, write_recording
+
     from quadid.flight import fly as fly_once
     from quadid.model.layout import Layout
     from quadid.parameters import NOMINAL_NAMES
     from quadid.vehicle_parts import Stabiliser
-    from quadid.workflow.files import write_text
-    from quadid.workflow.loading import GRID, load, load_vehicle, write_recording
 
     base, sets, logs = load_vehicle(VEHICLE), [], []
     folder.mkdir(parents=True, exist_ok=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from quadid_report.text_table import Column, TextTable
+
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
-from quadid.report.text_table import Column, TextTable
 from quadid.types import Json
 
 PAPER_MSE: dict[str, tuple[float, float, float]] = {

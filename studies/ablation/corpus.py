@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from quadid_workflow.loading import load_vehicle
+
 import quadid
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.workflow.loading import load_vehicle
 from studies.campaign import Case, cases, flown
 from studies.foreign.sets import SETS, FlightSet
 

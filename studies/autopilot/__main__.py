@@ -24,10 +24,10 @@ from quadid_node.service import Service
 from quadid_node.settings import session_settings
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log
+from quadid_workflow.loading import load_vehicle
 
 from quadid.online import Event, Phase, Publish
 from quadid.window import Sample
-from quadid.workflow.loading import load_vehicle
 from studies.autopilot.flights import ARDUCOPTER, OTHERS, Flown, Outcome, errors_of
 from studies.autopilot.live import serve
 from studies.autopilot.readings import telemetry

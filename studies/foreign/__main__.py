@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from quadid_workflow.loading import load_vehicle
+
 import quadid
 from quadid.errors import QuadidError
 from quadid.identify.open_loop import QUANTITIES, mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid.window import Window
-from quadid.workflow.loading import load_vehicle
 from studies.foreign.learning import FEATURES, network, ridge, runs_of, shares, velocity_against_position
 from studies.foreign.numbers import Number, of_cases, of_rotorpy
 from studies.foreign.page import AHEAD, Row, page, section

@@ -15,9 +15,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from quadid_report.health_page import has_changed
 from scipy.stats import spearmanr
 
-from quadid.report.health_page import has_changed
 from studies.health.recorded import LARGE, Flown
 
 SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (

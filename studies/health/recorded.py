@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from quadid_report.health_page import has_changed
+from quadid_workflow.loading import open_recording
 from scipy.stats import binomtest, spearmanr
 
 from quadid.health import FlightTrim, Health, assess, flight_trim
-from quadid.report.health_page import has_changed
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
-from quadid.workflow.loading import open_recording
 
 CRAZYFLIE = Vehicle.shipped("crazyflie")
 LARGE = 3.0

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from quadid_workflow.loading import load_vehicle
 from scipy.signal import lfilter, savgol_filter
 
 import quadid
@@ -22,7 +23,6 @@ from quadid.resample import linear
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Recording
-from quadid.workflow.loading import load_vehicle
 
 LOG, CUT, MODEL = "arpl/log15.csv", 18.0, "arpl/vehicle.yaml"
 """The log, fitted up to the cut [s] and predicted from there."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quadid_workflow.loading import Log, load_vehicle
 
 import quadid
 from quadid.identify.open_loop import mean_errors, no_change
@@ -18,7 +19,6 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.window import Window
-from quadid.workflow.loading import Log, load_vehicle
 from studies import rotorpy_flight
 from studies.foreign.sets import SETS
 from studies.peers import mujoco_sysid

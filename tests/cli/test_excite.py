@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from quadid_workflow.excite import propose
 
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.workflow.excite import propose
 from tests.cli.conftest import Cli, Flights, one_line
 
 

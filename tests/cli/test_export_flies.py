@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from quadid_report.programs import export
+from quadid_report.programs.facts import SHORTEST_LAG
 from scipy.integrate import solve_ivp
 
 from quadid.errors import ParameterError
 from quadid.model.simulate import simulate as fly_file
-from quadid.report.programs import export
-from quadid.report.programs.facts import SHORTEST_LAG
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.model.simulate import held, simulate, state

@@ -20,11 +20,11 @@ from quadid_cli.fleet_cluster import ClusterError, cluster, results
 from quadid_cli.fleet_folder import find_jobs
 from quadid_cli.fleet_store import open_store
 from quadid_replay import write_csv, write_mcap
+from quadid_workflow.fleet import Job, Row, identify_one
 
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from quadid.workflow.fleet import Job, Row, identify_one
 from tests.cli.conftest import Cli, one_line
 
 DAY_NS = 86_400 * 10**9
@@ -178,7 +178,7 @@ def test_workers_begin_warm_and_with_one_thread_each() -> None:
         import os
         import sys
 
-        warm = "quadid.workflow.identify" in sys.modules
+        warm = "quadid_workflow.identify" in sys.modules
         return warm, sys.modules["numba"].config.NUMBA_NUM_THREADS, os.environ.get("OPENBLAS_NUM_THREADS")
 
     with cluster(None, 1, "1GiB") as client:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from quadid_workflow.init import init
 
 import quadid
 from quadid.vehicle import Vehicle
-from quadid.workflow.init import init
 from tests.cli.conftest import Cli, Flights, one_line
 
 

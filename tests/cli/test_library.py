@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 from quadid_replay import write_csv
+from quadid_workflow.health import HealthOutcome
+from quadid_workflow.logs import settled
 
 import quadid
 from quadid.errors import QuadidError, VehicleError
 from quadid.health import assess, flight_trim
 from quadid.jsonable import jsonable
 from quadid.vehicle import Vehicle
-from quadid.workflow.health import HealthOutcome
-from quadid.workflow.logs import settled
 from studies.health.flights import hover
 from tests.cli.conftest import Cli, Flights, one_line
 

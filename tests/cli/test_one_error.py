@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_workflow.diagnose import Diagnosed
+from quadid_workflow.identify import Identified
+from quadid_workflow.loading import Log
 
 import quadid
-from quadid.workflow.diagnose import Diagnosed
-from quadid.workflow.identify import Identified
-from quadid.workflow.loading import Log
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import write_csv, write_mcap
+from quadid_workflow.loading import Log
+from quadid_workflow.overlap import check_unseen
 
 import quadid
 from quadid.errors import LogError
 from quadid.window import Recording
-from quadid.workflow.overlap import check_unseen
 from tests.cli.conftest import Cli, Flights, one_line
 
 
-def load(path: Path | str) -> quadid.workflow.loading.Log:
+def load(path: Path | str) -> Log:
     return quadid.load(path, vehicle="pelican")
 
 

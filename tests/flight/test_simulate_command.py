@@ -14,11 +14,11 @@ import pytest
 from quadid_cli.main import app_main
 from quadid_cli.simulate import check_target, stream
 from quadid_replay import open_log
+from quadid_workflow.simulate import SimulateError, parse_effects, read_manoeuvre
 
 from quadid.errors import ParameterError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from quadid.workflow.simulate import SimulateError, parse_effects, read_manoeuvre
 
 PELICAN = Vehicle.shipped("pelican")
 

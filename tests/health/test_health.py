@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_report.health_page import change_words, health_verdict
 
 from quadid.errors import NotIdentifiableError
 from quadid.health import Health, assess, comparison, flight_trim, healthy_spread
 from quadid.health.comparison import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
 from quadid.health.trims import trim_directions, trim_of_load
-from quadid.report.health_page import change_words, health_verdict
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command
 from quadid.window import Recording

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
+from quadid_workflow.loading import load_vehicle
 
 from quadid.online import Phase, Session
 from quadid.online.consistency import ALLOWED, Consistency, Factor
@@ -17,7 +18,6 @@ from quadid.online.resampler import Resampler
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Recording
-from quadid.workflow.loading import load_vehicle
 from studies.poisoning.flying import Poison
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, published, samples

@@ -1,4 +1,4 @@
-"""What `pip install .` brings: five packages with their data, one version, and imports that cost nothing."""
+"""What `pip install .` brings: seven packages with their data, one version, and imports that cost nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = ("quadid", "quadid_replay", "quadid_node", "quadid_paper", "quadid_cli")
+PACKAGES = ("quadid", "quadid_replay", "quadid_report", "quadid_workflow", "quadid_node", "quadid_paper", "quadid_cli")
 HEAVY = ("numba", "scipy", "pandas", "plotly", "dask", "distributed", "zenoh", "pymavlink", "mcap", "pyulog", "rclpy")
 
 
@@ -42,12 +42,13 @@ def test_data_files_are_in_and_markers_are_out(wheel: list[str], repository: Pat
     """Every tracked file of a package that is not Python source is data that the package reads."""
     folders = {"quadid": "quadid", "replay": "replay/quadid_replay", "quadid_node": "quadid_node/quadid_node"}
     folders |= {"cli": "cli/quadid_cli", "paper": "paper/quadid_paper"}
+    folders |= {"report": "report/quadid_report", "workflow": "workflow/quadid_workflow"}
     tracked = subprocess.run(
         ["git", "ls-files", *folders.values()], cwd=repository, check=True, capture_output=True, text=True
     ).stdout.split()
     assert "quadid/vehicles/pelican.yaml" in tracked
     for path in tracked:
-        name = re.sub(r"^(replay|cli|paper|quadid_node(?=/quadid_node/))/", "", path)
+        name = re.sub(r"^(replay|report|workflow|cli|paper|quadid_node(?=/quadid_node/))/", "", path)
         assert (name in wheel) == (Path(path).name != "COLCON_IGNORE"), path
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from quadid_cli.main import app_main
 from quadid_replay import write_csv
+from quadid_report.inspect_tables import channel_table, parameter_outlook_table
 
 from quadid.inspection import inspect
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.inspect_tables import channel_table, parameter_outlook_table
 from quadid.window import Recording
 from tests.replay.synthetic import Flight
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+from quadid_report.manoeuvres.plan import Plan
+
 from quadid.flight import Segment
-from quadid.report.manoeuvres.plan import Plan
 
 SECONDS = 13.0
 SEGMENTS = [

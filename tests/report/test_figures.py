@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from quadid.report.figures import (
+from quadid_report.figures import (
     BUDGET,
     WHOLE_POINTS,
     channel_figures,
@@ -14,7 +13,8 @@ from quadid.report.figures import (
     liveliest,
     parameter_figure,
 )
-from quadid.report.parts import short
+from quadid_report.parts import short
+
 from tests.report.test_page import scored
 
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quadid_report.diagnose_page import chance, diagnosis_part
+from quadid_report.identify_page import identify_page
+from quadid_report.page import code, fit, number, packed, render
 
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import ChannelScore, Series, SetScore
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.diagnose_page import chance, diagnosis_part
-from quadid.report.identify_page import identify_page
-from quadid.report.page import code, fit, number, packed, render
 from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"

@@ -6,9 +6,8 @@ import re
 
 import pytest
 from plotly.offline import get_plotlyjs
-
-from quadid.report.page import render
-from quadid.report.plotly_source import plotly_source, shortened
+from quadid_report.page import render
+from quadid_report.plotly_source import plotly_source, shortened
 
 HEAD = (
     ': this, () => {\n"use strict";var Plotly=(()=>{var L=(e,t)=>()=>(e&&(t=e(e=0)),t);'

@@ -1,0 +1,150 @@
+"""One self-contained HTML page from plain data: no request leaves it, and nothing from a log is ever run.
+
+The page carries one copy of plotly.js, as far as its figures use it.  Everything that comes from a log (names, topics,
+warnings) is escaped by the template; figure data travel as JSON in a script element that no browser runs, with ``<``,
+``>`` and ``&`` escaped.  A content security policy allows only the page's own two scripts, by hash.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from quadid.types import Json
+from quadid_report.verdict import digits
+
+
+def render(page: Json) -> str:
+    """Returns the HTML of a page.
+
+    Args:
+        page: what the template shows; absent parts are left out.  ``title``, ``subtitle``, ``verdict`` (of
+            `quadid_report.verdict`), ``parameters``, ``parameter_figure``, ``diagnoses``, ``sets``, ``quality``,
+            ``noise``, ``warnings``, ``provenance``.
+    """
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    environment.filters |= {"number": number, "code": code, "fit": fit, "unit": unit, "digits": digits}
+    figures = all_figures(page)
+    scripts = {name: closed(text) for name, text in (("plotly", _drawing(figures)), ("page", _asset("page.js")))}
+    policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
+    template = environment.from_string(_asset("page.html"))
+    return template.render(
+        page={**_EMPTY, **page},
+        figures=packed(figures),
+        style=Markup(_asset("page.css")),
+        scripts={name: Markup(text) for name, text in scripts.items()},
+        policy=policy,
+    )
+
+
+_EMPTY: dict[str, Any] = {
+    "subtitle": "", "verdict": None, "parameters": [], "parameter_figure": None, "diagnoses": [], "sets": [],
+    "sections": [], "excitation": None, "quality": [], "noise": [], "warnings": [], "provenance": [],
+}  # fmt: skip
+
+
+def all_figures(page: Json) -> dict[str, Any]:
+    """Every figure of the page by its identifier."""
+    found = [page.get("parameter_figure")]
+    parts = [*page.get("sets", ()), *page.get("sections", ())]
+    for diagnosis in page.get("diagnoses", ()):
+        parts += [*diagnosis["findings"], *diagnosis["logs"]]
+    for part in parts:
+        found.extend(part.get("figures", ()))
+    return {figure["id"]: figure for figure in found if figure is not None}
+
+
+PACKED_FROM = 40
+"""Rows of numbers at least this long travel packed."""
+_HOLE = -32768
+
+
+def packed(value: Any) -> Any:
+    """Long rows of numbers as 16 bit integers in base64: a third of their size, to a 65000th of their range.
+
+    ``{"i2": text, "low": a, "step": s}`` holds little-endian integers n from 0 to 65000, less 32767: the value is
+    a + s (n + 32767); -32768 is a hole (None).
+    """
+    if isinstance(value, Mapping):
+        return {k: packed(v) for k, v in value.items()}
+    if not isinstance(value, list | tuple):
+        return value
+    if len(value) < PACKED_FROM or not all(v is None or isinstance(v, int | float) for v in value):
+        return [packed(v) for v in value]
+    row = np.array([np.nan if v is None else v for v in value], dtype=np.float64)
+    good = np.isfinite(row)
+    low, high = (float(row[good].min()), float(row[good].max())) if good.any() else (0.0, 0.0)
+    step = (high - low) / 65000.0 or 1.0
+    whole = np.full(len(row), _HOLE, dtype="<i2")
+    whole[good] = np.rint((row[good] - low) / step).astype(np.int64) - 32767
+    return {"i2": base64.b64encode(whole.tobytes()).decode(), "low": low, "step": step}
+
+
+def unit(text: str) -> str:
+    """A unit with raised powers: ``N s^2/rad^2`` -> ``N s²/rad²``; a dash for none."""
+    raised = re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_RAISED), text)
+    return raised.replace(" ", "\u00a0") or "–"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for people: `digits` that matter, a real minus, powers of ten written out; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = f"{value:.{digits}g}"
+    mantissa, _, exponent = text.partition("e")
+    if exponent:
+        text = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
+    return text.replace("-", "−")
+
+
+def fit(value: float | None) -> str:
+    """A fit in per cent with one decimal; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{round(value, 1) + 0.0:.1f}\u00a0%".replace("-", "−")  # + 0.0: no minus before a zero
+
+
+def code(text: str) -> Any:
+    """Escaped text in which what stands between backticks is shown as code."""
+    from markupsafe import Markup, escape
+
+    parts = text.split("`")
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))
+
+
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def _drawing(figures: Mapping[str, Any]) -> str:
+    from quadid_report.plotly_source import plotly_source
+
+    views = [view for figure in figures.values() for view in figure["views"]]
+    return plotly_source(frozenset(trace.get("type", "scatter") for view in views for trace in view["data"]))
+
+
+def closed(script: str) -> str:
+    """A script that cannot end its element early; in a string or comment the escaped form means the same."""
+    return script.replace("</script", "<\\/script")
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+@lru_cache(maxsize=4)
+def _asset(name: str) -> str:
+    return (resources.files("quadid_report") / "assets" / name).read_text(encoding="utf-8")

@@ -1,0 +1,97 @@
+"""The parameters of a vehicle for another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import QuadidError
+from quadid_workflow.files import file_name, write_text
+from quadid_workflow.loading import as_vehicle
+
+if TYPE_CHECKING:
+    from quadid_report.text_table import TextTable
+
+    from quadid.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files for another program.
+
+    Attributes:
+        result: of the form ``quadid.export/1``; ``files`` is empty until they are written.
+        texts: content by file name.
+    """
+
+    result: dict[str, Any]
+    texts: dict[str, str]
+
+    def __repr__(self) -> str:
+        return "\n".join(self.texts.values())
+
+    def save(self, folder: str | Path = ".") -> list[Path]:
+        """Writes the files; returns their absolute paths."""
+        return [write_text(Path(folder) / name, text) for name, text in self.texts.items()]
+
+
+class UnprovenError(QuadidError):
+    """Values of a fit that predicted nothing, or predicted badly."""
+
+
+def export(
+    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, anyway: bool = False
+) -> Exported:
+    """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
+
+    Args:
+        vehicle: a shipped name, a YAML file or a `Vehicle`.
+        format: one of `quadid_report.programs.FORMATS`.
+        source: where the values come from, for the file; default the vehicle's file or name.
+        anyway: write the values of a fit that is not proven; the file says so at its top.
+
+    Raises:
+        ParameterError: an unknown format.
+        UnprovenError: the values are those of a fit that nothing proves.
+        VehicleError: no such vehicle.
+    """
+    from quadid_report.programs import export as written_as
+
+    described = as_vehicle(vehicle)
+    origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
+    if described.proof is not None and described.proof.lacking and not anyway:
+        raise UnprovenError(
+            f"{origin} is not proven: {described.proof.lacking}", "values that predict an unseen flight",
+            "`quadid identify LOG --validate OTHER`, or `quadid diagnose`; insist with --anyway",
+        )  # fmt: skip
+    texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, format, origin).items()}
+    guessed = [n for n, p in described.parameters.items() if p.sigma is None]
+    warnings = (
+        [f"not from data, but as the vehicle file has them, without a sigma: {', '.join(guessed)}"] if guessed else []
+    )
+    if format in ("px4", "ardupilot") and described.command.max_speed is None:
+        warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
+    result = {
+        "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
+    }  # fmt: skip
+    return Exported(result, texts)
+
+
+def forms() -> list[TextTable]:
+    """What each form carries, in two tables that fit a terminal; what it does not carry is named in its file."""
+    from quadid_report.programs import FORMS
+    from quadid_report.text_table import Column, TextTable
+
+    from quadid.effects import EFFECTS
+
+    out = []
+    for part in (
+        ("px4", "ardupilot", "gazebo", "agilicious"),
+        ("rotorpy", "mujoco", "urdf", "drone-models", "isaac-lab"),
+    ):
+        rows = [(effect, *("yes" if effect in FORMS[name].carried else "-" for name in part)) for effect in EFFECTS]
+        columns = (Column("effect"), *(Column(name) for name in part))
+        programs = ", ".join(FORMS[name].program for name in part)
+        out.append(TextTable(f"Effects carried to {programs}", columns, tuple(row for row in rows if "yes" in row)))
+    return out

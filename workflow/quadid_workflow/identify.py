@@ -1,0 +1,240 @@
+"""Identification: fits the parameters of a vehicle to flight logs, and scores the fit on them and on others."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from quadid.errors import NotIdentifiableError
+from quadid.sanitise import LONGEST_LINE, plain
+from quadid_workflow.files import file_name
+from quadid_workflow.logs import Given, settled
+from quadid_workflow.progress import Advance, silent
+from quadid_workflow.reporting import LIBRARY, Reported, known, provenance, quality, told
+from quadid_workflow.searching import OPTIMIZERS, check_optimizer, search
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from quadid_report.text_table import TextTable
+    from quadid_report.verdict import Verdict
+
+    from quadid.identify.controller_gains import Autopilot
+    from quadid.identify.fit import Fit
+    from quadid.identify.result import ScoredSet
+    from quadid.parameters import ParameterSet
+    from quadid.vehicle import Vehicle
+    from quadid_workflow.loading import Log
+
+
+@dataclass(frozen=True, repr=False)
+class Identified(Reported):
+    """What an identification found.
+
+    Attributes:
+        result: of the form ``quadid.identify/1``; ``vehicle_file`` is None until a file is written.
+        fit: the fit itself.
+        sets: scored logs, for pictures.
+        logs: as loaded, training logs first.
+    """
+
+    result: dict[str, Any]
+    fit: Fit
+    sets: list[ScoredSet]
+    logs: list[Log]
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Parameters with intervals, statuses and covariance."""
+        return self.fit.parameters
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
+        from quadid.identify.result import fitted_vehicle
+
+        train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], train)
+        return vehicle.with_remark(origin_remark(train))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the vehicle file, ``pelican.fitted.yaml``."""
+        return f"{file_name(self.fit.vehicle.name)}.fitted.yaml"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used, and what to do next."""
+        from quadid_report.verdict import identify_verdict
+
+        return identify_verdict(self.result)
+
+    def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
+        """Parameters, beside the truth where a simulation knows it, and how well each log is followed."""
+        from quadid_report.result_tables import parameter_table, set_table
+
+        return [parameter_table(self.result["parameters"], truth), set_table(self.result["sets"])]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a parameter."""
+        return [
+            {**{k: v for k, v in p.items() if k != "ci95"}, "low": p["ci95"][0], "high": p["ci95"][1]}
+            for p in self.result["parameters"]
+        ]
+
+    def plot(self, log: int = -1, group: str = "rates") -> Any:
+        """Measured and simulated outputs of one log as a plotly figure.
+
+        Args:
+            log: which of the logs, in the order given, training logs first; -1 is the last.
+            group: rates, attitude, accel, velocity or position.
+        """
+        from quadid_report.plotly_figure import channel_plot
+
+        return channel_plot(self.sets[log], group)
+
+    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
+        """Writes measured outputs of every log, and simulated ones before and after the fit, as mcap or csv."""
+        from quadid_workflow.series import save_series
+
+        return save_series(self.sets, self.logs, folder, kinds)
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: parameters, errors of every log, correlations, what the flights excite."""
+        from quadid_report.figures import MOST_LOGS
+        from quadid_report.flight_part import flight_section
+        from quadid_report.identify_page import correlation_section, identify_page
+        from quadid_report.page import render
+
+        result, fit = self.result, self.fit
+        rows = provenance(self.logs, command) + [
+            {"name": "seed", "value": str(result["seed"])},
+            {
+                "name": "search",
+                "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
+            },
+            {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
+            {"name": "taken as known", "value": known(fit.vehicle)},
+        ]
+        page = identify_page(result, self.sets, fit.noise, [quality(log) for log in self.logs], rows)
+        flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
+        page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
+        page["excitation"] = told(fit, [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"])
+        return render(page)
+
+
+class UnansweredError(NotIdentifiableError):
+    """The data say nothing about any parameter; `outcome` holds what there is, which is the initial guess."""
+
+    def __init__(self, outcome: Identified) -> None:
+        self.outcome = outcome
+        super().__init__(
+            "the data reveal no parameter",
+            "a flight that moves in roll, pitch, yaw and height",
+            "fly what `quadid excite` proposes; results were written, but they are the initial guess",
+        )
+
+
+def identify(
+    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, optimizer: str = OPTIMIZERS[0],
+    seed: int = 1, advance: Advance = silent,
+) -> Identified:  # fmt: skip
+    """Fits the parameters to logs, and scores the fit on them and on others.
+
+    Args:
+        logs: a log or several, as paths or from `load`.
+        validate: flights that are scored only.
+        vehicle: initial guess and known effects; default that of the first loaded log.
+        optimizer: one of `OPTIMIZERS`.
+        seed: of all random numbers.
+        advance: told how far the fit is.
+
+    Raises:
+        UnansweredError: the data reveal no parameter.
+        NotIdentifiableError: too little data.
+        LogError: a log that does not fit the vehicle.
+        ParameterError: an unknown search.
+    """
+    from quadid.identify.controller_gains import find_autopilot
+    from quadid.identify.result import answered, identify_result
+    from quadid.model.supply import with_reference_voltage
+
+    check_optimizer(optimizer)
+    given = settled(logs, validate, vehicle)
+    train, held = given.train, given.held
+    windows = [w for log in train for w in log.windows]
+    described = with_reference_voltage(given.vehicle, windows)
+    begin = time.perf_counter()
+    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
+    seconds = time.perf_counter() - begin
+    autopilot = find_autopilot(windows, described)
+    sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
+    result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
+    for entry, log in zip(result["sets"], (*train, *held), strict=True):
+        entry["seconds"] = log.grid.seconds_used
+    done = Identified(result, fit, sets, [*train, *held])
+    result["verdict"] = done.verdict.level
+    if not answered(fit.parameters):
+        raise UnansweredError(done)
+    return done
+
+
+def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
+    """Parameters that no log can show, because a channel is missing or too slow, each with the reason."""
+    from quadid.inspection.outlook import parameter_outlook
+    from quadid.inspection.timing import channel_facts
+
+    outlooks = [parameter_outlook(channel_facts(log.recording)) for log in logs]
+    each = [{o.parameter: o.reason for o in outlook if not o.possible} for outlook in outlooks]
+    return {name: each[0][name] for name in each[0] if all(name in one for one in each)} if each else {}
+
+
+def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> ScoredSet:
+    """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
+    from quadid.identify.paper_objective import paper_score
+    from quadid.identify.result import ScoredSet
+    from quadid.identify.score import mse_score
+    from quadid.model.layout import Layout
+
+    initial = Layout(fit.vehicle).initial(fit.vehicle)
+    before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (initial, fit.theta))
+    flown = [paper_score(log.windows, fit.vehicle, theta, autopilot) for theta in (initial, fit.theta)]
+    paper = None if flown[0] is None or flown[1] is None else (flown[0].mse, flown[1].mse)
+    return ScoredSet(log.recording.name, role, before, after, paper)
+
+
+def origin_remark(logs: Sequence[Log]) -> str:
+    """What a fitted vehicle file was made from."""
+    from quadid import __version__
+
+    lines = [f"Fitted by quadid {__version__}; `initial` is the fitted value, `sigma` its standard deviation. From:"]
+    lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
+    return "\n".join(plain(line, LONGEST_LINE) for line in lines)
+
+
+def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log]) -> Vehicle:
+    """The vehicle with the proof of its values; values of a red fit become guesses without `sigma`.
+
+    Args:
+        vehicle: with what was found.
+        verdict: on the result.
+        sets: its scored logs, as in ``quadid.identify/1``.
+        train: the logs that were fitted.
+    """
+    from quadid.proof import Proof
+    from quadid_workflow.overlap import remembered
+
+    unseen = [s for s in sets if s["role"] == "validate"]
+    errors = [s["mse"]["fitted"] for s in unseen]
+    proof = Proof(
+        verdict=verdict.level, unseen=tuple(s["log"] for s in unseen),
+        error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
+        fitted=remembered(train, vehicle),
+    )  # fmt: skip
+    values = dict(vehicle.parameters)
+    if verdict.level == "poor":
+        values = {n: p.model_copy(update={"sigma": None}) for n, p in values.items()}
+    return vehicle.model_copy(update={"proof": proof, "parameters": values})
