@@ -13,7 +13,7 @@ from benchmarks.kernel import numpy_moments, numpy_step
 from benchmarks.speed.flights import flight
 from benchmarks.speed.timing import interleaved
 from quadid.identify.fit import SWARM_SECONDS
-from quadid.identify.global_search import SWARM_SEGMENTS, projected_cost
+from quadid.identify.global_search import SWARM_SEGMENTS, Projected
 from quadid.identify.particle_swarm import Swarm, SwarmOptions
 from quadid.identify.shooting import Shooting
 from quadid.identify.shooting_objective import BoxProblem
@@ -41,7 +41,7 @@ class NumpyObjective:
         self.vehicle, self.shooting = vehicle, whole if most is None else whole.at_most(most)
         s = self.shooting
         self.theta, self.free = s.layout.initial(vehicle), s.free(NOMINAL_NAMES)
-        self.ours = projected_cost(s, self.theta, self.free, s.count)
+        self.ours = Projected(s, self.theta, self.free, s.count).costs
         self.lower, self.upper = np.log(vehicle.bounds).T
         self.segments, self.x0 = s.segments[0], s.starts(1).x0[0].copy()
         rollout = s.rollouts[0]

@@ -190,7 +190,7 @@ def _exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
 def particles_and_parameters(rounds: int) -> dict[str, Any]:
     """The swarm's cost against particles, the linearisation against free parameters and against windows."""
     from quadid.identify.fit import SWARM_SECONDS
-    from quadid.identify.global_search import projected_cost
+    from quadid.identify.global_search import Projected
     from quadid.identify.noise_estimation import flexible_names
     from quadid.identify.shooting import Shooting
     from quadid.parameters import NOMINAL_NAMES
@@ -198,7 +198,7 @@ def particles_and_parameters(rounds: int) -> dict[str, Any]:
     vehicle, window = Vehicle.shipped("pelican"), flight(120.0)
     shooting = Shooting.cut([window], vehicle, SWARM_SECONDS)
     theta, free = shooting.layout.initial(vehicle), shooting.free(NOMINAL_NAMES)
-    cost = projected_cost(shooting, theta, free, shooting.count)
+    cost = Projected(shooting, theta, free, shooting.count).costs
     names = list(dict.fromkeys([*NOMINAL_NAMES, *flexible_names(shooting.layout, shooting)]))
     pieces = {n: [window.slice(i * len(window) // n, (i + 1) * len(window) // n) for i in range(n)] for n in (1, 4, 16)}
     split = {n: Shooting.cut(parts, vehicle, SWARM_SECONDS) for n, parts in pieces.items()}

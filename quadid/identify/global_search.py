@@ -9,6 +9,7 @@ import numpy as np
 
 from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.identify.shooting import RIDGE, Free, Shooting
+from quadid.model.kernel import LANES
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 
@@ -41,7 +42,7 @@ def swarm_search(
     stated = dict(zip(NOMINAL_NAMES, shooting.vehicle.bounds, strict=True))
     box = np.array([stated.get(e.name, (e.lower, e.upper)) for e in free.entries])
     lower, upper = (free.scaled(bound) for bound in box.T)
-    cost = projected_cost(shooting, theta, free, SWARM_SEGMENTS)
+    cost = Projected(shooting, theta, free, SWARM_SEGMENTS).costs
     guess = np.clip(free.scaled(theta[free.index]), lower, upper)[None]
     settings = replace(options, initial_points=guess)
     swarm = Swarm(lower, upper, particles, seed, settings)
@@ -64,30 +65,41 @@ def _resolved(swarm: Swarm, settings: SwarmOptions) -> bool:
     return settings.tolerance > 0.0 and np.isfinite(worst) and worst - swarm.best_cost < RESOLUTION
 
 
-def projected_cost(shooting: Shooting, theta: FloatArray, free: Free, most: int) -> Callable[[FloatArray], FloatArray]:
-    """Cost of many parameter vectors at once on at most `most` segments, spread evenly.
+class Projected:
+    """Residuals of short segments without what their initial states can undo, for many parameter vectors at once.
 
     The directions of the initial states are taken at `theta` and projected out (variable projection): within a short
     segment they hardly depend on the parameters.
-
-    Returns:
-        A function of parameter vectors (m, size) giving costs (m,).
     """
-    n_pre, k = shooting.start_of(theta, free)
-    few = shooting.at_most(most)
-    sigma = np.sqrt(few.noise.variance)
-    jobs = []
-    for i, (rollout, segments, start) in enumerate(zip(few.rollouts, few.segments, few.starts(n_pre).x0, strict=True)):
-        x0 = start.copy()
-        rolled, steps = few.roll_directions(i, theta, few.free([]), x0, n_pre, k)
-        columns = rolled[0, ..., : few.channels, 1 : k + 1] - rolled[0, ..., : few.channels, :1]
-        flat = (columns / steps * (few.measured_weights(i) / sigma)[..., None]).reshape(len(x0), -1, k)
-        flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / RIDGE[:k])[None], len(flat), axis=0)], axis=1)
-        basis = np.ascontiguousarray(np.linalg.qr(flat)[0][:, :-k])  # once, not at every call
-        jobs.append((rollout, segments, x0, rollout.valid[:, : few.channels] / sigma, basis))
 
-    def cost(thetas: FloatArray) -> FloatArray:
-        parts = [r.costs(cut, thetas, x0, weights, basis, n_pre) for r, cut, x0, weights, basis in jobs]
+    def __init__(self, shooting: Shooting, theta: FloatArray, free: Free, most: int) -> None:
+        """Takes at most `most` segments, spread evenly, and the directions that matter beside `free`."""
+        self._n_pre, k = shooting.start_of(theta, free)
+        few = shooting.at_most(most)
+        sigma = np.sqrt(few.noise.variance)
+        self._jobs = []
+        windows = zip(few.rollouts, few.segments, few.starts(self._n_pre).x0, strict=True)
+        for i, (rollout, segments, start) in enumerate(windows):
+            x0 = start.copy()
+            rolled, steps = few.roll_directions(i, theta, few.free([]), x0, self._n_pre, k)
+            columns = rolled[0, ..., : few.channels, 1 : k + 1] - rolled[0, ..., : few.channels, :1]
+            flat = (columns / steps * (few.measured_weights(i) / sigma)[..., None]).reshape(len(x0), -1, k)
+            flat = np.concatenate([flat, np.repeat(np.diag(1e-6 / RIDGE[:k])[None], len(flat), axis=0)], axis=1)
+            basis = np.ascontiguousarray(np.linalg.qr(flat)[0][:, :-k])  # once, not at every call
+            self._jobs.append((rollout, segments, x0, rollout.valid[:, : few.channels] / sigma, basis))
+
+    def costs(self, thetas: FloatArray) -> FloatArray:
+        """Sums of squares, in the noise's units, shapes (m, size) -> (m,)."""
+        parts = [r.costs(cut, thetas, x0, weights, basis, self._n_pre) for r, cut, x0, weights, basis in self._jobs]
         return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
 
-    return cost
+    def residuals(self, thetas: FloatArray) -> FloatArray:
+        """What `costs` sums the squares of, shapes (m, size) -> (m, samples)."""
+        parts = []
+        for rollout, segments, x0, weights, basis in self._jobs:
+            out, _ = rollout.roll(segments, thetas, x0, None, self._n_pre)
+            scaled = out[..., : weights.shape[1], :] * weights[segments.rows][..., None]
+            flat = scaled.reshape(*out.shape[:2], -1, LANES)
+            flat = flat - np.matmul(basis, np.matmul(basis.transpose(0, 2, 1), flat))
+            parts.append(flat.transpose(0, 3, 1, 2).reshape(-1, flat.shape[1] * flat.shape[2])[: len(thetas)])
+        return np.concatenate(parts, axis=1)

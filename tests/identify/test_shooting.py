@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from quadid.errors import WindowError
 from quadid.flight import draw_truth, fly
-from quadid.identify.global_search import projected_cost
+from quadid.identify.global_search import Projected
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import MEASURED, VELOCITY_PRIOR, Free, Linearised, Shooting
@@ -316,7 +316,7 @@ def test_the_swarm_sees_the_same_valley_as_the_eliminated_cost() -> None:
     shooting = Shooting.cut([window], PELICAN, 0.2)
     truth = at_truth(shooting, flown(3).truth.parameters)
     free = shooting.free(NOMINAL_NAMES)
-    cost = projected_cost(shooting, truth, free, 10_000)
+    cost = Projected(shooting, truth, free, 10_000).costs
     rng = np.random.default_rng(0)
     thetas = np.array([free.move(truth, 0.05 * rng.standard_normal(6)) for _ in range(10)])
     swarm = cost(thetas)
@@ -327,7 +327,7 @@ def test_the_swarm_sees_the_same_valley_as_the_eliminated_cost() -> None:
     difference = swarm - np.array(plain)
     assert np.ptp(difference) < 0.02 * np.ptp(swarm)
     assert np.argmin(swarm) == np.argmin(plain)
-    assert len(projected_cost(shooting, truth, free, 5)(thetas[:3])) == 3
+    assert len(Projected(shooting, truth, free, 5).costs(thetas[:3])) == 3
 
 
 def test_robust_weights_of_two_windows_go_with_the_segments_that_are_taken() -> None:
