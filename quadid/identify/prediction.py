@@ -32,13 +32,11 @@ class HorizonScore:
         mean: mean error by sample after the start, shape (longest, 4), columns as `QUANTITIES`; row h - 1 is h samples
             on; NaN for what the log lacks.
         horizons: those asked for.
-        sum_to: number of rows in `sum`.
     """
 
     samples: int
     mean: FloatArray
     horizons: tuple[int, ...]
-    sum_to: int = SUM_TO
 
     def at(self, horizon: int) -> dict[str, float]:
         """Mean error after `horizon` samples by quantity; NaN for what the log lacks."""
@@ -46,8 +44,8 @@ class HorizonScore:
 
     @property
     def sum(self) -> dict[str, float]:
-        """Sum of the mean errors after 1, 2, … `sum_to` samples, by quantity."""
-        return dict(zip(QUANTITIES, self.mean[: self.sum_to].sum(axis=0).tolist(), strict=True))
+        """Sum of the mean errors after 1, 2, … `SUM_TO` samples, by quantity."""
+        return dict(zip(QUANTITIES, self.mean[:SUM_TO].sum(axis=0).tolist(), strict=True))
 
 
 def horizon_scores(

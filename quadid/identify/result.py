@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from quadid.identify.fit import Fit
-from quadid.identify.prediction import HorizonScore
+from quadid.identify.prediction import SUM_TO, HorizonScore
 from quadid.identify.score import SetScore
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia
@@ -184,5 +184,5 @@ def _horizon_entry(score: HorizonScore, gaps: int) -> JsonDict:
         "samples": score.samples,
         "gaps": gaps,
         "horizons": {str(h): score.at(h) for h in score.horizons},
-        "sum": {"to": score.sum_to, **score.sum},
+        "sum": {"to": SUM_TO, **score.sum},
     }
