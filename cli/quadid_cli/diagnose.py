@@ -43,17 +43,10 @@ def diagnose(
         train, held = read(logs), read(validate or [])
         with terminal.progress() as advance:
             done = work.diagnose(train, held, seed=seed, advance=advance)
-    target = free_path(folder / done.file_name, vehicle)
-    done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))
+    files = {"vehicle": free_path(folder / done.file_name, vehicle)}
     if done.prediction is not None:
-        predicts = free_path(folder / done.prediction_file_name, vehicle)
-        done.result["prediction_file"] = str(output.write_text(predicts, done.prediction.to_yaml()))
-    if report is not None:
-        done.result["report"] = str(done.report(report, output.command_line()))
-    if series:
-        done.result["series"] = [str(path) for path in done.save_series(folder, series)]
-    output.write_json(done.result, json)
-    tables.print_outcome(terminal.console(quiet=json == "-"), done)
+        files["prediction"] = free_path(folder / done.prediction_file_name, vehicle)
+    tables.conclude(done, json, report, files, series)
 
 
 def free_path(path: Path, given: str) -> Path:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from itertools import groupby
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -85,20 +83,15 @@ def excite(
 
 def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
-    from quadid_report.manoeuvres.plan import half_width
-    from quadid_report.text_table import Column, TextTable
+    from quadid_report.excite_page import gain_table, grouped
 
     from quadid.experiment import BLOCK
     from quadid_cli import tables, terminal
 
     console = terminal.console(quiet)
-    keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
-    rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in result["parameters"])
-    heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
-    title = f"Relative 95 % half-width (±) before and after {result['seconds']:g} s"
-    tables.print_tables(console, [TextTable(title, heads, rows)])
+    tables.print_tables(console, [gain_table(result)])
     console.print(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms")
-    for name, amplitudes, times in grouped(result["movements"]):
+    for name, times, amplitudes in grouped(result["movements"]):
         console.print(f"  {times} × {name}: {amplitudes}")
     peak = result["peak"]
     room, e = result["room"], result["envelope"]
@@ -116,14 +109,3 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
         console.print(f"To fly it: {path}", soft_wrap=True)
     if "report" in result:
         console.print(f"Report: {result['report']}", soft_wrap=True)
-
-
-def grouped(movements: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int]]:
-    """Movements that follow each other alike as one: name, amplitudes, how many times."""
-    each = [(m["name"], ", ".join(amplitude(a, v) for a, v in m["amplitudes"].items())) for m in movements]
-    return [(*move, len(list(same))) for move, same in groupby(each)]
-
-
-def amplitude(axis: str, value: float) -> str:
-    """An amplitude for people."""
-    return f"throttle {100.0 * value:.0f} %" if axis == "throttle" else f"{axis} {math.degrees(value):.1f}°"

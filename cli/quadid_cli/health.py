@@ -28,7 +28,7 @@ def health(
     from quadid_workflow import health as work
     from quadid_workflow.loading import load_vehicle
 
-    from quadid_cli import output, tables, terminal
+    from quadid_cli import output, tables
     from quadid_cli.explaining import explained
 
     output.check_file(json, "--json")
@@ -37,7 +37,4 @@ def health(
     described = load_vehicle(vehicle)
     with explained(report, f"Health of {described.name}", [*logs, *baseline], described, preset):
         done = work.health(logs, baseline, vehicle=described, preset=preset, unchecked=unchecked)
-    if report is not None:
-        done.result["report"] = str(done.report(report, output.command_line()))
-    output.write_json(done.result, json)
-    tables.print_outcome(terminal.console(quiet=json == "-"), done)
+    tables.conclude(done, json, report)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,10 +39,11 @@ def identify(
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid_workflow import identify as work
     from quadid_workflow.loading import load_vehicle
+    from quadid_workflow.reporting import known
     from quadid_workflow.searching import check_optimizer
     from quadid_workflow.series import check_kinds
 
-    from quadid_cli import output, terminal
+    from quadid_cli import output, tables, terminal
     from quadid_cli.explaining import explained
 
     check_optimizer(optimizer)
@@ -53,15 +53,20 @@ def identify(
     described = load_vehicle(vehicle)
     read = options.reader(described, rate, start, stop, preset, unchecked, columns)
     target = fitted_path(output.out_folder(out), described, vehicle)
+
+    def conclude(done: Identified) -> None:
+        basis = f"{done.vehicle.name}: {known(done.vehicle)}, from its file. All values depend on these."
+        tables.conclude(done, json, report, {"vehicle": target}, series, basis)
+
     with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
         train, held = read(logs), read(validate or [])
         try:
             with terminal.progress() as advance:
                 done = work.identify(train, held, optimizer=optimizer, seed=seed, advance=advance)
         except work.UnansweredError as error:
-            conclude(error.outcome, target, report, series or (), json)
+            conclude(error.outcome)
             raise
-    conclude(done, target, report, series or (), json)
+    conclude(done)
 
 
 def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
@@ -72,21 +77,3 @@ def fitted_path(folder: Path, vehicle: Vehicle, given: str) -> Path:
     if path.exists() and Path(given).exists() and path.samefile(given):
         raise OutputError(f"the result would overwrite {given}", "another folder", "use --out, or rename the vehicle")
     return path
-
-
-def conclude(done: Identified, target: Path, report: Path | None, series: Sequence[str], json: str | None) -> None:
-    """Writes the vehicle file, the report, series and JSON, and prints the result."""
-    from quadid_workflow.reporting import known
-
-    from quadid_cli import output, tables, terminal
-
-    done.result["vehicle_file"] = str(output.write_text(target, done.vehicle.to_yaml()))
-    if report is not None:
-        done.result["report"] = str(report.absolute())
-        done.report(report, output.command_line())
-    if series:
-        done.result["series"] = [str(path) for path in done.save_series(target.parent, series)]
-    output.write_json(done.result, json)
-    console = terminal.console(quiet=json == "-")
-    console.print(f"{done.vehicle.name}: {known(done.vehicle)}, from its file. All values depend on these.")
-    tables.print_outcome(console, done)

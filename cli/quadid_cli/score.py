@@ -29,14 +29,13 @@ def score(
     from quadid_workflow import score as work
     from quadid_workflow.loading import load_vehicle
 
-    from quadid_cli import output, tables, terminal
+    from quadid_cli import output, tables
 
     output.check_file(json, "--json")
     wanted = parse_horizons(horizons)
     read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
     done = work.score(read(logs), horizons=wanted, rate=rate)
-    output.write_json(done.result, json)
-    tables.print_outcome(terminal.console(quiet=json == "-"), done)
+    tables.conclude(done, json)
 
 
 def parse_horizons(text: str) -> list[int]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from quadid_report.text_table import SPACE, Cell, TextTable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from quadid_report.verdict import Verdict
     from quadid_workflow.outcome import Outcome
     from rich.console import Console
@@ -44,16 +46,40 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
         print_cell(console, Cell(line))
 
 
-def print_outcome(console: Console, outcome: Outcome) -> None:
-    """Prints tables, verdict and written files of a result; its warnings go to stderr."""
-    from quadid_cli.terminal import warn
+def conclude(
+    done: Outcome, json: str | None, report: Path | None = None, files: Mapping[str, Path] | None = None,
+    series: Sequence[str] | None = None, said: str = "",
+) -> None:  # fmt: skip
+    """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
 
-    print_tables(console, outcome.tables())
-    if outcome.verdict is not None:
-        print_verdict(console, outcome.verdict)
+    Args:
+        done: the result; its warnings go to stderr.
+        json: where its JSON goes, as `output.write_json`.
+        report: where its HTML report goes.
+        files: where its ``vehicle``, and its ``prediction``, go.
+        series: forms of simulated against measured, written beside the vehicle file.
+        said: what stands above the tables.
+    """
+    from quadid_cli import output, terminal
+
+    whole: Any = done  # which of these a command offers depends on its result
+    for name, path in (files or {}).items():
+        done.result[f"{name}_file"] = str(output.write_text(path, getattr(done, name).to_yaml()))
+    if report is not None:
+        done.result["report"] = str(report.absolute())
+        whole.report(report, output.command_line())
+    if series and files:
+        done.result["series"] = [str(path) for path in whole.save_series(files["vehicle"].parent, series)]
+    output.write_json(done.result, json)
+    console = terminal.console(quiet=json == "-")
+    if said:
+        console.print(said)
+    print_tables(console, done.tables())
+    if done.verdict is not None:
+        print_verdict(console, done.verdict)
     for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
-        if outcome.result.get(key):
-            console.print(f"{label}: {outcome.result[key]}", soft_wrap=True)
-    for path in outcome.result.get("series", ()):
+        if done.result.get(key):
+            console.print(f"{label}: {done.result[key]}", soft_wrap=True)
+    for path in done.result.get("series", ()):
         console.print(f"Simulated against measured: {path}", soft_wrap=True)
-    warn(outcome.warnings)
+    terminal.warn(done.warnings)

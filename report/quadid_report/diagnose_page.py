@@ -12,8 +12,9 @@ from quadid.identify.result import ScoredSet
 from quadid.identify.score import SCORE_SECONDS
 from quadid.types import Json
 from quadid_report.figures import MODELS, MOST_LOGS, channel_figures, error_figure, gain_figure
-from quadid_report.identify_page import noise_rows, parameter_row
-from quadid_report.page import number
+from quadid_report.identify_page import noise_table, parameter_row
+from quadid_report.page import number, unit
+from quadid_report.parts import measures
 from quadid_report.residual_maps import ResidualMap, map_figure
 from quadid_report.verdict import NOISE_LEVEL, Level, Verdict, percent
 
@@ -204,19 +205,16 @@ def remaining(result: Json, sets: Sequence[ScoredSet]) -> dict[str, Any]:
     """What is left: by channel, and what it follows."""
     channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
     rows = [
-        {
-            "channel": name,
-            "share": percent(share),
-            "rmse": channels[name].rmse if name in channels else None,
-            "unit": channels[name].unit if name in channels else "",
-        }
+        (name, percent(share), number(known.rmse if known else None, 3), unit(known.unit if known else ""))
         for name, share in sorted(result["unexplained"].items(), key=lambda item: -item[1])
+        for known in [channels.get(name)]
     ]
     follows = [
         f"the {f['acts_on']} follows {f['signal'].rstrip(',')} ({percent(f['share'])} of the noise)"
         for f in result.get("unexplained_follows", ())
     ]
-    return {"rows": rows, "follows": follows}
+    head = ("Channel", "Share of its error beyond noise", "Root mean squared error", "Unit")
+    return {"table": measures(head, rows, (1, 2)), "follows": follows}
 
 
 def diagnose_page(
@@ -234,6 +232,6 @@ def diagnose_page(
         "diagnoses": [{**part, "verdict": None}],
         "warnings": list(warnings),
         "quality": quality,
-        "noise": noise_rows(noise),
+        "noise": noise_table(noise),
         "provenance": provenance,
     }

@@ -6,12 +6,14 @@ import math
 from typing import Any
 
 from quadid.identify.excitation import Excitation
+from quadid_report.parts import rows_of
 from quadid_report.verdict import MOTION, percent
 
 SHARP = 0.02
 """Relative standard deviation below which more flying gains nothing that anybody needs."""
 COUPLED = 5.0
 """From this ratio on, it is the coupling with other parameters that limits, not the motion."""
+_HEAD = ("Parameter", "Best achievable σ", "If all others were known", "Manoeuvre needed")
 
 
 def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
@@ -23,16 +25,18 @@ def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
     """
     rows = []
     for name, bound, alone in zip(found.names, found.bound.tolist(), found.alone.tolist(), strict=True):
-        rows.append({
-            "name": name, "bound": _sigma(bound), "alone": _sigma(alone), "next": _advice(name, bound, alone, seconds),
-        })  # fmt: skip
+        rows.append((name, _sigma(bound), _sigma(alone), _advice(name, bound, alone, seconds)))
     sharp = all(b <= SHARP for b in found.bound.tolist())
     intro = (
         f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method, were the model right "
         "(Cramér–Rao bound): with all parameters unknown, and with all others known. If they differ much, the flight "
         "couples parameters."
     )
-    return {"intro": intro, "rows": rows, "done": "Nothing more needs to be flown for these." if sharp else ""}
+    return {
+        "intro": intro,
+        "table": rows_of(_HEAD, rows, classes=("", "number", "number", "")),
+        "done": "Nothing more needs to be flown for these." if sharp else "",
+    }
 
 
 def _sigma(bound: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
@@ -13,6 +14,7 @@ from quadid.window import Window
 from quadid_report.manoeuvres.plan import half_width
 from quadid_report.page import render
 from quadid_report.parts import axis, figure, rows_of, section, trace
+from quadid_report.text_table import Column, TextTable
 
 
 def excite_html(result: Json, window: Window) -> str:
@@ -22,15 +24,6 @@ def excite_html(result: Json, window: Window) -> str:
         result: of the form ``quadid.excite/1``.
         window: the manoeuvre as flown in simulation.
     """
-    gained = [
-        [p["name"], *(half_width(p[k]) for k in ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time"))]
-        for p in result["parameters"]
-    ]
-    each = [
-        (m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items()))
-        for m in result["movements"]
-    ]
-    moves = [[name, str(len(list(same))), size] for (name, size), same in groupby(each)]
     peak = result["peak"]
     return render({
         "title": f"What to fly next: {result['vehicle']}",
@@ -40,12 +33,12 @@ def excite_html(result: Json, window: Window) -> str:
                 "gain", "What it would gain",
                 "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
                 [_bars(result)],
-                [rows_of(("parameter", "now", "gentle flight", "manoeuvre", "one axis at a time"), gained)],
+                [gain_table(result).part()],
             ),
             section(
                 "manoeuvre", "The manoeuvre",
                 "Stick movements one after the other, and the attitude that the simulation flies.",
-                [_attitude(window)], [rows_of(("movement", "times", "amplitude, rms"), moves)],
+                [_attitude(window)], [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
             ),
             section(
                 "envelope", "Where it may be flown",
@@ -54,6 +47,20 @@ def excite_html(result: Json, window: Window) -> str:
             ),
         ],
     })  # fmt: skip
+
+
+def gain_table(result: Json) -> TextTable:
+    """Half-widths now, and after each kind of flight."""
+    keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
+    rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in result["parameters"])
+    heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
+    return TextTable(f"Relative 95 % half-width (±) before and after {result['seconds']:g} s", heads, rows)
+
+
+def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:
+    """Movements that follow each other alike as one: name, how many times, amplitudes."""
+    each = [(m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items())) for m in movements]
+    return [(name, str(len(list(same))), size) for (name, size), same in groupby(each)]
 
 
 def _limits(result: Json) -> list[list[str]]:

@@ -133,7 +133,7 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
     }  # fmt: skip
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
     changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
-    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], compact=True)
+    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], kind="compact")
     count = Counter(row["unit"] for row in rows if row["baseline"]).values()
     most = "up to " * (len(set(count)) > 1) + str(max(count))
     intro = (

@@ -37,7 +37,9 @@ def _section(
     if not rows:
         return None
     fold = f"All {len(rows)}" if len(rows) > FOLDED else ""
-    return section(identifier, title, intro + _left_out(rows), tables=[rows_of(head, rows[:MOST_ROWS], fold, True)])
+    return section(
+        identifier, title, intro + _left_out(rows), tables=[rows_of(head, rows[:MOST_ROWS], fold, "compact")]
+    )
 
 
 def _left_out(rows: Sequence[Any]) -> str:
@@ -55,7 +57,7 @@ def _units(summary: Json) -> JsonDict | None:
         ]
         if rows:
             title = f"{unit['unit']}: {unit['done']} of {unit['logs']} logs gave an answer"
-            tables.append({**rows_of(head, rows, title, True), "open": not tables})
+            tables.append({**rows_of(head, rows, title, "compact"), "open": not tables})
     intro = f"Spread between flights: robust standard deviation over the median.{_left_out(summary['units'])}"
     return section("vehicles", "Vehicles", intro, tables=tables) if tables else None
 
@@ -115,7 +117,7 @@ def every_log(logs: Sequence[Json]) -> JsonDict:
             )
             for log in some
         ]  # fmt: skip
-        tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", True))
+        tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", "compact"))
     intro = (
         "Error over one second of simulation, before and after, in noise variances: 1 is the noise floor. The worst "
         "come first. Dates are those of the clock in the log or of its file."

@@ -176,8 +176,6 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
     ]
     changes = [rows_of(("Change", "Found", "Rejected alternatives (probability)"), found)] if found else []
     trims = trim_table(result)
-    head = [column.heading for column in trims.columns]
-    rows = [[cell.text if isinstance(cell, Cell) else cell for cell in row] for row in trims.rows]
     return {
         "title": f"Health of {result['vehicle']}",
         "subtitle": f"{n} flight{'s' * (n != 1)} against {m} baseline flight{'s' * (m != 1)}",
@@ -185,7 +183,7 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
         "sections": [
             section("airframe", "Airframe", caption, picture=picture),
             section("changes", "What changed", intro, tables=changes),
-            section("trim", "Trim", trims.title, history, [rows_of(head, rows)]),
+            section("trim", "Trim", trims.title, history, [trims.part()]),
         ],
         "warnings": result["warnings"],
         "provenance": provenance,

@@ -10,9 +10,10 @@ from quadid.identify.noise_model import NoiseModel
 from quadid.identify.result import ScoredSet
 from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.parameters import ParameterSet
-from quadid.types import Json
+from quadid.types import Json, JsonDict
 from quadid_report.figures import MOST_LOGS, channel_figures, error_figure, parameter_figure
-from quadid_report.parts import rows_of, section
+from quadid_report.page import fit, number, unit
+from quadid_report.parts import measures, rows_of, section
 from quadid_report.verdict import at_bounds, identify_verdict, percent, reason, relative_halfwidth
 from quadid_report.words import parameter_name, status_words
 
@@ -39,11 +40,11 @@ def identify_page(
         "verdict": asdict(identify_verdict(result)),
         "parameters": [parameter_row(p, truth, at_bounds(result)) for p in result["parameters"]],
         "parameter_figure": parameter_figure(result["parameters"], truth),
-        "fit_names": [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in result["sets"])],
+        "fit": fit_table(result["sets"]),
         "sets": set_sections(result["sets"], sets),
         "warnings": result["warnings"],
         "quality": quality,
-        "noise": noise_rows(noise),
+        "noise": noise_table(noise),
         "provenance": provenance,
     }
 
@@ -79,16 +80,34 @@ def set_sections(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[dic
         figures = (
             [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)] if i < MOST_LOGS else []
         )
-        out.append({**entry, "figures": figures})
+        rows = [
+            (n, number(e["value"], 3), unit(e["unit"]), fit(entry["fit_percent"].get(n)))
+            for n, e in entry["rmse"].items()
+        ]
+        channels = measures(("Channel", "Root mean squared error", "Unit", "Fit"), rows, (1, 3))
+        out.append({**entry, "figures": figures, "channels": channels})
     return out
 
 
-def noise_rows(noise: NoiseModel) -> list[dict[str, Any]]:
+def fit_table(entries: Sequence[Json]) -> JsonDict:
+    """Errors of every log before and after, and how well channels fit."""
+    names = [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in entries)]
+    head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
+    rows = [
+        (
+            s["log"], "fitting" if s["role"] == "train" else "validation", number(s["mse"]["initial"], 3),
+            number(s["mse"]["fitted"], 3), *(fit(s["fit_percent"].get(n)) for n in names),
+        )
+        for s in entries
+    ]  # fmt: skip
+    return rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
+
+
+def noise_table(noise: NoiseModel) -> JsonDict:
     """Standard deviations of the white and the slow part of every channel."""
-    return [
-        {"name": name, "unit": unit, "white": float(white), "slow": float(slow)}
-        for name, unit, white, slow in zip(CHANNEL_NAMES, CHANNEL_UNITS, noise.white, noise.slow, strict=False)
-    ]
+    each = zip(CHANNEL_NAMES, noise.white, noise.slow, CHANNEL_UNITS, strict=False)
+    rows = [(name, number(float(white), 3), number(float(slow), 3), unit(of)) for name, white, slow, of in each]
+    return measures(("Channel", "White", "Slow", "Unit"), rows, (1, 2))
 
 
 def correlation_section(parameters: ParameterSet) -> dict[str, Any]:

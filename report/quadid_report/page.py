@@ -35,7 +35,7 @@ def render(page: Json) -> str:
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    environment.filters |= {"number": number, "code": code, "fit": fit, "unit": unit, "digits": digits}
+    environment.filters |= {"number": number, "code": code, "unit": unit, "digits": digits}
     figures = all_figures(page)
     scripts = {name: closed(text) for name, text in (("plotly", _drawing(figures)), ("page", _asset("page.js")))}
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())

@@ -26,9 +26,21 @@ def section(
     }  # fmt: skip
 
 
-def rows_of(head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", compact: bool = False) -> JsonDict:
-    """A table; folded under a line where one is given; on a phone each row is a card, or compact: a line or two."""
-    return {"head": list(head), "rows": [list(row) for row in rows], "fold": fold, "compact": compact}
+def rows_of(
+    head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", kind: str = "cards",
+    classes: Sequence[str] | None = None,
+) -> JsonDict:  # fmt: skip
+    """A table; folded under a line where one is given; `classes` are of the cells of each column.
+
+    On a phone each row is a card (`kind` ``cards``, ``cards narrow``), or a line or two (``compact``).
+    """
+    given = list(classes or ["wrap"] * len(head))
+    return {"head": list(head), "rows": [list(row) for row in rows], "fold": fold, "kind": kind, "classes": given}
+
+
+def measures(head: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int]) -> JsonDict:
+    """A narrow table in which the columns `numbers`, counted from 0, hold numbers."""
+    return rows_of(head, rows, kind="cards narrow", classes=["number" * (i in numbers) for i in range(len(head))])
 
 
 def figure(

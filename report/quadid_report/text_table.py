@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal, NamedTuple
 
+from quadid.types import JsonDict
+from quadid_report.parts import rows_of
+
 Tone = Literal["", "good", "fair", "poor", "title", "head", "dim"]
 """What a piece of text is, for whoever has colours."""
 SPACE = "  "
@@ -67,6 +70,10 @@ class TextTable:
             "<tr>" + "".join(f"<td>{escape(_cell(value).text)}</td>" for value in row) + "</tr>" for row in self.rows
         )
         return f"<table><caption>{escape(self.title)}</caption><tr>{head}</tr>{body}</table>"
+
+    def part(self) -> JsonDict:
+        """The table as part of a page, without its title."""
+        return rows_of([c.heading for c in self.columns], [[_cell(value).text for value in row] for row in self.rows])
 
     def _blocks(self, width: int) -> list[list[int]]:
         """Columns that stand beside each other: those kept, below each other where the width does not hold them.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from quadid_cli.excite import grouped
 from quadid_replay import write_csv
+from quadid_report.excite_page import grouped
 
 from tests.cli.conftest import Cli, Flights
 
@@ -43,4 +43,4 @@ def test_columns_are_named_wherever_a_log_is_read(command: str, renamed: Path, i
 
 def test_equal_movements_are_one_row() -> None:
     moves = [{"name": n, "amplitudes": {"roll": 0.1}} for n in ("a", "a", "b", "a")]
-    assert [(name, times) for name, _, times in grouped(moves)] == [("a", 2), ("b", 1), ("a", 1)]
+    assert [(name, times) for name, times, _ in grouped(moves)] == [("a", "2"), ("b", "1"), ("a", "1")]

@@ -12,7 +12,7 @@ def part(bound: list[float], alone: list[float]) -> list[str]:
     """Advice for b, d, J_zz with these bounds."""
     names = ("b", "d", "J_zz")
     found = Excitation(names, np.array(bound), np.array(alone), np.eye(3))
-    return [row["next"] for row in excitation_part(found, 60.0)["rows"]]
+    return [row[3] for row in excitation_part(found, 60.0)["table"]["rows"]]
 
 
 def test_each_reason_has_its_advice() -> None:

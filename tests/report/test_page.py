@@ -14,6 +14,7 @@ import pytest
 from quadid_report.diagnose_page import chance, diagnosis_part
 from quadid_report.identify_page import identify_page
 from quadid_report.page import code, fit, number, packed, render
+from quadid_report.parts import measures
 
 from quadid.identify.result import ScoredSet
 from quadid.identify.score import ChannelScore, Series, SetScore
@@ -76,7 +77,7 @@ def page(sets: list[ScoredSet]) -> str:
             "name": EVIL,
             "format": "mcap",
             "summary": [EVIL],
-            "channels": [{"name": "gyro", "rate": 50.0, "samples": 3, "source": EVIL, "faults": ""}],
+            "channels": measures(("Channel", "Source"), [("gyro", EVIL)], ()),
         }
     ]
     provenance = [{"name": EVIL, "value": EVIL}]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from quadid_workflow.identify import origin_remark, out_of_reach, proven
 from quadid_workflow.logs import Given, settled
 from quadid_workflow.outcome import NUMBER_COLUMNS, number_rows
 from quadid_workflow.progress import Advance, silent
-from quadid_workflow.reporting import LIBRARY, Reported, provenance, quality
+from quadid_workflow.reporting import LIBRARY, Fitted, provenance, quality
 from quadid_workflow.searching import OPTIMIZERS, search
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosed(Reported):
+class Diagnosed(Fitted):
     """What a diagnosis found.
 
     Attributes:
@@ -41,7 +41,6 @@ class Diagnosed(Reported):
         found: the diagnosis itself.
         sets: logs scored without and with the findings.
         noise: estimated sensor noise.
-        logs: as loaded, diagnosed ones first.
         nominal: vehicle that was given.
         search: how the causes were selected.
     """
@@ -65,7 +64,7 @@ class Diagnosed(Reported):
             {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
             for log, s in zip(self.logs, self.sets, strict=True)
         ]
-        return proven(vehicle, self.verdict, sets, self._train).with_remark(origin_remark(self._train))
+        return proven(vehicle, self.verdict, sets, self.train).with_remark(origin_remark(self.train))
 
     @property
     def prediction(self) -> Vehicle | None:
@@ -74,16 +73,12 @@ class Diagnosed(Reported):
             return None
         wiser = self.vehicle.model_copy(update={"residual": self.found.prediction.terms})
         remark = "Residual terms predict better; the physical values are those of the other file."
-        return wiser.with_remark(f"{origin_remark(self._train)}\n{remark}")
+        return wiser.with_remark(f"{origin_remark(self.train)}\n{remark}")
 
     @property
     def prediction_file_name(self) -> str:
         """``pelican+motor_lag+prediction.yaml``."""
         return f"{file_name(self.found.vehicle_name)}+prediction.yaml"
-
-    @property
-    def _train(self) -> list[Log]:
-        return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
 
     @property
     def file_name(self) -> str:
@@ -126,12 +121,6 @@ class Diagnosed(Reported):
 
         return channel_plot(self.sets[log], group, MODELS)
 
-    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
-        """Writes measured outputs of every log, and simulated ones without and with the findings, as mcap or csv."""
-        from quadid_workflow.series import save_series
-
-        return save_series(self.sets, self.logs, folder, kinds)
-
     def page(self, command: str = LIBRARY) -> str:
         """The page: findings with their pictures, parameters, residuals."""
         from quadid_report.diagnose_page import diagnose_page
@@ -151,7 +140,7 @@ class Diagnosed(Reported):
         """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
         from quadid_report.residual_maps import residual_map
 
-        windows = [w for log in self._train for w in log.windows]
+        windows = [w for log in self.train for w in log.windows]
         model = self.search.model
         drawn = {
             c.effect: residual_map(windows, self.nominal, model.theta, c.effect, c.names, self.noise)

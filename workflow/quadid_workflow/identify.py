@@ -13,7 +13,7 @@ from quadid.sanitise import LONGEST_LINE, plain
 from quadid_workflow.files import file_name
 from quadid_workflow.logs import Given, settled
 from quadid_workflow.progress import Advance, silent
-from quadid_workflow.reporting import LIBRARY, Reported, known, provenance, quality, told
+from quadid_workflow.reporting import LIBRARY, Fitted, known, provenance, quality, told
 from quadid_workflow.searching import OPTIMIZERS, check_optimizer, search
 
 if TYPE_CHECKING:
@@ -31,14 +31,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Identified(Reported):
+class Identified(Fitted):
     """What an identification found.
 
     Attributes:
         result: of the form ``quadid.identify/1``; ``vehicle_file`` is None until a file is written.
         fit: the fit itself.
-        sets: scored logs, for pictures.
-        logs: as loaded, training logs first.
     """
 
     result: dict[str, Any]
@@ -56,9 +54,8 @@ class Identified(Reported):
         """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
         from quadid.identify.result import fitted_vehicle
 
-        train = [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
-        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], train)
-        return vehicle.with_remark(origin_remark(train))
+        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], self.train)
+        return vehicle.with_remark(origin_remark(self.train))
 
     @property
     def file_name(self) -> str:
@@ -96,12 +93,6 @@ class Identified(Reported):
 
         return channel_plot(self.sets[log], group)
 
-    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
-        """Writes measured outputs of every log, and simulated ones before and after the fit, as mcap or csv."""
-        from quadid_workflow.series import save_series
-
-        return save_series(self.sets, self.logs, folder, kinds)
-
     def page(self, command: str = LIBRARY) -> str:
         """The page: parameters, errors of every log, correlations, what the flights excite."""
         from quadid_report.figures import MOST_LOGS
@@ -122,7 +113,7 @@ class Identified(Reported):
         page = identify_page(result, self.sets, fit.noise, [quality(log) for log in self.logs], rows)
         flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
         page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
-        page["excitation"] = told(fit, [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"])
+        page["excitation"] = told(fit, self.train)
         return render(page)
 
 

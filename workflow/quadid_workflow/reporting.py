@@ -18,6 +18,7 @@ from quadid_workflow.parts import parse_cut
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
+    from quadid.identify.result import ScoredSet
     from quadid.inspection import Inspection
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
@@ -38,6 +39,29 @@ class Reported(Outcome):
     def report(self, path: str | Path, command: str = LIBRARY) -> Path:
         """Writes the HTML report, as `page`."""
         return write_text(path, self.page(command))
+
+
+class Fitted(Reported):
+    """A result from logs that were fitted and scored.
+
+    Attributes:
+        sets: scored logs, for pictures.
+        logs: the same ones as loaded, training logs first.
+    """
+
+    sets: list[ScoredSet]
+    logs: list[Log]
+
+    @property
+    def train(self) -> list[Log]:
+        """The logs that were fitted."""
+        return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+
+    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
+        """Writes measured outputs of every log, and those of both simulations, as mcap or csv."""
+        from quadid_workflow.series import save_series
+
+        return save_series(self.sets, self.logs, folder, kinds)
 
 
 def known(vehicle: Vehicle) -> str:
@@ -84,6 +108,9 @@ def failure_html(
 
 def quality(log: Log) -> dict[str, Any]:
     """What one log offered and what of it was used."""
+    from quadid_report.page import number
+    from quadid_report.parts import measures
+
     from quadid.resample import sample_period
 
     grid = log.grid
@@ -93,16 +120,14 @@ def quality(log: Log) -> dict[str, Any]:
         f"rotor signal {grid.rotor_source} at {grid.rotor_rate:.3g} Hz",
         "all channels low-passed alike for the grid" if grid.filtered else "no filtering",
     ]
-    channels = [
-        {
-            "name": c.name,
-            "rate": 1.0 / sample_period(c.t) if len(c.t) > 1 else None,
-            "samples": len(c.t),
-            "source": c.source,
-            "faults": ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in c.faults.items()),
-        }
+    rows = [
+        (
+            c.name, f"{number(1.0 / sample_period(c.t) if len(c.t) > 1 else None, 3)} Hz", str(len(c.t)), c.source,
+            ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in c.faults.items()) or "none",
+        )
         for c in log.recording.channels.values()
-    ]
+    ]  # fmt: skip
+    channels = measures(("Channel", "Rate", "Samples", "Source", "Dropped"), rows, (1, 2))
     return {"name": log.recording.name, "format": log.recording.format, "summary": summary, "channels": channels}
 
 
