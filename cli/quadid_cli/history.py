@@ -66,16 +66,16 @@ def show(result: dict[str, Any], quiet: bool) -> None:
     console = terminal.console(quiet=quiet)
     if not result["sets"]:
         others = ", ".join(v["name"] for v in result["vehicles"]) or "none"
-        console.print(f"no sets of '{result['vehicle']}' yet; vehicles in this history: {others}", markup=False)
+        console.print(f"no sets of '{result['vehicle']}' yet; vehicles in this history: {others}")
     else:
         story = _story(result["sets"], f"Parameter sets of {result['vehicle']}")
         print_tables(console, [story, _values(result["sets"])])
         for item in result["sets"]:
-            console.print(f"set {item['sequence']}: {item['reason']}", markup=False)
+            console.print(f"set {item['sequence']}: {item['reason']}")
     for item in result["candidates"]:
-        console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}", markup=False)
+        console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}")
     for item in result["events"]:
-        console.print(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}", markup=False)
+        console.print(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}")
 
 
 def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:

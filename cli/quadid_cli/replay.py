@@ -249,15 +249,15 @@ def show(result: dict[str, Any], quiet: bool) -> None:
     console = terminal.console(quiet=quiet)
     for event in result["events"]:
         if event["level"] != "info" or event["kind"] == "accepted":
-            console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", markup=False, soft_wrap=True)
+            console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", soft_wrap=True)
     for check, count in result["refused"].items():
-        console.print(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}", markup=False)
+        console.print(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}")
     if not result["published"]:
         status = result["status"]
-        console.print(f"nothing published: {status['phase']}: {status['reason']}", markup=False, soft_wrap=True)
+        console.print(f"nothing published: {status['phase']}: {status['reason']}", soft_wrap=True)
         return
     last = result["published"][-1]
     console.print(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
     tables.print_tables(console, [parameter_table(last["parameters"])])
     if "out" in result:
-        console.print(f"Written: {result['out']}", markup=False, soft_wrap=True)
+        console.print(f"Written: {result['out']}", soft_wrap=True)

@@ -115,7 +115,7 @@ class _Console:
         from quadid.online import Event
 
         if isinstance(item, Event):
-            self._console.print(f"{item.level:7} {item.text}", markup=False, soft_wrap=True)
+            self._console.print(f"{item.level:7} {item.text}", soft_wrap=True)
 
     def report(self, health: Health) -> None:
         """A line when fits can begin, and one now and then about how things are."""
@@ -139,7 +139,6 @@ class _Console:
         status = health.status
         self._console.print(
             f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}",
-            markup=False,
             soft_wrap=True,
         )
 

@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 _PIPE_WIDTH = 120
 
 
-def console(quiet: bool = False, stderr: bool = False, markup: bool = False) -> Console:
+def console(quiet: bool = False, stderr: bool = False) -> Console:
     """Returns the console to print on.
 
     Args:
         quiet: print nothing (stdout carries JSON).
         stderr: print on stderr instead of stdout.
-        markup: ``[bold]`` and the like are styles; whoever sets this escapes what comes from a log.
 
-    Colours follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80 columns.
+    Nothing is markup.  Colours follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80
+    columns.
     """
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_WIDTH
-    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=markup)
+    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=False)
 
 
 def warn(messages: tuple[str, ...] | list[str]) -> None:

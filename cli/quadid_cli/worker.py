@@ -37,9 +37,9 @@ def worker(
     done = work(
         connect,
         lambda: stop() or time.monotonic() > end,
-        lambda text: console.print(plain(text), markup=False, soft_wrap=True),
+        lambda text: console.print(plain(text), soft_wrap=True),
     )
     stop.ignore_more()
     result = {"schema": "quadid.worker/1", "answered": done.answered, "refused": done.refused, "seconds": done.seconds}
-    console.print(f"{done.answered} requests answered, {done.refused} refused", markup=False)
+    console.print(f"{done.answered} requests answered, {done.refused} refused")
     output.write_json(result, json)
