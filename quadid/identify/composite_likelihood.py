@@ -8,7 +8,6 @@ Varin, Reid and Firth, Statistica Sinica 21 (2011) 5).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +16,6 @@ from quadid.identify.gauss_newton import Polished, polish
 from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.types import FloatArray, IndexArray
-
-Places = list[IndexArray]
 
 FEWEST_SEGMENTS = 10
 """Segments of the second cut below which it is not made."""
@@ -88,11 +85,9 @@ def _shared(
     """
     p = len(free.entries)
     own, cross = np.zeros((p, p)), np.zeros((p, p))
-    for one, later in _pairs(first, second, other):
-        (before,), (after,) = (
-            cut.taking(places).columns(other.theta, free, states.taking(places))
-            for (cut, states), places in zip(((first, found.states), (second, other.states)), (one, later), strict=True)
-        )
+    cuts = zip((first, second), (found.states, other.states), _compared(first, second, other), strict=True)
+    columns = (cut.taking(some).columns(other.theta, free, states.taking(some)) for cut, states, some in cuts)
+    for before, after in zip(*columns, strict=True):
         a, b = before.projected, after.projected
         place = {int(start): i for i, start in enumerate(before.rows[:, 0])}
         half, length = a.shape[1] // 2, a.shape[1]
@@ -105,24 +100,20 @@ def _shared(
     return own, 0.5 * (cross + cross.T)
 
 
-def _pairs(first: Shooting, second: Shooting, other: Polished) -> Iterator[tuple[Places, Places]]:
-    """Window by window places in the first cut, and those of the second that tell most and overlap them."""
+def _compared(first: Shooting, second: Shooting, other: Polished) -> tuple[list[IndexArray], list[IndexArray]]:
+    """Places, window by window, of segments of the first cut that overlap those of the second that tell most; these."""
     told = np.diagonal(other.lin.gram, axis1=1, axis2=2)
     total = told.sum(axis=0)
     weight = np.sum(told / np.where(total > 0.0, total, 1.0), axis=1)
     chosen = np.zeros(len(weight), dtype=bool)
     chosen[np.argsort(-weight, kind="stable")[:MOST_COMPARED]] = True
-    for w, rollout in enumerate(second.rollouts):
-        places = np.flatnonzero(chosen[other.lin.window == w])
-        if not len(places):
-            continue
-        v = next(i for i, r in enumerate(first.rollouts) if r is rollout)
+    later = [np.flatnonzero(chosen[other.lin.window == w]) for w in range(len(second.rollouts))]
+    one, left = [], list(zip(second.rollouts, later, strict=True))
+    for rollout, segments in zip(first.rollouts, first.segments, strict=True):
+        places = left.pop(0)[1] if left and left[0][0] is rollout else np.zeros(0, dtype=np.intp)
         both = np.union1d(places, places + 1)
-        none = np.zeros(0, dtype=np.intp)
-        yield (
-            [both[both < len(s.starts)] if i == v else none for i, s in enumerate(first.segments)],
-            [places if i == w else none for i in range(len(second.rollouts))],
-        )
+        one.append(both[both < len(segments.starts)])
+    return one, later
 
 
 def _products(a: FloatArray, b: FloatArray) -> FloatArray:
