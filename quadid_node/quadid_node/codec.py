@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from quadid.chi_square import Z95
+from quadid.jsonable import jsonable
 from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
 
@@ -93,14 +94,9 @@ def diagnosis_to_dict(item: Diagnosed) -> dict[str, Any]:
 
 def status_to_dict(status: SessionStatus) -> dict[str, Any]:
     """What a session is doing."""
-    return {
-        "t": number(status.t), "phase": status.phase.name.lower(), "reason": status.reason,
-        "excitation": {n: number(float(v)) for n, v in zip(NOMINAL_NAMES, status.excitation, strict=True)},
-        "samples": status.samples, "window_seconds": status.window_seconds, "gaps": status.gaps,
-        "mse": number(status.mse), "fits": status.fits, "rejected": status.rejected, "in_force": status.in_force,
-        "pending": status.pending, "stale": status.stale, "approval": status.approval,
-        "faults": dict(status.faults), "backlog": number(status.backlog),
-    }  # fmt: skip
+    excitation = dict(zip(NOMINAL_NAMES, status.excitation.tolist(), strict=True))
+    data: dict[str, Any] = jsonable({**vars(status), "phase": status.phase.name.lower(), "excitation": excitation})
+    return data
 
 
 def _float(value: float | None) -> float:

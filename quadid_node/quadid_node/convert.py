@@ -182,7 +182,7 @@ class Decoder:
             rank = self._ranks.get(channel)
             if rank is None:
                 continue
-            plain = _FAST[name](values) if name in _FAST else tuple(convert(np.array([values]))[0].tolist())
+            plain = tuple(convert(np.array([values]))[0].tolist())
             if channel in ("motor_command", "rotor_speed"):
                 plain = plain[: self._rotors]
             yield from self._chooser.take(Sample(t, channel, plain), rank + _BEHIND.get(name, 0))
@@ -198,47 +198,6 @@ _DENIABLE = {
     }
 }  # fmt: skip
 """Signals that a message may say to have none of, by a covariance of -1 (REP-145), and its field."""
-
-
-def _flip(v: Any) -> tuple[float, ...]:
-    """FLU to FRD, as `flip_body`, without an array."""
-    return (v[0], -v[1], -v[2])
-
-
-def _same(v: Any) -> tuple[float, ...]:
-    return tuple(v)
-
-
-def _attitude(q: Any) -> tuple[float, ...]:
-    """FLU->ENU to FRD->NED, as `flip_attitude`."""
-    w, x, y, z = q
-    return (_HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z))
-
-
-def _world(v: Any) -> tuple[float, ...]:
-    """ENU to NED, as `flip_world`."""
-    return (v[1], v[0], -v[2])
-
-
-_HALF = math.sqrt(0.5)
-_FAST: dict[str, Callable[[Any], tuple[float, ...]]] = {
-    "body_rate": _flip,
-    "body_force": _flip,
-    "attitude": _attitude,
-    "pose_attitude": _attitude,
-    "position": _world,
-    "velocity": _world,
-    "gyro": _same,
-    "accel": _same,
-    "rotor_speed": _same,
-    "motor_command": _same,
-    "outputs": _same,
-    "battery": _same,
-    "frd_attitude": _same,
-    "ned_position": _same,
-    "ned_velocity": _same,
-}
-"""Signals whose conversion needs no array; the numbers are the same to the bit."""
 
 
 def best_ranks(inputs: tuple[Input, ...]) -> dict[str, int]:
