@@ -14,6 +14,8 @@ from quadid.window import Channel, Recording, Sampling
 
 SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal says nothing about what happened between its samples; it is refused."""
+INERTIA_RATE = 30.0
+"""Rotor signal and gyro below this rate [Hz] reveal no inertia, lag or delay: the rate loop acts faster."""
 _HIGHEST_COMMAND = 1.5
 _HOW_TO_GET_MOTORS = (
     "log rotor speeds or motor outputs at 50 Hz or more: PX4 SDLOG_PROFILE high rate (actuator_motors, esc_status); "

@@ -6,10 +6,8 @@ import math
 
 from quadid.inspection.findings import ChannelFacts, Missing, Outlook
 from quadid.parameters import NOMINAL_NAMES
-from quadid.rotor_signal import SLOWEST_RATE
+from quadid.rotor_signal import INERTIA_RATE, SLOWEST_RATE
 
-INERTIA_RATE = 30.0
-"""Rotor signal and gyro below this rate [Hz] cannot reveal inertias: the rate loop acts faster."""
 _HOW: dict[str, dict[str, str]] = {
     "rotor": {
         "ulog": "set SDLOG_PROFILE to 17 (default + high rate), or list actuator_motors and esc_status in "

@@ -14,7 +14,7 @@ from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, CheckResult
 from quadid.resample import linear, moving_mean, sample_period
-from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.rotor_signal import INERTIA_RATE, RotorSignal, rotor_signal
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording
@@ -25,7 +25,6 @@ _FARTHEST = 25
 _BLOCK = 15.0
 _SLOW = 0.4
 """Motion slower than this [s] is left out, as in `motor_checks`."""
-_SLOWEST_RATE = 30.0
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
 _WANDER, _LATE, _EARLY = 0.012, 0.015, 0.2
@@ -51,7 +50,7 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     except QuadidError as error:
         return Check(name, CheckResult.UNKNOWN, error.found)
     slowest = max(sample_period(signal.t), sample_period(gyro.t))
-    if not slowest <= 1.0 / _SLOWEST_RATE:
+    if not slowest <= 1.0 / INERTIA_RATE:
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.
     width = max(3, round(2.5 * slowest / _STEP) | 1)

@@ -12,11 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from quadid.chi_square import Z95
+from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.online.consistency import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.jobs import Job, JobReply
 from quadid.online.records import Alternative, Diagnosed, OnlineFinding
+from quadid.rotor_signal import INERTIA_RATE
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class DiagnosisRequest(Job):
 
     Attributes:
         seed: of what is drawn.
+        slow: rotors were read too slowly to show lags and delays.
     """
 
     background: ClassVar[bool] = True
@@ -54,21 +57,24 @@ class DiagnosisRequest(Job):
     reply = DiagnosisReply
 
     seed: int
+    slow: bool = False
 
     def answer(self) -> DiagnosisReply:
         """Diagnoses the windows."""
         from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
 
         result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
-        return DiagnosisReply(self.number, "", tuple(map(_online, result.findings)), result.verdict.value)
+        findings = tuple(_online(f, self.slow) for f in result.findings)
+        return DiagnosisReply(self.number, "", findings, result.verdict.value)
 
 
-def _online(f: Finding) -> OnlineFinding:
+def _online(f: Finding, slow: bool) -> OnlineFinding:
+    sure = f.confident and not (slow and EFFECTS[f.effect].family == "late")
     return OnlineFinding(
         f.effect, {p.name: p.value for p in f.parameters},
         {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
         {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
-        tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, f.confident,
+        tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, sure,
     )  # fmt: skip
 
 
@@ -106,7 +112,8 @@ class BackgroundDiagnosis:
         if cut.reason or cut.seconds < COMPLETE * (tick - start):
             return None
         self._last = tick
-        self._asked = DiagnosisRequest(number, self._vehicle, cut.windows, start, tick, self._seed)
+        slow = any(cut.spacing * window.dt > 1.0 / INERTIA_RATE for window in cut.windows)
+        self._asked = DiagnosisRequest(number, self._vehicle, cut.windows, start, tick, self._seed, slow)
         return self._asked
 
     def deliver(self, reply: JobReply) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -85,3 +86,18 @@ def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
     assert not reply.problem
     assert reply.findings[0].effect == "rotor_drag"
     assert reply.findings[0].values["k_x"] == pytest.approx(0.35, rel=0.3)
+
+
+def test_a_lag_is_not_named_with_confidence_where_rotors_are_read_slowly() -> None:
+    """As by the command (`quadid_workflow.diagnose`): the lag is over before the next reading."""
+    made = flight(72.0, 11, effects=(("motor_lag", "tau", 0.06),))
+    fast = samples(made.recording)
+    kept = itertools.count()
+    slow = [s for s in fast if s.channel != "rotor_speed" or next(kept) % 4 == 0]
+    asked = [studies(drive(Session(PELICAN, QUICK), stream, diagnose=unanswered))[0] for stream in (fast, slow)]
+    assert [request.slow for request in asked] == [False, True]
+    for request in (asked[0], replace(asked[0], slow=True)):
+        reply = request.run()
+        assert isinstance(reply, DiagnosisReply)
+        (lag,) = (f for f in reply.findings if f.effect == "motor_lag")
+        assert lag.confident is not request.slow
