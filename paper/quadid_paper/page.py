@@ -71,7 +71,7 @@ def _about_parameters(result: Json) -> list[str]:
     inside, wrong = (sum(p[key][0] <= p["truth"] <= p[key][1] for p in rows) for key in ("extended_ci95", "ci95"))
     return [
         f"The 95 % intervals of the extended model contain {inside} of 6 true values, those of the nominal model "
-        f"{wrong}, widened by differences between estimates. d and J_zz are correlated by "
+        f"{wrong}, widened by differences between parts of the flight. d and J_zz are correlated by "
         f"{result['correlations'][1][4]:+.2f} in the nominal model.",
     ]
 

@@ -1,8 +1,9 @@
 """Whether a number deserves its name: estimates of one parameter that agree wherever the model is right.
 
-Short segments beside long ones, every second row (`coarse_grid`), and models with each cause added that the residual
-asks for, all estimate the same parameters.  What they differ by beyond chance belongs to the model, not to the noise:
-intervals are widened by it, and beyond `SPREAD_LIMIT` the number is not to be used.
+Blocks of time, short segments beside long ones, every second row (`coarse_grid`), and models with each cause added
+that the residual asks for, all estimate the same parameters.  What they differ by beyond chance belongs to the
+model, not to the noise: intervals are widened by it, between blocks as random effects (DerSimonian and Laird,
+Controlled Clinical Trials 7 (1986) 177), and beyond `SPREAD_LIMIT` the number is not to be used.
 """
 
 from __future__ import annotations
@@ -18,10 +19,14 @@ from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, uncertainty
 from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_estimation import flexible_names
-from quadid.identify.priors import Prior, default_prior, normal_equations
+from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance
 from quadid.identify.shooting import Free, Shooting
 from quadid.types import FloatArray, IndexArray
 
+BLOCKS = 6
+"""Blocks of time that are compared; enough that their spread is known to a third."""
+FEWEST_SEGMENTS = 10
+"""Segments that make a block."""
 CHANCE = 0.01
 """Probability with which a difference of right estimates is taken for one of the model."""
 MISFIT = 1.1
@@ -45,24 +50,23 @@ class Reliability:
     """What estimates of the parameters differ by, beyond chance.
 
     Attributes:
-        steps: from the fit to other estimates, scaled parameters, shape (estimates, P); names: what was different.
+        spread: standard deviation between estimates, scaled parameters, shape (P,).
+        widening: of the estimate itself, shape (P,): of many blocks their mean is known better than each.
+        steps: from the fit to other estimates, shape (estimates, P); names: what was different.
         misfit: the model misses something.
         missed: it misses the flight by so much that no number is to be used.
     """
 
+    spread: FloatArray
+    widening: FloatArray
     steps: FloatArray
     names: tuple[str, ...]
     misfit: bool
     missed: bool
 
-    @property
-    def spread(self) -> FloatArray:
-        """Distance of each parameter to its farthest other estimate, shape (P,)."""
-        return np.asarray(np.max(np.abs(self.steps), axis=0))
-
     def widened(self, unc: Uncertainty) -> Uncertainty:
         """Intervals that hold what the estimates differ by."""
-        return unc.widened(self.spread, self._counted(unc))
+        return unc.widened(self.widening, self._counted(unc))
 
     def _counted(self, unc: Uncertainty) -> FloatArray:
         """What has to stay below `SPREAD_LIMIT`, shape (P,)."""
@@ -74,7 +78,9 @@ class Reliability:
             return ("the model misses this flight by so much that its numbers are not to be used",)
         why: dict[str, list[str]] = {}
         for j in np.flatnonzero((self._counted(unc) > SPREAD_LIMIT) & free.is_log):
-            how = f"different {self.names[int(np.argmax(np.abs(self.steps[:, j])))]}"
+            k = int(np.argmax(np.abs(self.steps[:, j]))) if len(self.steps) else -1
+            close = k < 0 or abs(self.steps[k, j]) < self.spread[j]
+            how = f"different {'in another part of the flight' if close else self.names[k]}"
             if self.spread[j] <= SPREAD_LIMIT:
                 how = "uncertain, and the model misses something"
             why.setdefault(how, []).append(free.names[j])
@@ -96,6 +102,7 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         prior = Prior(prior.mean, np.maximum(prior.sigma, WIDE))
         found = polish(problem, found.theta, free, prior, found.states, settled=True)
     own = uncertainty(found.lin, prior)
+    between, mean = _between_blocks(found, prior, own)
     left = found.lin.reduced_chi_square
     # Beside random moments the model misses something, however well these account for it.
     misfit = problem.noise.moments is not None or left > MISFIT
@@ -107,7 +114,31 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         steps.append(step)
         names.append(f"with {name} in the model")
         left = min(left, remains)
-    return Reliability(np.array(steps), tuple(names), misfit, left > MISSED)
+    farthest = np.max(np.abs(steps), axis=0)
+    return Reliability(
+        np.maximum(between, farthest), np.hypot(mean, farthest), np.array(steps), tuple(names), misfit, left > MISSED
+    )
+
+
+def _between_blocks(found: Polished, prior: Prior, own: Uncertainty) -> tuple[FloatArray, FloatArray]:
+    """Standard deviation between blocks of time, and what it adds to that of their mean, shapes (P,)."""
+    lin, p = found.lin, len(prior.mean)
+    count = min(BLOCKS, len(lin.cost) // FEWEST_SEGMENTS)
+    if count < 3:
+        return np.zeros(p), np.zeros(p)
+    steps, variances = np.empty((count, p)), np.empty((count, p))
+    thin = Prior(prior.mean, np.sqrt(count) * prior.sigma)
+    for k, part in enumerate(np.array_split(np.arange(len(lin.cost)), count)):
+        covariance = posterior_covariance(lin.gram[part].sum(axis=0), thin)
+        steps[k] = -covariance @ (lin.grad[part].sum(axis=0) - lin.gradient / count)
+        variances[k] = np.diag(covariance) * own.inflation**2
+    weight = 1.0 / variances
+    total = weight.sum(axis=0)
+    q = np.sum(weight * (steps - np.sum(weight * steps, axis=0) / total) ** 2, axis=0)
+    excess = np.maximum(q - (count - 1), 0.0) / (total - np.sum(weight**2, axis=0) / total)
+    tau = np.where(q > exceeded(CHANCE, count - 1), np.sqrt(excess), 0.0)
+    mean = 1.0 / np.sum(1.0 / (variances + tau**2), axis=0) - 1.0 / total
+    return tau, np.sqrt(np.maximum(mean, 0.0))
 
 
 def _beyond_chance(found: Polished, free: Free, own: Uncertainty, other: Polished, prior: Prior) -> FloatArray:
