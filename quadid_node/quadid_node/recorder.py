@@ -18,6 +18,7 @@ from quadid_replay.mcap_metadata import read_metadata
 from quadid_replay.schemas import has_definition, whole_text
 
 from quadid.errors import LogError, QuadidError
+from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.codec import set_from_dict, set_to_dict
@@ -97,8 +98,9 @@ def read_beginning(path: Path) -> Beginning | None:
     try:
         left = json.loads(found["restored"])
         restored = Restored(
-            _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", ""))
-        )
+            _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", "")),
+            tuple(map(flight_from_dict, left.get("healthy", ()))),
+        )  # fmt: skip
         settings = SessionSettings.model_validate_json(found["settings"])
         return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
     except (KeyError, TypeError, ValueError, QuadidError) as error:
@@ -112,6 +114,7 @@ def _to_strings(beginning: Beginning) -> Mapping[str, str]:
         "next_sequence": left.next_sequence,
         "approval": left.approval,
         "baseline": set_to_dict(left.baseline) if left.baseline is not None else None,
+        "healthy": list(map(flight_to_dict, left.healthy)),
     }
     return {
         "vehicle": beginning.vehicle.to_yaml(),

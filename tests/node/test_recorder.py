@@ -16,6 +16,8 @@ from quadid_replay.mcap_metadata import read_metadata
 from quadid_replay.mcap_records import McapFile
 
 from quadid.errors import LogError
+from quadid.health.stored import flight_to_dict
+from quadid.health.trims import FlightTrim
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
@@ -28,7 +30,10 @@ EPOCH_NS = 1_700_000_000 * 10**9
 
 def beginning() -> Beginning:
     last = replace(online_set(TRUE), sequence=4)
-    return Beginning(PELICAN, SessionSettings(window=5.0, seed=7), "canonical", Restored(last, 5, last))
+    trim = np.array([0.1, -0.2, 0.3, 1.0 / 3.0])
+    healthy = FlightTrim("one", trim, np.array([trim, trim]), np.full(4, 0.25), 0.1 * trim, 60.0, "accelerometer")
+    restored = Restored(last, 5, last, healthy=(healthy,))
+    return Beginning(PELICAN, SessionSettings(window=5.0, seed=7), "canonical", restored)
 
 
 def messages(path: Path) -> list[tuple[str, str, bytes]]:
@@ -50,6 +55,8 @@ def test_what_a_session_began_with_comes_back_exactly(tmp_path: Path) -> None:
     assert np.array_equal(found.restored.item.parameters.covariance, written.restored.item.parameters.covariance), (
         "to the last bit"
     )
+    (healthy,) = found.restored.healthy
+    assert flight_to_dict(healthy) == flight_to_dict(written.restored.healthy[0]), "health is judged as it was"
 
 
 def test_messages_come_back_in_the_order_of_arrival(tmp_path: Path) -> None:
