@@ -15,9 +15,7 @@ A session stands still while a fit runs and catches up afterwards, so that nothi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from quadid.health.trims import FlightTrim
 from quadid.online.active_set import ActiveSet, Answer
@@ -36,7 +34,7 @@ from quadid.online.resampler import Resampler
 from quadid.online.rows import Rows
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
-from quadid.online.window_fit import is_excited
+from quadid.online.window_fit import FitReply, FitRequest, is_excited
 from quadid.online.window_supervisor import WindowSupervisor
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
@@ -87,7 +85,6 @@ class Session:
         self._windows = WindowSupervisor(vehicle, self._store, self.settings, self._outbox, self._supervisor)
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
-        self._on_reply: Callable[[Any], Iterator[None]] = iter
         self._outdated = 0
         self._now, self._tick_at = -math.inf, math.nan
         self._work: Iterator[None] | None = None
@@ -269,7 +266,7 @@ class Session:
         request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
-        self._await(request, partial(self._changed, request))
+        self._number, self._waiting = request.number, request
         self._reply = self._change_supervisor.answer_without_fit(request, self._estimator)
         if self._reply is None:
             self._outbox.act(request)
@@ -277,7 +274,7 @@ class Session:
     def _fit(self, tick: float) -> Iterator[None]:
         request = yield from self._windows.ask(self._number + 1, tick, self._estimator)
         if request is not None:
-            self._await(request, partial(self._supervisor.fitted, request))
+            self._number, self._waiting = request.number, request
             self._outbox.act(request)
 
     def _apply(self) -> Iterator[None]:
@@ -285,13 +282,8 @@ class Session:
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
-        yield from self._on_reply(reply)
-
-    def _changed(self, request: ChangeRequest, reply: ChangeReply) -> Iterator[None]:
-        self._change_supervisor.restart()
-        self._supervisor.changed(request, reply)
-        yield
-
-    def _await(self, job: Job, on_reply: Callable[[Any], Iterator[None]]) -> None:
-        """Stands still until the reply to a job is there; `on_reply` takes it in."""
-        self._number, self._waiting, self._on_reply = job.number, job, on_reply
+        if isinstance(request, FitRequest) and isinstance(reply, FitReply):
+            yield from self._supervisor.fitted(request, reply)
+        elif isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
+            self._change_supervisor.restart()
+            self._supervisor.changed(request, reply)

@@ -14,7 +14,7 @@ from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
 from quadid.online.gate import GateSettings, decide
 from quadid.online.outbox import Outbox
-from quadid.online.records import Diagnosed, OnlineSet, Phase, Publish, SetState
+from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 
@@ -60,14 +60,20 @@ class Supervisor:
 
     def changed(self, request: ChangeRequest, reply: ChangeReply) -> None:
         """Publishes what a sudden change was."""
-        outbox, finding = self._outbox, reply.finding
-        verdict = "explained" if finding is not None and finding.confident else "unknown"
-        start, stop = outbox.stamp(request.start), outbox.stamp(request.stop)
-        outbox.act(Diagnosed(stop, start, stop, (finding,) if finding is not None else (), verdict))
+        finding = reply.finding
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
-        outbox.say(request.stop, "warning", "finding", text)
+        self._has_changed(request.start, request.stop, finding, "finding", text, request.start + 0.1)
+
+    def _has_changed(
+        self, start: float, stop: float, finding: OnlineFinding | None, kind: str, text: str, learn_from: float
+    ) -> None:
+        """Says what happened between `start` and `stop` [s]; the set in force is out of date, learning begins anew."""
+        since, until = self._outbox.stamp(start), self._outbox.stamp(stop)
+        verdict = "explained" if finding is not None and finding.confident else "unknown"
+        self._outbox.act(Diagnosed(until, since, until, (finding,) if finding is not None else (), verdict))
+        self._outbox.say(stop, "warning", kind, text)
         self._outbox.act(*self._active_set.withdraw(text))
-        self.relearn(request.start + 0.1, "the vehicle has changed")
+        self.relearn(learn_from, "the vehicle has changed")
 
     def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
         """Takes in the fit of a window, piece by piece."""
@@ -110,12 +116,8 @@ class Supervisor:
         self._outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
         if request.start < self._disagrees_since - _EPS:
             return
-        start, stop = self._outbox.stamp(self._disagrees_since), self._outbox.stamp(request.stop)
-        self._outbox.act(Diagnosed(stop, start, stop, (), "unknown"))
         text = "windows disagree with the earlier estimate for the length of a window: learning restarts"
-        self._outbox.say(request.stop, "warning", "change", text)
-        self._outbox.act(*self._active_set.withdraw(text))
-        self.relearn(request.start, "the vehicle has changed")
+        self._has_changed(self._disagrees_since, request.stop, None, "change", text, request.start)
 
     def _rolled_back(self, estimate: WindowEstimate) -> bool:
         """Watches the set in force; rolls it back when its predecessor predicts new windows better."""
