@@ -189,26 +189,22 @@ def summary(
     """The replay as JSON, of the form ``quadid.replay/1``; times [s, UNIX], or since boot in a log that has no more."""
     from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
 
-    from quadid.online import Diagnosed, Event, Publish
-
-    sets = [o.item for o in outputs if isinstance(o, Publish) and o.topic == "parameters"]
+    sets = [o.item for o in outputs if o.topic == "parameters"]
+    estimates = [o.item for o in outputs if o.topic == "candidate"]
     refused: dict[str, int] = {}
-    for o in outputs:
-        if isinstance(o, Publish) and o.topic == "candidate" and o.item.state.value == "rejected":
-            refused[o.item.check] = refused.get(o.item.check, 0) + 1
-    every = [o.item for o in outputs if isinstance(o, Publish) and o.topic == "candidate"] if candidates else []
+    for item in estimates:
+        if item.state.value == "rejected":
+            refused[item.check] = refused.get(item.check, 0) + 1
     return {
         "schema": "quadid.replay/1",
         "log": recording.name,
         "epoch": 0,
         "vehicle": service.vehicle.name,
         "published": [set_to_dict(s) for s in sets],
-        **({"candidates": [set_to_dict(s, covariance=False) for s in every]} if candidates else {}),
+        **({"candidates": [set_to_dict(s, covariance=False) for s in estimates]} if candidates else {}),
         "refused": refused,
-        "diagnoses": [diagnosis_to_dict(o) for o in outputs if isinstance(o, Diagnosed)],
-        "events": [
-            {"t": o.t, "level": o.level, "kind": o.kind, "text": o.text} for o in outputs if isinstance(o, Event)
-        ],
+        "diagnoses": [diagnosis_to_dict(o) for o in outputs if o.topic == "diagnosis"],
+        "events": [{**vars(o)} for o in outputs if o.topic == "event"],
         "status": status_to_dict(service.session.status()),
         "warnings": list(recording.warnings),
     }
@@ -216,28 +212,15 @@ def summary(
 
 def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
     """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
-    from quadid_node.stamps import nanoseconds
-    from quadid_node.vehicle_health import health_message
+    from quadid_node.messages import RESULTS, TOPICS
     from quadid_replay import TopicWriter
 
-    from quadid.health.watch import HealthReport
-    from quadid.online import Diagnosed, Publish
-    from quadid_node import messages
-
     with TopicWriter(path) as writer:
-        for item in outputs:
-            if isinstance(item, Publish):
-                kind, topic = messages.PARAMETER_SET, messages.TOPICS[item.topic]
-                message, t = messages.parameter_set(item.item, vehicle), item.item.stop
-            elif isinstance(item, Diagnosed):
-                kind, topic = messages.DIAGNOSIS, messages.TOPICS["diagnosis"]
-                message, t = messages.diagnosis(item, vehicle), item.t
-            elif isinstance(item, HealthReport):
-                kind, topic = messages.HEALTH, "quadid/health"
-                message, t = health_message(item, vehicle), item.t
-            else:
-                continue
-            writer.write(topic, kind, message, nanoseconds(t))
+        for output in outputs:
+            if output.topic in RESULTS:
+                message = RESULTS[output.topic](output, vehicle, "")
+                stamp = message["header"]["stamp"]
+                writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
 
 
 def show(result: dict[str, Any], quiet: bool) -> None:

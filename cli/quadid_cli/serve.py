@@ -112,9 +112,7 @@ class _Console:
 
     def publish(self, item: Output) -> None:
         """A line for each event and finding."""
-        from quadid.online import Event
-
-        if isinstance(item, Event):
+        if item.topic == "event":
             self._console.print(f"{item.level:7} {item.text}", soft_wrap=True)
 
     def report(self, health: Health) -> None:

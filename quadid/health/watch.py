@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.special import stdtrit
@@ -60,6 +61,7 @@ class HealthReport:
         text: one sentence.
     """
 
+    topic: ClassVar[Literal["vehicle_health"]] = "vehicle_health"
     t: float
     verdict: str
     has_baseline: bool

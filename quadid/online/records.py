@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar, Literal
 
 from quadid.health.trims import FlightTrim
 from quadid.parameters import ParameterSet
@@ -83,7 +84,7 @@ class Publish:
         item: the set.
     """
 
-    topic: str
+    topic: Literal["parameters", "candidate"]
     item: OnlineSet
 
 
@@ -131,6 +132,7 @@ class Diagnosed:
         verdict: ``nothing_found``, ``explained``, ``partly_explained`` or ``unknown``.
     """
 
+    topic: ClassVar[Literal["diagnosis"]] = "diagnosis"
     t: float
     start: float
     stop: float
@@ -147,6 +149,7 @@ class HealthyFlight:
         trim: of the flight.
     """
 
+    topic: ClassVar[Literal["healthy_flight"]] = "healthy_flight"
     t: float
     trim: FlightTrim
 
@@ -162,6 +165,7 @@ class Event:
         text: sentence for people.
     """
 
+    topic: ClassVar[Literal["event"]] = "event"
     t: float
     level: str
     kind: str

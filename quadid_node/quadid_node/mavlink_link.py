@@ -11,7 +11,6 @@ from typing import Any
 from quadid_replay.tlog_messages import READERS
 
 from quadid.health.watch import HealthReport
-from quadid.online import Diagnosed, Event, Publish
 from quadid.online.records import OnlineSet
 from quadid.window import Sample
 from quadid_node.mavlink_decode import MavlinkDecoder
@@ -216,20 +215,20 @@ class MavlinkLink:
 
     def publish(self, output: Output) -> None:
         """Tells a result: numbers of a set in force, a line of text for what people should know."""
-        if isinstance(output, Publish) and output.topic == "parameters":
+        if output.topic == "parameters":
             self._set = output.item
             self._tell = self._clock()
             for index in range(len(parameters_of(self._set))):
                 self._send_parameter(index)
             self._send_values()
             self._say(6, f"quadid: set {output.item.sequence} {output.item.state.value}")
-        elif isinstance(output, Diagnosed):
+        elif output.topic == "diagnosis":
             for finding in output.findings:
                 numbers = " ".join(f"{n} {v:.3g}" for n, v in finding.values.items() if n != "time")
                 self._say(4, f"quadid: {finding.effect} {numbers}{'' if finding.confident else ' (?)'}")
-        elif isinstance(output, HealthReport):
+        elif output.topic == "vehicle_health":
             self._send_health(output)
-        elif isinstance(output, Event) and output.level != "info":
+        elif output.topic == "event" and output.level != "info":
             self._say(SEVERITY[output.level], f"quadid: {output.text}")
 
     def traffic(self) -> Traffic:

@@ -6,6 +6,7 @@ Times inside are stamps; `stamps.stamp` turns them into the two integers of buil
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from quadid.chi_square import Z95
@@ -13,15 +14,19 @@ from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Se
 from quadid.parameters import NOMINAL_NAMES
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
 from quadid_node.stamps import stamp
+from quadid_node.vehicle_health import health_message
 
 Message = dict[str, Any]
 
 PARAMETER_SET = "quadid_msgs/msg/ParameterSet"
-DIAGNOSIS = "quadid_msgs/msg/Diagnosis"
-FIT_STATUS = "quadid_msgs/msg/FitStatus"
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-HEALTH = "quadid_msgs/msg/Health"
-TOPICS = {"parameters": "quadid/parameters", "candidate": "quadid/candidate", "diagnosis": "quadid/diagnosis"}
+TOPICS = {
+    "parameters": ("quadid/parameters", PARAMETER_SET), "candidate": ("quadid/candidate", PARAMETER_SET),
+    "diagnosis": ("quadid/diagnosis", "quadid_msgs/msg/Diagnosis"),
+    "vehicle_health": ("quadid/health", "quadid_msgs/msg/Health"),
+    "status": ("quadid/status", "quadid_msgs/msg/FitStatus"),
+    "diagnostics": ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
+}  # fmt: skip
+"""Name and type of each topic."""
 SCHEMA_VERSION = 2
 BODY_FRAME = "base_link_frd"
 SET_STATES = {
@@ -105,6 +110,15 @@ def _finding(finding: OnlineFinding) -> Message:
         "alternatives_mse": [a.mse_after for a in finding.alternatives],
         "evidence": finding.evidence,
     }
+
+
+RESULTS: Mapping[str, Callable[[Any, str, str], Message]] = {
+    "parameters": lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
+    "candidate": lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
+    "diagnosis": lambda output, vehicle, _: diagnosis(output, vehicle),
+    "vehicle_health": lambda output, vehicle, _: health_message(output, vehicle),
+}
+"""Message of an output, by its topic; of the vehicle's name and the `boot_id` of `parameter_set`."""
 
 
 def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -> Message:

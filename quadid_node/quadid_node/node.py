@@ -18,8 +18,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from quadid.errors import QuadidError
-from quadid.health.watch import HealthReport
-from quadid.online import Diagnosed, Event, Publish
+from quadid.online import Publish
 from quadid_node import messages
 from quadid_node.chooser import Chooser
 from quadid_node.commands import Commands
@@ -43,7 +42,6 @@ from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
 from quadid_node.service import Service
 from quadid_node.speaker import Speaker
 from quadid_node.store import Store, default_path
-from quadid_node.vehicle_health import health_message
 from quadid_node.worker import ProcessWorker
 from quadid_node.workers import with_ground
 
@@ -234,16 +232,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 return
 
     def _put(self, output: Output) -> None:
-        if isinstance(output, Event):
+        if output.topic == "event":
             self._log(output.level, output.text)
         elif self._service is None or self._speaker is None or self._speaker.silent:
             return
-        elif isinstance(output, Publish):
-            self._speaker.publish(output.topic, messages.parameter_set(output.item, self._id, self._service.boot_id))
-        elif isinstance(output, HealthReport):
-            self._speaker.publish("health", health_message(output, self._id))
-        elif isinstance(output, Diagnosed):
-            self._speaker.publish("diagnosis", messages.diagnosis(output, self._id))
+        elif output.topic in messages.RESULTS:
+            fields = messages.RESULTS[output.topic](output, self._id, self._service.boot_id)
+            self._speaker.publish(output.topic, fields)
 
     def _log(self, level: str, text: str) -> None:
         """One call a level: rclpy remembers the level of each line of code and refuses another."""

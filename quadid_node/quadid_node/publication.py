@@ -8,6 +8,7 @@ from quadid.health.watch import HealthReport
 from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish
 
 Output = Publish | Diagnosed | HealthReport | HealthyFlight | Event
+"""What a service hands out; its `topic` says which it is, and is what the tables of the links are keyed by."""
 OF_SETS = ("accepted", "rollback")
 """Kinds of events that say which set is in force."""
 MOST_WAITING = 64
@@ -50,7 +51,7 @@ class Publication:
         out = [*self._released(), *free]
         self._forget_oldest()
         for output in out:
-            if isinstance(output, Publish) and output.topic == "parameters":
+            if output.topic == "parameters":
                 self.in_force = output.item
         return out
 
@@ -59,10 +60,10 @@ class Publication:
             return False
         if isinstance(output, Publish):
             return output.item.sequence > 0
-        return isinstance(output, Event) and output.kind in OF_SETS and bool(self._waiting)
+        return output.topic == "event" and output.kind in OF_SETS and bool(self._waiting)
 
     def _forget_oldest(self) -> None:
-        ours = [o for o in self._waiting if isinstance(o, Publish) and o.topic == "parameters"]
+        ours = [o for o in self._waiting if o.topic == "parameters"]
         while len(self._waiting) > MOST_WAITING:
             self._waiting.remove(next(o for o in self._waiting if not any(o is newest for newest in ours[-1:])))
 

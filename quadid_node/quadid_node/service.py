@@ -15,7 +15,7 @@ from pathlib import Path
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
 from quadid.online.outbox import Action
-from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish, SessionStatus, SetState
+from quadid.online.records import Event, OnlineSet, SessionStatus, SetState
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
 from quadid_node.publication import Output, Publication
@@ -273,18 +273,13 @@ class Service:
     def _journal(self, output: Output) -> None:
         if self._store is None:
             return
-        if isinstance(output, Event):
+        if output.topic == "event":
             self._store.event(output)
-        elif isinstance(output, Diagnosed):
+        elif output.topic == "diagnosis":
             self._store.diagnosis(output)
-        elif isinstance(output, HealthyFlight):
+        elif output.topic == "healthy_flight":
             self._store.healthy_flight(output.trim)
-        elif isinstance(output, Publish):
-            self._journal_set(output.topic, output.item)
-
-    def _journal_set(self, topic: str, item: OnlineSet) -> None:
-        assert self._store is not None
-        if topic == "candidate":
-            self._store.candidate(item)
-        if topic == "parameters" or item.state is SetState.PENDING:
-            self._store.numbered(item)
+        elif output.topic == "candidate":
+            self._store.candidate(output.item)
+        if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
+            self._store.numbered(output.item)

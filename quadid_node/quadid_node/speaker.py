@@ -15,9 +15,9 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 
-from quadid_node import messages
 from quadid_node.claim import Claim
 from quadid_node.convert import message_class, to_message
+from quadid_node.messages import TOPICS, Message
 from quadid_node.polling import NO_PUBLISHER_EVENTS
 
 # Said in full, so that they can be compared with what subscribers ask for.
@@ -28,12 +28,7 @@ USUAL_QOS = QoSProfile(
 LATCHED_QOS = QoSProfile(
     depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
 )  # fmt: skip
-KINDS = {
-    "parameters": messages.PARAMETER_SET, "candidate": messages.PARAMETER_SET, "diagnosis": messages.DIAGNOSIS,
-    "health": messages.HEALTH, "status": messages.FIT_STATUS, "diagnostics": messages.DIAGNOSTICS,
-}  # fmt: skip
-_NAMES = {**messages.TOPICS, "health": "quadid/health", "status": "quadid/status", "diagnostics": "/diagnostics"}
-LATCHED = ("diagnosis", "health")
+LATCHED = ("diagnosis", "vehicle_health")
 """Topics whose last message is for late joiners too, as is that of the parameters."""
 
 
@@ -52,10 +47,10 @@ class Speaker:
             observer: publish status and health only.
         """
         self._node = node
-        self.ours = node.resolve_topic_name(_NAMES["parameters"])
+        self.ours = node.resolve_topic_name(TOPICS["parameters"][0])
         self._publishers = {
             topic: self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS)
-            for topic in KINDS
+            for topic in TOPICS
             if topic != "parameters"
         }
         self._claim: Claim | None = None
@@ -78,13 +73,13 @@ class Speaker:
         """Looks who else publishes parameter sets; True when the topic has just become ours, if it is `wanted`."""
         return self._claim is not None and self._claim.step(wanted)
 
-    def publish(self, topic: str, fields: messages.Message) -> None:
+    def publish(self, topic: str, fields: Message) -> None:
         """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
         publisher = self._publishers.get(topic)
         if topic == "parameters" and self._claim is not None:
             publisher = self._claim.publisher
         if publisher is not None:
-            publisher.publish(to_message(KINDS[topic], fields))
+            publisher.publish(to_message(TOPICS[topic][1], fields))
 
     def deaf(self) -> dict[str, bool]:
         """For each topic of ours: whether somebody subscribes with a QoS that is not offered, and hears nothing."""
@@ -107,8 +102,9 @@ class Speaker:
         self._publishers.clear()
 
     def _create(self, topic: str, qos: Any) -> Any:
+        name, kind = TOPICS[topic]
         return self._node.create_lifecycle_publisher(
-            message_class(KINDS[topic]), _NAMES[topic], qos, event_callbacks=NO_PUBLISHER_EVENTS
+            message_class(kind), name, qos, event_callbacks=NO_PUBLISHER_EVENTS
         )
 
     def _kin(self) -> int:

@@ -17,20 +17,23 @@ import json
 import queue
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zenoh
 
-from quadid.health.watch import HealthReport
-from quadid.online import Diagnosed, Publish
 from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
 from quadid_node.publication import Output
 from quadid_node.service import Health, Service
 from quadid_node.vehicle_health import health_to_dict
 from quadid_node.zenoh_session import ZenohError, config_of, connect, key_of
 
-KINDS = ("parameters", "candidate", "diagnosis", "health", "vehicle_health")
+RESULTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
+    "parameters": lambda output: set_to_dict(output.item), "candidate": lambda output: set_to_dict(output.item),
+    "diagnosis": diagnosis_to_dict, "vehicle_health": health_to_dict,
+}  # fmt: skip
+"""What is told of an output, by its topic."""
+KINDS = (*RESULTS, "health")
 COMMANDS = ("approve", "rollback", "fit_now")
 MOST_COMMANDS = 16
 RETRY = 3.0
@@ -99,12 +102,8 @@ class ZenohLink:
 
     def publish(self, output: Output) -> None:
         """Tells a result."""
-        if isinstance(output, Publish):
-            self._put(output.topic, set_to_dict(output.item))
-        elif isinstance(output, Diagnosed):
-            self._put("diagnosis", diagnosis_to_dict(output))
-        elif isinstance(output, HealthReport):
-            self._put("vehicle_health", health_to_dict(output))
+        if output.topic in RESULTS:
+            self._put(output.topic, RESULTS[output.topic](output))
 
     def report(self, health: Health) -> None:
         """Tells how things are."""
