@@ -12,6 +12,7 @@ from quadid.diagnose.attribution import Identified, stated_errors, worths
 from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
 from quadid.diagnose.cross_validation import BLOCKS
 from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.log_evidence import better
 from quadid.diagnose.model import Model, free_names, refit, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes
 from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remainder
@@ -132,10 +133,9 @@ def _nominal_parameters(
 ) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
-    Estimates must agree as those of an identification, and with those of the models without each cause that is
-    `doubted` (by label): it stands for something else, which may do to them what it does.  Where the cause of the error
-    is unknown, so is what it does to them: none is to be used; nor an inertia beside a doubtful moment.  What is
-    `held`, and shows without any cause, is not concerned.
+    Estimates must agree as those of an identification, and with models without each cause `doubted` (by label).  Where
+    the cause of the error is unknown, none is to be used, nor an inertia beside a doubtful moment, nor what is `held`
+    beside causes that do not explain all.  What is `held` and shows without any cause is not concerned.
     """
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     trust = reliability(decisive, model, model.free, model.prior, brief)
@@ -157,6 +157,8 @@ def _nominal_parameters(
     spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
     if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
         spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
+    if held and verdict is not Explanation.EXPLAINED:
+        spoilt |= {tuple(held.parameters): "fast motion shows them beside causes that leave too much unexplained"}
     safe = held.regardless() if held and spoilt else set()
     for names, why in spoilt.items():
         open_to_it = set(names) - safe
@@ -221,7 +223,8 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple
         # One by one led nowhere; from everything at once it may.
         general = from_everything(schedule[-1], begun.flexible, begun.listed)
         other = select(schedule, begun.nominal, begun.listed, report, general)
-        search = min(search, other, key=lambda s: (-s.shooting.length, s.model.lin.reduced_chi_square))
+        longer = other.shooting.length - search.shooting.length
+        search = other if longer > 0 or (longer == 0 and better(other.model, search.model)) else search
     while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance

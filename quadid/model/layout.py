@@ -100,7 +100,7 @@ class Layout:
             p = EFFECTS["weak_rotor"].parameter(key)
             entries.extend(
                 Entry(f"weak_rotor.{p.entry or key}_{i + 1}", LOSS + k * self.rotors + i, "", 0.0, p.lower, p.upper,
-                      p.typical) for i in range(self.rotors)
+                      p.typical, p.sign) for i in range(self.rotors)
             )  # fmt: skip
         entries.extend(
             Entry(f"residual.{i + 1}", LOSS + 2 * self.rotors + i, term.unit, 0.0, -math.inf, math.inf,

@@ -52,6 +52,18 @@ def test_what_a_vehicle_may_have_is_believed() -> None:
     assert with_number("rotor_drag_moment.h_x", -0.06) == []
 
 
+def test_a_rotor_stronger_than_the_others_is_no_weak_rotor() -> None:
+    """A regression flight of a Crazyflie had one of -21 % beside a thrust coefficient 10 % too small, `identified`."""
+    problem = fitted(window_with({"weak_rotor": {"rotor": 2, "loss": 0.05}}), clean().shooting.noise)
+    start = Start(problem.nominal.theta, problem.nominal.states)
+    model = extend(problem.shooting, problem.nominal, cause(problem, "weak_rotor 2"), start, iterations=10)
+    assert doubts(model) == []
+    theta = model.theta.copy()
+    theta[problem.shooting.layout.entry("weak_rotor.loss_2").index] = -0.2
+    (reason,) = doubts(replace(model, theta=theta))
+    assert "weak_rotor.loss_2 = -0.2 cannot be negative" in reason
+
+
 def test_air_that_pushes_is_not_believed() -> None:
     (told,) = with_number("rotor_drag.k_y", -0.09)
     assert told.startswith("rotor_drag.k_y = -0.09 1/s cannot be negative")

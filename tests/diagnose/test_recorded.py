@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from quadid_replay import open_log
 
 import quadid
@@ -66,3 +67,15 @@ def test_a_crazyflie_without_attitude_has_its_lag_and_inertias_but_nothing_that_
     assert found.result["verdict"] == "unknown"
     assert not any(f["confident"] for f in found.result["findings"])
     assert not any(p["status"] == "identified" for p in found.result["parameters"])
+
+
+@pytest.mark.slow
+def test_a_healthy_crazyflie_has_no_strong_rotor_and_its_thrust_coefficient(data_dir: Path) -> None:
+    """Regressions give b = 3.70e-8 within 3 %; a rotor stronger by 21 %, which took a tenth of it, was confident."""
+    folder = data_dir / "crazyflie_rpm"
+    vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
+    train = windows_of(folder, vehicle, "figure8_22", "figure8_34")
+    found, _ = diagnose(train, vehicle, windows_of(folder, vehicle, "figure8_30"), predict=False)
+    assert not any(f.effect == "weak_rotor" and f.confident for f in found.findings)
+    b = next(p for p in found.parameters if p.name == "b")
+    assert b.status is not Status.IDENTIFIED or b.ci95[0] < 3.811e-8 and b.ci95[1] > 3.589e-8
