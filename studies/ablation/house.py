@@ -1,12 +1,14 @@
-"""How large the diagnosis is: files, lines, named numbers, layers of imports."""
+"""How large the core is, by package, and the diagnosis: files, lines, named numbers, layers of imports."""
 
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import quadid
 import quadid.diagnose
 
 ROOM = "quadid.diagnose."
@@ -42,6 +44,16 @@ def measured() -> House:
     trees = {p.stem: ast.parse(p.read_text(encoding="utf-8")) for p in paths}
     lines = sum(len(p.read_text(encoding="utf-8").splitlines()) for p in paths)
     return House(len(paths), lines, tuple(n for t in trees.values() for n in named_numbers(t)), _layers(trees))
+
+
+def core_lines() -> str:
+    """Lines of Python of the core, by package."""
+    root = Path(quadid.__path__[0])
+    lines: Counter[str] = Counter()
+    for path in root.rglob("*.py"):
+        package = path.relative_to(root).parts[0] if path.parent != root else "modules shared by all"
+        lines[package] += len(path.read_text(encoding="utf-8").splitlines())
+    return f"core {lines.total()}: " + ", ".join(f"{package} {n}" for package, n in sorted(lines.items()))
 
 
 def named_numbers(module: ast.Module) -> list[str]:

@@ -134,6 +134,10 @@ def _uncontradicted(*given: Any) -> Any:
     return replace(stated_errors(*given), contradicted=False)
 
 
+def _as_fitted(parameters: Any) -> Any:
+    return parameters, None
+
+
 def _first_guess(*given: Any, **more: Any) -> Any:
     return flexible_fit(*given[:2], given[2][:1], given[3], given[1].noise, **more)
 
@@ -160,6 +164,10 @@ RULES: dict[str, dict[str, Any]] = {
     "ordinary sizes last": {"ordinary": _given(False)},
     "contradiction by unseen data": {"stated_errors": _uncontradicted},
     "what the rest follows": {"follows": _given(())},
+    "fast motion beside unmodelled moments": {"held_by_quick_motion": _given(None)},
+    "moments that a rigid body can have": {"possible_moments": _as_fitted},
+    "slight steps and winds": {"slight_causes": _given({})},
+    "lags beside unreliable inertias": {"late_unknown": _given({})},
 }
 """Rules that are functions, and what stands in their place."""
 OUT: dict[str, Any] = {
