@@ -56,9 +56,9 @@ def excite(
 
     from quadid_cli import output, terminal
 
-    check_limits(seconds, tilt, rate_limit, battery)
-    check_forms(forms or ())
     heights = parse_height(height)
+    check_limits(seconds, tilt, rate_limit, heights, battery)
+    check_forms(forms or ())
     output.check_file(json, "--json")
     output.check_file(report, "--report")
     described = load_vehicle(vehicle)

@@ -39,7 +39,6 @@ def identify(
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid_workflow import identify as work
     from quadid_workflow.loading import load_vehicle
-    from quadid_workflow.reporting import known
     from quadid_workflow.searching import check_optimizer
     from quadid_workflow.series import check_kinds
 
@@ -55,8 +54,7 @@ def identify(
     target = fitted_path(output.out_folder(out), described, vehicle)
 
     def conclude(done: Identified) -> None:
-        basis = f"{done.vehicle.name}: {known(done.vehicle)}, from its file. All values depend on these."
-        tables.conclude(done, json, report, {"vehicle": target}, series, basis)
+        tables.conclude(done, json, report, {"vehicle": target}, series)
 
     with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
         train, held = read(logs), read(validate or [])

@@ -48,7 +48,7 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
 
 def conclude(
     done: Outcome, json: str | None, report: Path | None = None, files: Mapping[str, Path] | None = None,
-    series: Sequence[str] | None = None, said: str = "",
+    series: Sequence[str] | None = None,
 ) -> None:  # fmt: skip
     """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
 
@@ -58,7 +58,6 @@ def conclude(
         report: where its HTML report goes.
         files: where its ``vehicle``, and its ``prediction``, go.
         series: forms of simulated against measured, written beside the vehicle file.
-        said: what stands above the tables.
     """
     from quadid_cli import output, terminal
 
@@ -72,8 +71,8 @@ def conclude(
         done.result["series"] = [str(path) for path in whole.save_series(files["vehicle"].parent, series)]
     output.write_json(done.result, json)
     console = terminal.console(quiet=json == "-")
-    if said:
-        console.print(said)
+    if done.heading:
+        console.print(done.heading)
     print_tables(console, done.tables())
     if done.verdict is not None:
         print_verdict(console, done.verdict)

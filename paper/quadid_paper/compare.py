@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from quadid_workflow.logs import Given, settled
 from quadid_workflow.progress import Advance, silent
+from quadid_workflow.searching import check_seed
 
 from quadid.errors import ParameterError, nearest
 from quadid.types import JsonDict
@@ -64,6 +65,10 @@ def compare(
     from quadid_paper.subspace import METHODS as BLACK_BOXES
 
     names = check_names(methods, objective)
+    if not len(seeds):
+        raise ParameterError("no seed", "one or more", "for example seeds=(1, 2, 3)")
+    for seed in seeds:
+        check_seed(seed)
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 
@@ -66,8 +67,8 @@ def horizon_scores(
         ParameterError: impossible horizons.
         NotIdentifiableError: no run fits into any file, or there is no gyro.
     """
-    wanted = tuple(dict.fromkeys(int(h) for h in horizons))
-    if not wanted or min(wanted) < 1 or max(wanted) > LONGEST:
+    wanted = tuple(dict.fromkeys(horizons))
+    if not wanted or not all(isinstance(h, Integral) and 1 <= h <= LONGEST for h in wanted):
         raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
     longest = max(*wanted, SUM_TO)
     tallies = [_tally(windows, vehicle, theta, longest) for windows in files]

@@ -8,11 +8,13 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from quadid_paper.compare import compare
 from quadid_replay import write_csv
+from quadid_workflow.excite import propose
 from quadid_workflow.health import HealthOutcome
 from quadid_workflow.logs import settled
 
@@ -217,3 +219,39 @@ def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
     one = HealthOutcome({"changes": [some]}, found, Vehicle.shipped("pelican_x"), ())
     assert len(none.to_frame()) == 0
     assert list(none.to_frame()) == list(one.to_frame())
+
+
+@pytest.mark.parametrize(
+    ("call", "found"),
+    [
+        (lambda _: propose(height=(-50.0, 5000.0)), "height -50:5000"),
+        (lambda _: propose(height=(float("nan"), 40.0)), "height nan:40"),
+        (lambda _: propose(seed=-1), "seed -1"),
+        (lambda _: quadid.simulate(seconds=5.0, seed=-1), "seed -1"),
+        (lambda _: quadid.simulate(seconds=5.0, noise=-1.0), "noise -1"),
+        (lambda _: quadid.simulate(seconds=5.0, noise=float("nan")), "noise nan"),
+        (lambda _: quadid.simulate(seconds=5.0, spread=-0.1), "spread -0.1"),
+        (lambda _: quadid.simulate(seconds=5.0, manoeuvre="/"), "cannot read /"),
+        (lambda log: quadid.identify(log, vehicle="pelican", seed=-1), "seed -1"),
+        (lambda log: quadid.diagnose(log, vehicle="pelican", seed=cast(int, 1.5)), "seed 1.5"),
+        (lambda log: quadid.score(log, vehicle="pelican", horizons=cast(list[int], [1.5])), "horizons [1.5]"),
+        (
+            lambda log: quadid.score(log, vehicle="pelican", horizons=cast(list[int], "1,10")),
+            "horizons ['1', ',', '1', '0']",
+        ),
+        (lambda log: compare(log, vehicle="pelican", seeds=range(0)), "no seed"),
+    ],
+)
+def test_what_the_command_refuses_the_call_refuses_too(
+    call: Callable[[str], Any], found: str, logs: dict[str, str]
+) -> None:
+    with pytest.raises(QuadidError) as refused:
+        call(logs["good"])
+    assert found in str(refused.value)
+    assert refused.value.allowed
+
+
+def test_a_printed_fit_says_what_its_values_rest_on(logs: dict[str, str]) -> None:
+    fit = quadid.identify(logs["good"], vehicle="pelican")
+    assert "mass" in fit.heading
+    assert str(fit).startswith(fit.heading)

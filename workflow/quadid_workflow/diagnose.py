@@ -12,7 +12,7 @@ from quadid_workflow.logs import Given, settled
 from quadid_workflow.outcome import NUMBER_COLUMNS, number_rows
 from quadid_workflow.progress import Advance, silent
 from quadid_workflow.reporting import LIBRARY, Fitted, provenance, quality
-from quadid_workflow.searching import OPTIMIZERS, search
+from quadid_workflow.searching import OPTIMIZERS, check_seed, search
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -170,6 +170,7 @@ def diagnose(
     from quadid.diagnose.pipeline import diagnose as diagnose_windows
     from quadid.model.supply import with_reference_voltage
 
+    check_seed(seed)
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))

@@ -15,6 +15,7 @@ from quadid_workflow.files import file_name, write_text
 from quadid_workflow.loading import as_vehicle
 from quadid_workflow.logs import Given, read
 from quadid_workflow.progress import Advance, silent
+from quadid_workflow.searching import check_seed, search
 
 if TYPE_CHECKING:
     from quadid_report.manoeuvres.plan import Plan
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from quadid.window import Window
 
 MOST_SECONDS = 600.0
+_HEIGHTS = "LOWEST:HIGHEST in m above take-off, 2 to 500"
 ABORT = 1.4
 """Tilt beyond that of the simulation by which a script gives up: the vehicle is not the one that was simulated."""
 ROOM = 2.0
@@ -80,16 +82,15 @@ def parse_height(text: str) -> tuple[float, float]:
     """Reads ``10:40``, the lowest and highest height above take-off [m]; raises ParameterError for anything else."""
     low, _, high = text.partition(":")
     try:
-        heights = float(low), float(high)
-    except ValueError:
-        heights = (math.nan, math.nan)
-    if not 2.0 <= heights[0] < heights[1] <= 500.0:
-        raise ParameterError(f"--height {text}", "LOWEST:HIGHEST in m above take-off, 2 to 500", "for example 10:40")
-    return heights
+        return float(low), float(high)
+    except ValueError as error:
+        raise ParameterError(f"--height {text}", _HEIGHTS, "for example 10:40") from error
 
 
-def check_limits(seconds: float, tilt: float, rate_limit: float, battery: float) -> None:
+def check_limits(seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float) -> None:
     """Raises ParameterError for a manoeuvre that nobody can fly."""
+    if not 2.0 <= height[0] < height[1] <= 500.0:
+        raise ParameterError(f"--height {height[0]:g}:{height[1]:g}", _HEIGHTS, "for example 10:40")
     if not 6.5 <= seconds <= MOST_SECONDS:
         raise ParameterError(f"--seconds {seconds:g}", f"6.5 to {MOST_SECONDS:g} s")
     if not 2.0 <= tilt <= 60.0:
@@ -109,7 +110,6 @@ def knowledge(
     """
     from quadid.identify.result import fitted_vehicle
     from quadid.parameters import NOMINAL_NAMES
-    from quadid_workflow.searching import search
 
     if windows:
         fit = search("pso_polish", windows, vehicle, seed, advance)
@@ -145,7 +145,8 @@ def propose(
     from quadid.experiment import Limits, Simulator, manoeuvre_file
     from quadid.experiment import propose as chosen
 
-    check_limits(seconds, tilt, rate_limit, battery)
+    check_limits(seconds, tilt, rate_limit, height, battery)
+    check_seed(seed)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
     described = as_vehicle(vehicle)
     given = read(logs, described)

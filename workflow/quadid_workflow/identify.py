@@ -14,7 +14,7 @@ from quadid_workflow.files import file_name
 from quadid_workflow.logs import Given, settled
 from quadid_workflow.progress import Advance, silent
 from quadid_workflow.reporting import LIBRARY, Fitted, known, provenance, quality, told
-from quadid_workflow.searching import OPTIMIZERS, check_optimizer, search
+from quadid_workflow.searching import OPTIMIZERS, check_optimizer, check_seed, search
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,6 +68,11 @@ class Identified(Fitted):
         from quadid_report.verdict import identify_verdict
 
         return identify_verdict(self.result)
+
+    @property
+    def heading(self) -> str:
+        """What the values rest on."""
+        return f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these."
 
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
         """Parameters, beside the truth where a simulation knows it, and how well each log is followed."""
@@ -154,6 +159,7 @@ def identify(
     from quadid.model.supply import with_reference_voltage
 
     check_optimizer(optimizer)
+    check_seed(seed)
     given = settled(logs, validate, vehicle)
     train, held = given.train, given.held
     windows = [w for log in train for w in log.windows]

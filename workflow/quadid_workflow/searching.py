@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 from quadid.errors import ParameterError, nearest
@@ -25,6 +26,12 @@ def check_optimizer(name: str) -> None:
     """Raises ParameterError for an unknown search, with the nearest known one."""
     if name not in OPTIMIZERS:
         raise ParameterError(f"unknown optimizer '{name}'", ", ".join(OPTIMIZERS), nearest(name, OPTIMIZERS))
+
+
+def check_seed(seed: int) -> None:
+    """Raises ParameterError for a seed that no generator takes."""
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ParameterError(f"seed {seed}", "a whole number from 0 on")
 
 
 def search(

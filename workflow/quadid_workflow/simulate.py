@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.errors import ParameterError, QuadidError, nearest
 from quadid_workflow.loading import as_vehicle, write_recording
+from quadid_workflow.searching import check_seed
 
 if TYPE_CHECKING:
     from quadid.flight import Flight, Segment
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 SUFFIXES = (".mcap", ".tlog", ".csv")
 LONGEST = 3600.0
 """Longest flight [s]: every step of it is held in memory."""
+WIDEST = 0.9
+"""Largest fraction by which true parameters leave those of the type."""
 _LARGEST_MANOEUVRE = 1 << 20
 
 
@@ -70,6 +73,11 @@ def simulate(
 
     if not (math.isfinite(seconds) and 0.0 < seconds <= LONGEST):
         raise SimulateError(f"a flight of {seconds:g} s", f"more than 0 and at most {LONGEST:g} s")
+    if not (math.isfinite(noise) and noise >= 0.0):
+        raise ParameterError(f"noise {noise:g}", "a factor from 0 on")
+    if not 0.0 <= spread <= WIDEST:
+        raise ParameterError(f"spread {spread:g}", f"a fraction from 0 to {WIDEST:g}")
+    check_seed(seed)
     described = as_vehicle(vehicle)
     truth = draw_truth(described, seed, spread) if spread > 0.0 else TruthParameters.of(described)
     named, outside = parse_effects(effects, described, seed, seconds)
@@ -151,6 +159,8 @@ def read_manoeuvre(path: Path) -> list[Segment]:
         data = yaml.safe_load(path.read_bytes()[:_LARGEST_MANOEUVRE].decode("utf-8"))
     except FileNotFoundError as error:
         raise SimulateError(f"no manoeuvre file {path}", "a YAML file", "check the path") from error
+    except OSError as error:
+        raise SimulateError(f"cannot read {path}: {error.strerror}", "a YAML file", "check the path") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SimulateError(f"{path.name}: not YAML", "a list of segments") from error
     if isinstance(data, dict):
