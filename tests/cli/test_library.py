@@ -16,6 +16,7 @@ from quadid_paper.compare import compare
 from quadid_replay import write_csv
 from quadid_workflow.excite import propose
 from quadid_workflow.health import HealthOutcome
+from quadid_workflow.init import init
 from quadid_workflow.logs import settled
 
 import quadid
@@ -26,7 +27,7 @@ from quadid.vehicle import Vehicle
 from studies.health.flights import hover
 from tests.cli.conftest import Cli, Flights, one_line
 
-WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "log", "manoeuvre_file")
+WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "file", "log", "manoeuvre_file")
 """Paths of files, which only a command writes."""
 
 
@@ -130,6 +131,33 @@ def test_simulate_and_export_agree(inside: Cli, tmp_path: Path) -> None:
     assert same(run.data) == same(exported.result)
     for file in run.data["files"]:
         assert Path(file).read_text(encoding="utf-8") == exported.texts[Path(file).name]
+
+
+OTHERS: dict[str, tuple[list[str], Callable[[str, str], Any]]] = {
+    "health": (["{good}", "--baseline", "{other}", "--vehicle", "pelican"],
+               lambda a, b: quadid.health(a, baseline=b, vehicle="pelican").result),
+    "excite": (["--vehicle", "pelican", "--seconds", "13"], lambda a, b: propose(seconds=13.0).result),
+    "compare": (["{good}", "--validate", "{other}", "--vehicle", "pelican", "--method", "initial", "--method", "cva",
+                 "--seeds", "1"], lambda a, b: compare(load(a), load(b), methods=["initial", "cva"], seeds=(1,))),
+    "init": (["mine", "--mass", "1.2"], lambda a, b: init("mine", mass=1.2).result),
+}  # fmt: skip
+"""Commands whose functions `import quadid` does not offer, or that take more than one kind of log."""
+
+
+def timeless(result: Any) -> Any:
+    """A result without what only a command writes and without wall time, at any depth."""
+    if isinstance(result, dict):
+        return {k: timeless(v) for k, v in result.items() if k not in (*WRITTEN, "seconds")}
+    return [timeless(v) for v in result] if isinstance(result, list) else result
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_other_commands_and_calls_agree(name: str, inside: Cli, logs: dict[str, str], tmp_path: Path) -> None:
+    options, call = OTHERS[name]
+    run = inside(name, *(o.format(**logs) for o in options), "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+
+    assert timeless(run.data) == timeless(same(call(logs["good"], logs["other"])))
 
 
 PATHS: dict[str, Callable[..., Any]] = {
@@ -240,6 +268,9 @@ def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
             "horizons ['1', ',', '1', '0']",
         ),
         (lambda log: compare(log, vehicle="pelican", seeds=range(0)), "no seed"),
+        (lambda log: compare(log, vehicle="pelican", budget=3), "budget 3"),
+        (lambda _: init("mine", mass=-1.0), "mass -1"),
+        (lambda _: init("mine", arm=0.0), "arm 0"),
     ],
 )
 def test_what_the_command_refuses_the_call_refuses_too(

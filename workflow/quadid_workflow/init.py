@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from quadid.errors import VehicleError
+from quadid.errors import ParameterError, VehicleError
 from quadid.vehicle import Vehicle
 from quadid_workflow.files import write_text
 from quadid_workflow.loading import open_recording
@@ -68,7 +69,11 @@ def init(
     Raises:
         LogError: not readable, or neither airframe nor rotor signal in it.
         VehicleError: a name that no vehicle can have.
+        ParameterError: a mass or an arm that is not positive.
     """
+    for what, size, unit in (("mass", mass, "kg"), ("arm", arm, "m")):
+        if size is not None and not (math.isfinite(size) and size > 0.0):
+            raise ParameterError(f"{what} {size:g} {unit}", f"more than 0 {unit}")
     if log is None:
         text = _TEMPLATE.format(name=json.dumps(name))
         if mass is not None:
