@@ -256,7 +256,8 @@ def _gain_text(case: Case) -> str:
     total, n = float(np.sum(case.held_out)), len(case.held_out)
     if n == 0:
         return "narrower intervals than before"
-    return f"deviance on {n} unseen window{'s' * (n != 1)} {total:+.1f} better than before"
+    how = "better" if total > 0.0 else "no better"
+    return f"{how} on {n} held-out window{'s' * (n != 1)} (deviance {-total:+.1f})"
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (

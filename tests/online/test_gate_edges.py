@@ -34,11 +34,13 @@ def led_by(item: OnlineSet | ParameterSet, value: float, sigma: float = 0.01) ->
 @pytest.mark.parametrize(
     ("changes", "check", "reason"),
     [
-        ({}, "approval", "3 windows agree; deviance on 2 unseen windows +110.0 better than before"),
-        ({"approval": "manual"}, "approval", "waits for approval: 3 windows agree; deviance on 2 unseen windows"),
+        ({}, "approval", "3 windows agree; better on 2 held-out windows (deviance -110.0)"),
+        ({"approval": "manual"}, "approval", "waits for approval: 3 windows agree; better on 2 held-out windows"),
         ({"held_out": (), "in_force": online_set(TRUE, sigma=0.01)}, "approval",
          "3 windows agree; narrower intervals than before"),
-        ({"held_out": (7.0,), "in_force": online_set(TRUE)}, "approval", "3 windows agree; deviance on 1 unseen"),
+        ({"held_out": (-1.0,), "in_force": online_set(TRUE, sigma=0.01)}, "approval",
+         "3 windows agree; no better on 1 held-out window (deviance +1.0)"),
+        ({"held_out": (7.0,), "in_force": online_set(TRUE)}, "approval", "3 windows agree; better on 1 held-out"),
         ({"excited": False}, "excitation", "the newest window does not reveal roll and pitch"),
         ({"held_out": ()}, "held_out_gain", "no window yet that the estimate has not seen"),
         ({"held_out": (math.nan,)}, "held_out_gain", "the estimate cannot be scored on data it has not seen"),
