@@ -166,7 +166,9 @@ def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Mo
     return out
 
 
-def propose(simulator: Simulator, known: FloatArray, limits: Limits, seconds: float, advance: Advance) -> Proposal:
+def design_manoeuvre(
+    simulator: Simulator, known: FloatArray, limits: Limits, seconds: float, advance: Advance
+) -> Proposal:
     """Chooses a manoeuvre of about `seconds` and says what it would give.
 
     Args:

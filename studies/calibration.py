@@ -25,8 +25,8 @@ from scipy import stats
 from quadid.chi_square import Z95
 from quadid.diagnose import Diagnosis, Search, diagnose
 from quadid.diagnose import log_evidence as rule
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.cross_validation import Gain, paired_gain
-from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.model import Model, extend
 from quadid.diagnose.residual_tests import ALARM
 from quadid.diagnose.result import FoundParameter

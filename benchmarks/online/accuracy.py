@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.online.driving import drive, samples
 from quadid.flight import Flight, fly
 from quadid.identify.fit import FIT_SECONDS, FitOptions, fit
-from quadid.online import Diagnosed, Publish, Session
+from quadid.online import OnlineDiagnosis, Publish, Session
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 
@@ -62,7 +62,7 @@ def mass_changes(seeds: range) -> dict[str, Any]:
         fraction = CHANGE if seed % 2 == 0 else -CHANGE
         flight = flown(CHANGE_AT + 8.0, seed, mass_change={"time": CHANGE_AT, "fraction": fraction})
         actions = list(drive(Session(PELICAN), samples(flight.recording)))
-        found = [a for a in actions if isinstance(a, Diagnosed)]
+        found = [a for a in actions if isinstance(a, OnlineDiagnosis)]
         finding = found[0].findings[0] if found and found[0].findings else None
         rows.append({
             "seed": seed,
@@ -96,7 +96,7 @@ def hover(seconds: float, seeds: range) -> dict[str, Any]:
             "seconds": seconds,
             "published": sum(a.topic == "parameters" for a in sets),
             "candidates": sum(a.topic == "candidate" for a in sets),
-            "diagnoses": sum(isinstance(a, Diagnosed) for a in actions),
+            "diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions),
             "phase": session.status().phase.value,
         })  # fmt: skip
     return {"flights": rows}

@@ -73,7 +73,7 @@ def replay(
     from quadid_node.worker import InlineWorker
     from quadid_replay import open_log
     from quadid_workflow.loading import load_vehicle, parse_columns
-    from quadid_workflow.parts import parse_cut
+    from quadid_workflow.log_parts import parse_part
 
     from quadid_cli import output, terminal
 
@@ -83,7 +83,7 @@ def replay(
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
     settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
-    cut = parse_cut(log)
+    cut = parse_part(log)
     if as_recorded and cut.path != Path(log):
         raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
     recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.cross_validation import block_labels, paired_gain, steps_without, sum_by_block
-from quadid.diagnose.hypotheses import Candidate
 from quadid.diagnose.model import Model, free_names
 from quadid.effects import EFFECTS
 from quadid.identify.gauss_newton import polish
@@ -138,7 +138,7 @@ def block_deviance(scorer: Shooting, model: Model) -> tuple[FloatArray, float]:
     return sum_by_block(lin.cost + lin.occam, block_labels(lin)), lin.total_rows
 
 
-class Identified(NamedTuple):
+class NominalFit(NamedTuple):
     """The nominal model and the noise that errors are stated with: vehicle, full vector, noise."""
 
     vehicle: Vehicle
@@ -147,7 +147,7 @@ class Identified(NamedTuple):
 
 
 def stated_errors(
-    nominal: Identified, model: Model, windows: Sequence[Window], validation: Sequence[Window],
+    nominal: NominalFit, model: Model, windows: Sequence[Window], validation: Sequence[Window],
     deciding: tuple[float, float],
 ) -> Validation:  # fmt: skip
     """Errors without and with the findings, as `mse_score` has them; without validation logs, of blocks left out.
@@ -198,7 +198,7 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
     return reduce(add, parts).mse
 
 
-def _second_halves(nominal: Identified, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
+def _second_halves(nominal: NominalFit, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
     """Errors of second halves of logs without and with the findings, what belongs to a flight refitted on the first.
 
     None where nothing belongs to a flight, or no log is long enough.

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.cross_validation import held_out
-from quadid.diagnose.hypotheses import Candidate
 from quadid.effects import NEVER
 from quadid.identify.covariance import Uncertainty, uncertainty, variance_ratio
 from quadid.identify.gauss_newton import Polished, bounded_step, polish

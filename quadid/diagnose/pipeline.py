@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
-from quadid.diagnose.attribution import Identified, stated_errors, worths
+from quadid.diagnose.attribution import NominalFit, stated_errors, worths
 from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.cross_validation import BLOCKS
-from quadid.diagnose.hypotheses import Candidate, candidates
 from quadid.diagnose.log_evidence import better
 from quadid.diagnose.model import Model, free_names, refit, without
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes
@@ -56,7 +56,7 @@ LEAST_OF_EXPLAINED = 1e-3
 
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False, nominal: Identified | None = None, predict: bool = True,
+    progress: Progress | None = None, swarm: bool = False, nominal: NominalFit | None = None, predict: bool = True,
 ) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
@@ -88,7 +88,7 @@ def diagnose(
     report("validation", 0.0)
     fewer = {c.label: without(decisive, model, c) for c in model.causes}
     deciding, worth = worths(decisive, search.nominal, model, fewer, validation)
-    nominal = nominal or Identified(vehicle, search.nominal.theta, decisive.noise)
+    nominal = nominal or NominalFit(vehicle, search.nominal.theta, decisive.noise)
     outcome = stated_errors(nominal, model, windows, validation, deciding)
     doubts = impossible_causes(model) | inconstant_causes(model, left)
     unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from quadid.chi_square import Z95
 from quadid.diagnose.attribution import UNTIDY, untidy_sized
-from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.model import Model
 from quadid.effects import EFFECTS
 from quadid.parameters import Parameter, Status, at_bound

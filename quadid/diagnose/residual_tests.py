@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.model import Model
 from quadid.diagnose.residual_regressors import Follows, follows, strongest
 from quadid.effects import EFFECTS

@@ -10,7 +10,7 @@ from typing import Any
 
 from quadid.chi_square import Z95, survival
 from quadid.diagnose.attribution import Benefit, Validation, Worth
-from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.model import Model
 from quadid.diagnose.residual_tests import Remainder
 from quadid.diagnose.selection import Search
@@ -206,7 +206,7 @@ def _alternatives(search: Search, cause: Candidate, mse_after: float) -> tuple[A
     """
     found: dict[str, Alternative] = {}
     for step in search.rounds:
-        for t in step.trials:
+        for t in step.moves:
             holder = t.gone or (step.accepted.candidate if step.accepted else None)
             mine = step.before if t.gone or step.accepted is None else step.accepted.model
             if t.candidate is None or holder is None or holder.label != cause.label:

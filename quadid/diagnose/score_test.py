@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.diagnose.hypotheses import Candidate, unset_times
+from quadid.diagnose.candidates import Candidate, unset_times
 from quadid.diagnose.model import Model, free_names, taken_out_causes
 from quadid.identify.priors import prior_terms
 from quadid.identify.schur_complement import eliminated, freed

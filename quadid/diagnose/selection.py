@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.diagnose.hypotheses import Candidate
+from quadid.diagnose.candidates import Candidate
 from quadid.diagnose.log_evidence import better, worth_a_refit
 from quadid.diagnose.model import Model, Start, extend, fit_model, refit, sketch, taken_out, without
 from quadid.diagnose.plausibility import impossible_causes
@@ -27,7 +27,7 @@ MOST_REFITS = 7
 
 
 @dataclass(frozen=True)
-class Trial:
+class Move:
     """A move made: the cause that came (None: none), the one that left (None: none), and the refitted model."""
 
     candidate: Candidate | None
@@ -40,8 +40,8 @@ class Round:
     """One step of the selection: the moves refitted, and the one made (or None)."""
 
     before: Model
-    trials: tuple[Trial, ...]
-    accepted: Trial | None
+    moves: tuple[Move, ...]
+    accepted: Move | None
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def _only(shooting: Shooting, theta: FloatArray, causes: Sequence[Candidate]) ->
 
 def pruned(shooting: Shooting, model: Model) -> Model:
     """`model` without the causes that make it no better."""
-    while best := _best(model, [Trial(None, c, without(shooting, model, c)) for c in _removable(model)]):
+    while best := _best(model, [Move(None, c, without(shooting, model, c)) for c in _removable(model)]):
         model = best.model
     return model
 
@@ -135,19 +135,19 @@ def _round(stage: Stage, listed: Sequence[Candidate], seen: Collection[tuple[int
     shooting, model = stage.shooting, stage.model
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
-    trials: list[Trial] = []
+    moves: list[Move] = []
     best = None
-    for moves in (_adds_and_drops, _swaps):
+    for generated in (_adds_and_drops, _swaps):
         if best is None:
-            new = moves(shooting, everything, least)
-            trials += [t for t in new if _key(shooting, t.model) not in seen]
-            best = _best(model, trials)
-    return Round(model, tuple(trials), best)
+            new = generated(shooting, everything, least)
+            moves += [t for t in new if _key(shooting, t.model) not in seen]
+            best = _best(model, moves)
+    return Round(model, tuple(moves), best)
 
 
-def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
-    """The best of the trials that are better than `model`; those with impossible numbers only where no other is."""
-    good = [t for t in trials if better(t.model, model)]
+def _best(model: Model, moves: Sequence[Move]) -> Move | None:
+    """The best of the moves that are better than `model`; those with impossible numbers only where no other is."""
+    good = [t for t in moves if better(t.model, model)]
     best = None
     for t in [t for t in good if not impossible_causes(t.model)] or good:
         if best is None or better(t.model, best.model):
@@ -155,16 +155,16 @@ def _best(model: Model, trials: Sequence[Trial]) -> Trial | None:
     return best
 
 
-def _adds_and_drops(shooting: Shooting, everything: Everything, least: float) -> Iterator[Trial]:
+def _adds_and_drops(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move]:
     model = everything.model
     scores = [s for s in everything.scores() if s.candidate.start or s.drop > least]
     yield from _refits(shooting, model, scores, least, NEAR)
     for cause in _removable(model):
         if everything.loss(cause) < 4.0 * least:
-            yield Trial(None, cause, without(shooting, model, cause))
+            yield Move(None, cause, without(shooting, model, cause))
 
 
-def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator[Trial]:
+def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move]:
     """Look-alikes in the place of each cause."""
     model = everything.model
     for cause in _removable(model):
@@ -184,7 +184,7 @@ def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
 
 def _refits(
     shooting: Shooting, model: Model, scores: Sequence[Score], least: float, near: float, lost: float = 0.0
-) -> Iterator[Trial]:
+) -> Iterator[Move]:
     """Refits with one cause each, at most `MOST_REFITS`, until none is predicted to come `near` what one did gain.
 
     A prediction is linear and the effects are not, so what a refit brought counts, not what another one promised.
@@ -206,7 +206,7 @@ def _refits(
         if score.time is not None:
             extended = _refine_time(shooting, extended, score.candidate)
         gained = max(gained, lost + model.deviance - extended.deviance)
-        yield Trial(score.candidate, score.gone, extended)
+        yield Move(score.candidate, score.gone, extended)
 
 
 def _removable(model: Model) -> list[Candidate]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from quadid.chi_square import Z95
-from quadid.health.comparison import Explained, compare, distance, exact, p_healthy, p_unchanged
+from quadid.health.change_evidence import Explained, compare, distance, exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses
 from quadid.health.spread import Healthy, healthy_spread
 from quadid.health.trims import AXES, FlightTrim

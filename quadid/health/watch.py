@@ -15,8 +15,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import stdtrit
 
+from quadid.health.change_evidence import distance, p_healthy
 from quadid.health.changes import Change, changes_of
-from quadid.health.comparison import distance, p_healthy
 from quadid.health.spread import Healthy, healthy_spread
 from quadid.health.trims import AXES, FlightTrim, trim_of_load, wander
 from quadid.types import FloatArray

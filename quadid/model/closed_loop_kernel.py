@@ -21,7 +21,7 @@ from quadid.model.rotor_kernel import input_constants, turn_rotor
 from quadid.types import FloatArray, IntArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     A_G, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, R_NEXT, R_NOW, R_PAST, R_SPEED, ROTOR,
     S_FX, S_P, S_QW, X_P, X_QW,
 )  # fmt: skip

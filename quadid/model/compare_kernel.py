@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba as nb
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     C_VEL, C_VEL_Z, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_N, X_VN,
 )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once.
 
 Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
-trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `quadid.model.rows`.
+trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
 
 Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
 (`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
@@ -21,7 +21,7 @@ from quadid.model.layout import places
 from quadid.types import FloatArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DROP,
     C_DRAG_ARM, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY,
     C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX,

@@ -19,7 +19,7 @@ from quadid.model.layout import places
 from quadid.types import FloatArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     A_DO, A_O1, A_S1, A_S2, A_X2, A_Y2, A_Z2, C_CURVE, C_PART, C_SHIFT, C_TAU, C_TAU_DOWN, C_W0, DOWN, HALF, P_AT, P_E,
     P_E1, P_E2, P_E3, P_H, PIECE, R_DRAG, R_GAIN, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE,
     R_PAST, R_PAST_SLOPE, R_SPEED, T_A0, T_A1, T_S0, T_S1,

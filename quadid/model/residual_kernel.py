@@ -14,7 +14,7 @@ from quadid.model import layout as ix
 from quadid.types import FloatArray, IntArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     A_S2, A_X2, A_Y2, A_Z2, C_B, C_D, C_INVM, C_WE, C_WN, HALF, L_FX, L_NOW, L_PAST, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
     X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip

@@ -22,10 +22,10 @@ from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
 from quadid.model.recent import Recent
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
-from quadid.model.rows import ALL_MOMENTS, MAX_TANGENTS, N_STATE
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.model.supply import relative_voltage
+from quadid.model.work_array import ALL_MOMENTS, MAX_TANGENTS, N_STATE
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window

@@ -29,7 +29,7 @@ from quadid.model.rotor_kernel import PLAIN_MOMENTS, Drive, input_constants, rot
 from quadid.types import FloatArray, IntArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     A_G, ALL_MOMENTS, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, N_ROWS, N_STATE, ROTOR, S_FX, X_P, X_QW, X_QX, X_QY, X_QZ,
 )  # fmt: skip
 from quadid.model.sensor_kernel import (

@@ -29,7 +29,7 @@ from quadid.model.needs_kernel import Needs
 from quadid.types import FloatArray
 
 # isort: off
-from quadid.model.rows import (
+from quadid.model.work_array import (
     A_S2, A_X1, A_XX, A_XY, A_XZ, A_Y1, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS, C_GROWTH, C_HOVER, C_ROW, C_SHIFT,
     C_VOLT, HALF, N_ROWS, R_DRAG, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST,
     R_PAST_SLOPE, R_SPEED, ROTOR, T_VOLT,

@@ -52,7 +52,7 @@ def _sources() -> int:
     names = sorted(
         entry.name
         for entry in folder.iterdir()
-        if entry.name.endswith(("kernel.py", "rows.py", "layout.py", "simd.py", "piece.py"))
+        if entry.name.endswith(("kernel.py", "work_array.py", "layout.py", "simd.py", "piece.py"))
     )
     outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
     order = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters).encode()

@@ -17,7 +17,7 @@ from quadid.errors import QuadidError
 from quadid.online.consistency import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.jobs import Job, JobReply
-from quadid.online.records import Alternative, Diagnosed, OnlineFinding
+from quadid.online.records import OnlineAlternative, OnlineDiagnosis, OnlineFinding
 from quadid.rotor_signal import INERTIA_RATE
 from quadid.vehicle import Vehicle
 
@@ -74,7 +74,7 @@ def _online(f: Finding, slow: bool) -> OnlineFinding:
         f.effect, {p.name: p.value for p in f.parameters},
         {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
         {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
-        tuple(Alternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, sure,
+        tuple(OnlineAlternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, sure,
     )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ class BackgroundDiagnosis:
         if self._asked is not None and self._asked.is_answered_by(reply) and isinstance(reply, DiagnosisReply):
             self._reply = reply
 
-    def answer(self, tick: float, since: float) -> Diagnosed | None:
+    def answer(self, tick: float, since: float) -> OnlineDiagnosis | None:
         """What there is to publish of an answer, when it is time to use it; None where it was said before.
 
         Args:
@@ -138,7 +138,9 @@ class BackgroundDiagnosis:
         if reply.problem or (self._told is not None and _same(self._told, reply)):
             return None
         self._told, stop = reply, self._stamp(asked.stop)
-        return Diagnosed(stop, self._stamp(asked.start), stop, tuple(map(self._stamped, reply.findings)), reply.verdict)
+        return OnlineDiagnosis(
+            stop, self._stamp(asked.start), stop, tuple(map(self._stamped, reply.findings)), reply.verdict
+        )
 
     def _stamped(self, finding: OnlineFinding) -> OnlineFinding:
         if "time" not in finding.values:

@@ -40,7 +40,7 @@ _Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
-class Change:
+class ChangePoint:
     """A step.
 
     Attributes:
@@ -133,7 +133,7 @@ class ChangeDetector:
             np.array(astray), sigma,
         )  # fmt: skip
 
-    def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> Change | None:
+    def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> ChangePoint | None:
         """The strongest significant step of the last seconds, or None.
 
         Args:
@@ -149,12 +149,12 @@ class ChangeDetector:
         if doubt is not None:
             seen += [self._moment(axis, b, inertia, float(doubt[axis])) for axis in (0, 1)]
         first = max(len(t) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
-        best: Change | None = None
+        best: ChangePoint | None = None
         for split in range(first, len(t) - AFTER + 1):
             for name, (y, x, typical, astray) in zip(CHANNELS, seen, strict=False):
                 errors, size = step_beside(y, x, typical, split, LEAST, astray)
                 if errors > SIGNIFICANT and (best is None or errors > best.errors):
-                    best = Change(float(t[split]) - 0.5 * CHUNK, name, size, errors)
+                    best = ChangePoint(float(t[split]) - 0.5 * CHUNK, name, size, errors)
         return best
 
     def _thrust(self) -> _Series:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.online.change_detection import CHUNK, Change, ChangeDetector
+from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.fusion import DRIFT
@@ -28,7 +28,7 @@ _EPS = 1e-6
 class Seen:
     """A change that was seen: the step, and when it began, to a row [s]."""
 
-    change: Change
+    change: ChangePoint
     at: float
 
 
@@ -98,7 +98,7 @@ class ChangeSupervisor:
         return None
 
 
-def _unlearned(change: Change, time: float) -> OnlineFinding | None:
+def _unlearned(change: ChangePoint, time: float) -> OnlineFinding | None:
     """What a step of thrust means before anything was learned: mass or thrust, not to be told apart."""
     if change.channel != "thrust":
         return None

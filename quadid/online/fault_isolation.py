@@ -15,9 +15,9 @@ from quadid.identify.priors import Prior, posterior_covariance
 from quadid.identify.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout
-from quadid.online.change_detection import Change
+from quadid.online.change_detection import ChangePoint
 from quadid.online.jobs import Job, JobReply
-from quadid.online.records import Alternative, OnlineFinding
+from quadid.online.records import OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 
@@ -62,7 +62,7 @@ class ChangeRequest(Job):
     theta: FloatArray
     z_sigma: FloatArray
     noise: NoiseModel | None
-    change: Change
+    change: ChangePoint
     time: float
 
     def answer(self) -> ChangeReply:
@@ -165,7 +165,7 @@ def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]
     drop = (nothing.deviance - best.deviance) / scale
     values, sigma, units = _numbers(request, best)
     p_value = min(1.0, survival(drop, len(best.cause.names)) * len(outcomes))
-    alternatives = tuple(Alternative(name, r.mse) for name, r in rivals.items())
+    alternatives = tuple(OnlineAlternative(name, r.mse) for name, r in rivals.items())
     seen = request.change
     text = (
         f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "

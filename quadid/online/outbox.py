@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 from quadid.health.watch import HealthReport
 from quadid.online.jobs import Job
-from quadid.online.records import Diagnosed, Event, HealthyFlight, Phase, Publish
+from quadid.online.records import Event, HealthyFlight, OnlineDiagnosis, Phase, Publish
 
-Action = Job | Publish | Diagnosed | HealthReport | HealthyFlight | Event
+Action = Job | Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
 
 
 class Outbox:

@@ -89,7 +89,7 @@ class Publish:
 
 
 @dataclass(frozen=True)
-class Alternative:
+class OnlineAlternative:
     """A look-alike that was fitted against a finding, and the cost left with it (1: noise)."""
 
     effect: str
@@ -117,13 +117,13 @@ class OnlineFinding:
     mse_before: float
     mse_after: float
     p_value: float
-    alternatives: tuple[Alternative, ...]
+    alternatives: tuple[OnlineAlternative, ...]
     evidence: str
     confident: bool = True
 
 
 @dataclass(frozen=True)
-class Diagnosed:
+class OnlineDiagnosis:
     """Action: publish findings.
 
     Attributes:

@@ -2,9 +2,9 @@
 
     push(sample)            buffer it
     poll() -> actions       every tick of the data's own time, in order:
-        watch for sudden changes                -> ChangeRequest, Diagnosed
+        watch for sudden changes                -> ChangeRequest, OnlineDiagnosis
         compare with healthy flights            -> HealthReport, HealthyFlight
-        diagnose the last minute, now and then  -> DiagnosisRequest, Diagnosed; nothing waits for it
+        diagnose the last minute, now and then  -> DiagnosisRequest, OnlineDiagnosis; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
         FitRequest                              -> stops here until `deliver` brings the reply
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)

@@ -14,7 +14,7 @@ from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
 from quadid.online.gate import GateSettings, decide
 from quadid.online.outbox import Outbox
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, Publish, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 
@@ -70,7 +70,7 @@ class Supervisor:
         """Says what happened between `start` and `stop` [s]; the set in force is out of date, learning begins anew."""
         since, until = self._outbox.stamp(start), self._outbox.stamp(stop)
         verdict = "explained" if finding is not None and finding.confident else "unknown"
-        self._outbox.act(Diagnosed(until, since, until, (finding,) if finding is not None else (), verdict))
+        self._outbox.act(OnlineDiagnosis(until, since, until, (finding,) if finding is not None else (), verdict))
         self._outbox.say(stop, "warning", kind, text)
         self._outbox.act(*self._active_set.withdraw(text))
         self.relearn(learn_from, "the vehicle has changed")

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.jsonable import jsonable
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, SessionStatus, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
 
 
@@ -84,7 +84,7 @@ def finding_to_dict(finding: OnlineFinding) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def diagnosis_to_dict(item: Diagnosed) -> dict[str, Any]:
+def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
     """A diagnosis; times are stamps [s]."""
     return {
         "t": number(item.t), "start": number(item.start), "stop": number(item.stop), "verdict": item.verdict,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from quadid.chi_square import Z95
-from quadid.online.records import Diagnosed, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
 from quadid_node.stamps import stamp
@@ -73,7 +73,7 @@ def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
     }
 
 
-def diagnosis(item: Diagnosed, vehicle: str) -> Message:
+def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
     """quadid_msgs/Diagnosis of what was found."""
     nan = math.nan
     first = item.findings[0] if item.findings else None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Protocol
 
 from quadid.health.watch import HealthReport
-from quadid.online.records import Diagnosed, Event, HealthyFlight, OnlineSet, Publish
+from quadid.online.records import Event, HealthyFlight, OnlineDiagnosis, OnlineSet, Publish
 
-Output = Publish | Diagnosed | HealthReport | HealthyFlight | Event
+Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
 """What a service hands out; its `topic` says which it is, and is what the tables of the links are keyed by."""
 OF_SETS = ("accepted", "rollback")
 """Kinds of events that say which set is in force."""

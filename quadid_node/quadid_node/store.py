@@ -23,7 +23,7 @@ from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.trims import FlightTrim
 from quadid.online.gate import GateSettings
 from quadid.online.health_supervisor import MOST_FLIGHTS
-from quadid.online.records import Diagnosed, Event, OnlineSet
+from quadid.online.records import Event, OnlineDiagnosis, OnlineSet
 from quadid.vehicle import Vehicle
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
@@ -227,7 +227,7 @@ class Store:
         """Journals an event."""
         self._event(item.level, item.kind, item.text, item.t, None)
 
-    def diagnosis(self, item: Diagnosed) -> None:
+    def diagnosis(self, item: OnlineDiagnosis) -> None:
         """Journals findings."""
         quiet = item.verdict == "nothing_found"
         empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from quadid.health.comparison import LEAST_CHANCE
+from quadid.health.change_evidence import LEAST_CHANCE
 from quadid.types import Json
 from quadid_report.airframe_picture import change_value
 from quadid_report.parts import axis, figure, rows_of, section

@@ -13,8 +13,8 @@ from typing import Any
 
 import quadid.diagnose
 from quadid.diagnose.attribution import stated_errors
+from quadid.diagnose.candidates import candidates
 from quadid.diagnose.cross_validation import paired_gain
-from quadid.diagnose.hypotheses import candidates
 from quadid.diagnose.log_evidence import RELEVANT
 from quadid.diagnose.model import Model, fit_model
 from quadid.diagnose.pipeline import SHARE_TO_NAME

@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.diagnose import Diagnosis, Search, diagnose
 from quadid.diagnose.attribution import block_deviance
-from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.model import Model, Start, extend, fit_model
 from quadid.errors import QuadidError
 from quadid.flight import FlightError

@@ -1,4 +1,4 @@
-"""The faults, by row of the list in `tests/faults/rows.py`: each does its harm, and returns what it did."""
+"""The faults, by row of the list in `tests/faults/fault_list.py`: each does its harm, and returns what it did."""
 
 from __future__ import annotations
 

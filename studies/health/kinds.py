@@ -20,7 +20,7 @@ from math import ceil
 import numpy as np
 
 from quadid.health import Healthy
-from quadid.health.comparison import compare, exact
+from quadid.health.change_evidence import compare, exact
 from quadid.health.hypotheses import hypotheses
 from quadid.types import BoolArray, FloatArray
 from studies.health.limits import ASSESSED, DRAWS, Limits, spread_of

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from quadid.health import FlightTrim, Health, Healthy, assess, healthy_spread
+from quadid.health.change_evidence import distance
 from quadid.health.changes import SIGNIFICANT
-from quadid.health.comparison import distance
 from quadid.health.hypotheses import rotor_effect
 from quadid.types import BoolArray, FloatArray
 from studies.health.recorded import CRAZYFLIE, LARGE, Flown, Judged, is_large, is_single, kind_right, named_first, order

@@ -17,7 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 
 from benchmarks.online.accuracy import CHANGE, CHANGE_AT, PELICAN, flown
 from benchmarks.online.driving import drive, samples
-from quadid.online import Diagnosed, Publish, Session
+from quadid.online import OnlineDiagnosis, Publish, Session
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Window
@@ -143,7 +143,7 @@ def _session(seed: int) -> tuple[FloatArray, float, float]:
     cost = (time.process_time() - begin) / SECONDS
     last = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"][-1].parameters
     changed = flown(CHANGE_AT + 12.0, seed, mass_change={"time": CHANGE_AT, "fraction": CHANGE})
-    found = [a for a in drive(Session(PELICAN), samples(changed.recording)) if isinstance(a, Diagnosed)]
+    found = [a for a in drive(Session(PELICAN), samples(changed.recording)) if isinstance(a, OnlineDiagnosis)]
     named = [a for a in found if a.findings and a.findings[0].effect == "mass_change"]
     after = named[0].t - CHANGE_AT if named else float("nan")
     return np.log([last[n].value / truth[n] for n in NAMES]), after, cost

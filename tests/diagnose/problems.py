@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.model import Model, fit_model
 from quadid.flight import draw_truth, fly
 from quadid.identify.fit import SWARM_SECONDS

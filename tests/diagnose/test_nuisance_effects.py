@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from quadid.diagnose.attribution import ordinary
-from quadid.diagnose.hypotheses import candidates
+from quadid.diagnose.candidates import candidates
 from tests.diagnose.problems import clean
 
 

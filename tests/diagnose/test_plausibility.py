@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnose.hypotheses import candidates
+from quadid.diagnose.candidates import candidates
 from quadid.diagnose.model import Model, Start, extend, free_names, without
 from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes

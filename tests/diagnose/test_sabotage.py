@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from quadid.diagnose import pipeline, selection
-from quadid.diagnose.hypotheses import Candidate, candidates
+from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.log_evidence import better
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
 

@@ -1,4 +1,4 @@
-"""What tests measured against the rows of `tests.faults.rows`: collected, and written as one page.
+"""What tests measured against the rows of `tests.faults.fault_list`: collected, and written as one page.
 
 A test asks for the fixture `happened` and says what it saw, in one sentence with figures, next to the assertion that
 holds it.  `pytest --faults-page FILE tests` (`make faults`) runs the tests that do so, and writes the table.  Only what
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import pytest
 
 from studies.judged import judged
-from tests.faults.rows import FAULTS
+from tests.faults.fault_list import FAULTS
 
 Happened = Callable[[int, str], None]
 
@@ -39,7 +39,9 @@ def happened(request: pytest.FixtureRequest) -> Happened:
 
     def say(row: int, text: str) -> None:
         if row not in FAULTS:
-            raise ValueError(f"no row {row} among the faults {min(FAULTS)}..{max(FAULTS)} of tests/faults/rows.py")
+            raise ValueError(
+                f"no row {row} among the faults {min(FAULTS)}..{max(FAULTS)} of tests/faults/fault_list.py"
+            )
         request.node.user_properties.append((_KEY, [row, " ".join(text.split())]))
 
     return say

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from tests.faults.evidence import Evidence, page
-from tests.faults.rows import FAULTS
+from tests.faults.fault_list import FAULTS
 
 TESTS = """
 from tests.faults.evidence import Collector, happened

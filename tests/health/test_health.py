@@ -7,8 +7,8 @@ import pytest
 from quadid_report.health_page import change_words, health_verdict
 
 from quadid.errors import NotIdentifiableError
-from quadid.health import Health, assess, comparison, flight_trim, healthy_spread
-from quadid.health.comparison import exact, p_healthy, p_unchanged
+from quadid.health import Health, assess, change_evidence, flight_trim, healthy_spread
+from quadid.health.change_evidence import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
 from quadid.health.trims import trim_directions, trim_of_load
 from quadid.vehicle import GRAVITY, Vehicle
@@ -66,11 +66,11 @@ def test_a_flight_far_from_its_only_baseline_in_every_trim_is_not_called_unchang
 def test_what_draws_of_healthy_flights_show_is_found_once_for_all_flights_after_a_baseline() -> None:
     """A fleet compares each flight of a vehicle with the same first ones; each alone would draw them again."""
     baseline = [flight_trim(hover(PELICAN_X, seed=1000 + k), PELICAN_X) for k in range(5)]
-    comparison._evidence_of_draws.cache_clear()
+    change_evidence._evidence_of_draws.cache_clear()
     found = [assess([flight_trim(hover(PELICAN_X, seed=k), PELICAN_X)], baseline, PELICAN_X) for k in range(3)]
-    assert comparison._evidence_of_draws.cache_info().misses == 1
+    assert change_evidence._evidence_of_draws.cache_info().misses == 1
     for one in found:
-        comparison._evidence_of_draws.cache_clear()
+        change_evidence._evidence_of_draws.cache_clear()
         assert p_unchanged(one.trim - one.healthy.mean, one.healthy, 1, PELICAN_X) == one.p_value
 
 

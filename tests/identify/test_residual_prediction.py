@@ -14,7 +14,7 @@ from quadid_replay import open_log
 from typer.testing import CliRunner
 
 from quadid.diagnose import diagnose, pipeline
-from quadid.diagnose.hypotheses import candidates
+from quadid.diagnose.candidates import candidates
 from quadid.flight import fly
 from quadid.grid import grid_recording
 from quadid.identify.residual_prediction import AHEAD, _relative, learn_prediction

@@ -18,7 +18,7 @@ from quadid_node.mavlink_requests import Requests
 from quadid_node.mavlink_wire import LinkError, SafeMavlink, dialect, frames
 from quadid_replay.tlog_writer import mavlink_messages
 
-from quadid.online.records import Diagnosed, Event, OnlineFinding
+from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, accepted, free_port, samples
 from tests.online.driving import flight
@@ -111,7 +111,7 @@ def test_results_are_told_as_numbers_and_text(link: MavlinkLink, port: int) -> N
     samples(link, 0.1)
     link.publish(accepted())
     finding = OnlineFinding("mass_change", {"time": 1.0, "fraction": 0.15}, {}, {}, 3.0, 1.0, 0.0, (), "seen")
-    link.publish(Diagnosed(44.0, 40.0, 44.0, (finding,), "explained"))
+    link.publish(OnlineDiagnosis(44.0, 40.0, 44.0, (finding,), "explained"))
     link.publish(Event(1.0, "error", "worker", "the fit process \x1b[31mdied\n" + "x" * 200))
     heard = vehicle.heard()
     values = {m.name: m.value for m in heard if m.get_type() == "NAMED_VALUE_FLOAT"}

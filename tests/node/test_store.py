@@ -17,7 +17,7 @@ from quadid_node.store import Store
 from quadid_node.store_file import StoreError, connect, read_history
 
 from quadid.online.active_set import ActiveSet
-from quadid.online.records import Diagnosed, Event, OnlineFinding, Publish, SetState
+from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding, Publish, SetState
 from tests.faults.evidence import Happened
 from tests.online.test_gate import TRUE, online_set
 
@@ -34,7 +34,7 @@ def filled(path: Path, sets: int = 2) -> Store:
     finding = OnlineFinding(
         "mass_change", {"fraction": 0.15}, {"fraction": 0.01}, {"fraction": ""}, 3.0, 1.0, 1e-9, (), "seen"
     )
-    store.diagnosis(Diagnosed(44.0, 40.0, 44.0, (finding,), "explained"))
+    store.diagnosis(OnlineDiagnosis(44.0, 40.0, 44.0, (finding,), "explained"))
     return store
 
 

@@ -16,7 +16,7 @@ from quadid_node.zenoh_fleet import Fleet
 from quadid_node.zenoh_link import KINDS, ZenohLink
 from quadid_node.zenoh_session import ZenohError, key_of
 
-from quadid.online.records import Diagnosed, OnlineFinding
+from quadid.online.records import OnlineDiagnosis, OnlineFinding
 from quadid_node import zenoh_fleet
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
@@ -213,7 +213,7 @@ def test_findings_cross_too(net: Net) -> None:
         finding = OnlineFinding(
             "mass_change", {"fraction": 0.15}, {"fraction": 0.01}, {"fraction": ""}, 3.0, 1.0, 0.0, (), "seen"
         )
-        link.publish(Diagnosed(44.0, 40.0, 44.0, (finding,), "explained"))
+        link.publish(OnlineDiagnosis(44.0, 40.0, 44.0, (finding,), "explained"))
         assert until(lambda: "diagnosis" in fleet.latest.get("quad2", {}))
         assert fleet.latest["quad2"]["diagnosis"]["findings"][0]["effect"] == "mass_change"
     finally:

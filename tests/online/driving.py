@@ -8,7 +8,7 @@ from functools import lru_cache
 from quadid.flight import Flight, fly
 from quadid.online import Job, JobReply, Session
 from quadid.online.outbox import Action
-from quadid.online.records import Diagnosed, Event, OnlineSet, Publish
+from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid.window import Recording, Sample
 
@@ -75,9 +75,9 @@ def published(actions: Iterable[Action], topic: str = "parameters") -> list[Onli
     return [a.item for a in actions if isinstance(a, Publish) and a.topic == topic]
 
 
-def diagnosed(actions: Iterable[Action]) -> list[Diagnosed]:
+def diagnosed(actions: Iterable[Action]) -> list[OnlineDiagnosis]:
     """The diagnoses."""
-    return [a for a in actions if isinstance(a, Diagnosed)]
+    return [a for a in actions if isinstance(a, OnlineDiagnosis)]
 
 
 def events(actions: Iterable[Action], kind: str = "") -> list[Event]:

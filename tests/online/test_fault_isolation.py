@@ -7,7 +7,7 @@ import pytest
 
 from quadid.identify.noise_model import NoiseModel
 from quadid.model.layout import Layout
-from quadid.online.change_detection import Change, ChangeDetector
+from quadid.online.change_detection import ChangeDetector, ChangePoint
 from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.rows import Rows
 from quadid.vehicle import Vehicle
@@ -19,7 +19,7 @@ NOISE = NoiseModel(np.repeat([0.021, 0.003, 0.21], 3), np.repeat([0.0, 0.003, 0.
 Effects = tuple[tuple[str, str, float], ...]
 
 
-def watched(seconds: float, seed: int, profile: str, effects: Effects = ()) -> list[tuple[float, Change]]:
+def watched(seconds: float, seed: int, profile: str, effects: Effects = ()) -> list[tuple[float, ChangePoint]]:
     made = flight(seconds, seed, profile, effects)
     window, truth, monitor, seen = made.window, made.truth.parameters, ChangeDetector(PELICAN), []
     inertia = 1.1 * np.array([truth.J_xx, truth.J_yy, truth.J_zz])  # known to 10 % only
@@ -70,7 +70,7 @@ def timed(effect: str, fraction: float) -> Effects:
     return ((effect, "time", AT), (effect, "fraction", fraction))
 
 
-def explained(profile: str, effects: Effects, change: Change) -> ChangeRequest:
+def explained(profile: str, effects: Effects, change: ChangePoint) -> ChangeRequest:
     made = flight(50.0, 5, profile, effects)
     truth, theta = made.truth.parameters, Layout(PELICAN).initial(PELICAN)
     theta[:6] = [truth.b, truth.d, truth.J_xx, truth.J_yy, truth.J_zz, truth.J_r]
@@ -89,7 +89,7 @@ def explained(profile: str, effects: Effects, change: Change) -> ChangeRequest:
     ],
 )
 def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, float], name: str, number: str) -> None:
-    reply = explained("excited", effects, Change(40.0, *seen, 30.0)).answer()
+    reply = explained("excited", effects, ChangePoint(40.0, *seen, 30.0)).answer()
     assert reply.finding is not None, reply.problem
     assert reply.finding.effect == name
     assert reply.finding.confident or name == "thrust_drop", "mass taken up with its inertia looks much like it"
@@ -100,13 +100,13 @@ def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, flo
 
 def test_in_hover_mass_and_thrust_are_not_told_apart_with_confidence() -> None:
     drop = (("thrust_drop", "time", AT), ("thrust_drop", "fraction", 0.12))
-    reply = explained("hover", drop, Change(40.0, "thrust", -0.12, 30.0)).answer()
+    reply = explained("hover", drop, ChangePoint(40.0, "thrust", -0.12, 30.0)).answer()
     assert reply.finding is not None
     assert not reply.finding.confident
     assert {reply.finding.effect} | {a.effect for a in reply.finding.alternatives} >= {"mass_change", "thrust_drop"}
 
 
 def test_no_cause_is_invented() -> None:
-    reply = explained("excited", (), Change(40.0, "pitch moment", 0.05, 8.0)).answer()
+    reply = explained("excited", (), ChangePoint(40.0, "pitch moment", 0.05, 8.0)).answer()
     assert reply.finding is None
     assert "no known cause" in reply.problem

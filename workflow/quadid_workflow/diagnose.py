@@ -166,7 +166,7 @@ def diagnose(
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
     """
-    from quadid.diagnose.attribution import Identified
+    from quadid.diagnose.attribution import NominalFit
     from quadid.diagnose.pipeline import diagnose as diagnose_windows
     from quadid.model.supply import with_reference_voltage
 
@@ -180,7 +180,7 @@ def diagnose(
         OPTIMIZERS[0], windows, with_reference_voltage(described, windows), seed,
         lambda _, share: advance("nominal fit", share), unreachable,
     )  # fmt: skip
-    nominal = Identified(fit.vehicle, fit.theta, fit.noise)
+    nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
     found, model = _within_reach(found, unreachable), selection.model
     result, (before, after) = found.to_dict(), found.validation.deciding

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
 from quadid.sanitise import one_line
 from quadid_workflow.loading import Log, check_conventions, on_grid, open_recording, require_gyro
-from quadid_workflow.parts import Cut, parse_cut
+from quadid_workflow.log_parts import LogPart, parse_part
 
 if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
@@ -59,7 +59,7 @@ def identify_one(job: Job) -> Row:
     begin = time.perf_counter()
     row = blank(job)
     try:
-        cut = parse_cut(job.path)
+        cut = parse_part(job.path)
         vehicle, recording = _opened(job, cut)
         checked = check_conventions(recording, vehicle, cut)
         row |= _seen(cut.of(recording), vehicle, checked.doubts)
@@ -87,7 +87,7 @@ def blank(job: Job) -> Row:
     }  # fmt: skip
 
 
-def _opened(job: Job, cut: Cut) -> tuple[Vehicle, Recording]:
+def _opened(job: Job, cut: LogPart) -> tuple[Vehicle, Recording]:
     from quadid.vehicle import Vehicle
 
     vehicle = Vehicle.from_yaml(job.vehicle, job.unit)

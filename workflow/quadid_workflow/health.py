@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.errors import LogError, NotIdentifiableError
 from quadid_workflow.loading import Log, check_conventions, open_recording
+from quadid_workflow.log_parts import parse_part
 from quadid_workflow.logs import Flight, Given, listed, vehicle_of
 from quadid_workflow.outcome import NUMBER_COLUMNS, number_rows
-from quadid_workflow.parts import parse_cut
 from quadid_workflow.reporting import LIBRARY, Reported, provenance
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class HealthOutcome(Reported):
         from quadid_report.health_page import health_page, trim_figure
         from quadid_report.page import render
 
-        from quadid.health.comparison import distance
+        from quadid.health.change_evidence import distance
         from quadid.health.trims import AXES
 
         found, healthy = self.found, self.found.healthy
@@ -158,7 +158,7 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
     if isinstance(given, Log):
         recording, cut = given.recording, given.cut
     else:
-        cut = parse_cut(str(given))
+        cut = parse_part(str(given))
         recording = open_recording(cut.path, preset, vehicle.columns)
     doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut).doubts
     warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]

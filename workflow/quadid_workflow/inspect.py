@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.errors import QuadidError
 from quadid_workflow.loading import GRID, LONGEST, Log, as_vehicle, gridded, open_recording
+from quadid_workflow.log_parts import LogPart, flown_parts, left_on_ground, names_of, parse_part
 from quadid_workflow.outcome import Outcome
-from quadid_workflow.parts import Cut, flown_parts, left_on_ground, names_of, parse_cut
 
 if TYPE_CHECKING:
     from quadid_report.text_table import TextTable
@@ -82,7 +82,7 @@ def inspect(
     if isinstance(log, Log):
         cut, whole, vehicle = log.cut, log.recording, log.vehicle if vehicle is None else vehicle
     else:
-        cut = parse_cut(str(log), start, stop)
+        cut = parse_part(str(log), start, stop)
         whole = None
     described = None if vehicle is None else as_vehicle(vehicle)
     if whole is None:
@@ -96,7 +96,7 @@ def inspect(
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
 
 
-def _excitation(recording: Recording, vehicle: Vehicle, cut: Cut, flown: Spans) -> tuple[dict[str, Any], ...]:
+def _excitation(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[dict[str, Any], ...]:
     """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
     from quadid.identify.excitation import excitation
     from quadid.parameters import NOMINAL_UNITS

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from quadid.errors import LogError, VehicleError
-from quadid_workflow.parts import Cut, flown_parts, left_on_ground, names_of, parse_cut
+from quadid_workflow.log_parts import LogPart, flown_parts, left_on_ground, names_of, parse_part
 
 if TYPE_CHECKING:
     from quadid.grid import GridReport
@@ -44,7 +44,7 @@ class Log:
     vehicle: Vehicle
     windows: list[Window]
     grid: GridReport
-    cut: Cut
+    cut: LogPart
     doubts: tuple[str, ...] = ()
     flown: Spans = ()
 
@@ -130,7 +130,7 @@ def load(
         NotIdentifiableError: no rotor signal that means anything.
     """
     described = as_vehicle(vehicle)
-    cut = replace(parse_cut(str(log), start, stop), checked=not unchecked)
+    cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
     recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
     require_gyro(recording)
     return _read(cut.path.resolve(), recording, described, rate, cut)
@@ -162,13 +162,15 @@ def write_recording(path: str | Path, recording: Recording) -> Path:
     return Path(path).absolute()
 
 
-def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut) -> Log:
+def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart) -> Log:
     """A log checked and on the grid."""
     checked = check_conventions(recording, vehicle, cut) if cut.checked else Checked()
     return on_grid(path, recording, vehicle, rate, cut, checked)
 
 
-def on_grid(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut, checked: Checked) -> Log:
+def on_grid(
+    path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, checked: Checked
+) -> Log:
     """A checked log on the grid; of one that also stands on the ground, what is in the air."""
     doubts, flown = checked
     windows, report = gridded(recording, vehicle, rate, cut, flown)
@@ -177,7 +179,7 @@ def on_grid(path: Path, recording: Recording, vehicle: Vehicle, rate: float | No
 
 
 def gridded(
-    recording: Recording, vehicle: Vehicle, rate: float | None, cut: Cut, flown: Spans
+    recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, flown: Spans
 ) -> tuple[list[Window], GridReport]:
     """What is flown of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
     from quadid.grid import grid_recording
@@ -209,7 +211,7 @@ class Checked(NamedTuple):
     flown: Spans = ()
 
 
-def check_conventions(recording: Recording, vehicle: Vehicle, cut: Cut) -> Checked:
+def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> Checked:
     """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
 
     Args:

@@ -19,7 +19,7 @@ _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 
 
 @dataclass(frozen=True)
-class Cut:
+class LogPart:
     """Part of a log that was asked for: seconds after its first IMU sample; None for open ends; units to be checked."""
 
     path: Path
@@ -59,11 +59,11 @@ class Cut:
         return LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
 
 
-def parse_cut(text: str, start: float | None = None, stop: float | None = None) -> Cut:
+def parse_part(text: str, start: float | None = None, stop: float | None = None) -> LogPart:
     """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
     found = _CUT.fullmatch(text)
     if found is None or Path(text).exists():
-        cut = Cut(Path(text), start, stop)
+        cut = LogPart(Path(text), start, stop)
     else:
         try:
             own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
@@ -71,7 +71,7 @@ def parse_cut(text: str, start: float | None = None, stop: float | None = None) 
             raise LogError(
                 f"cannot read the span of '{text}'", "LOG@START:STOP in seconds, for example LOG@76:216"
             ) from error
-        cut = Cut(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
+        cut = LogPart(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
     for limit in (cut.start, cut.stop):
         if limit is not None and not math.isfinite(limit):
             raise LogError(f"{text}: a span from {cut.start} to {cut.stop} s", "seconds")
@@ -80,7 +80,7 @@ def parse_cut(text: str, start: float | None = None, stop: float | None = None) 
     return cut
 
 
-def flown_parts(recording: Recording, flying: Spans, cut: Cut) -> Spans:
+def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
     """What to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
 
     A part that was asked for is used as it is.
@@ -98,7 +98,7 @@ def flown_parts(recording: Recording, flying: Spans, cut: Cut) -> Spans:
     return proposed_cuts(flying, recording.first_imu_time, max(float(t[-1]) for t in imu))
 
 
-def names_of(cut: Cut, parts: Spans) -> list[str]:
+def names_of(cut: LogPart, parts: Spans) -> list[str]:
     """Parts of a log as one asks for them: ``flight.bin@73.2:227.3``."""
     return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in parts]
 

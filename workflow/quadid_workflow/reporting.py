@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from quadid.errors import QuadidError
 from quadid_workflow.files import write_text
 from quadid_workflow.loading import LONGEST, open_recording
+from quadid_workflow.log_parts import parse_part
 from quadid_workflow.outcome import Outcome
-from quadid_workflow.parts import parse_cut
 
 if TYPE_CHECKING:
     from quadid.identify.fit import Fit
@@ -93,7 +93,7 @@ def failure_html(
     read: list[tuple[Recording, Inspection | None]] = []
     for text in texts:
         try:
-            recording = open_recording(parse_cut(text).path, preset)
+            recording = open_recording(parse_part(text).path, preset)
         except (QuadidError, OSError) as unreadable:
             rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
             continue
