@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_valid
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
-from quadid.proof import Proof
+from quadid.provenance import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray

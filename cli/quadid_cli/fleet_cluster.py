@@ -30,7 +30,7 @@ _QUIET = {
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
     "distributed", "distributed.nanny", "quadid_workflow.fleet", "quadid_workflow.identify", "quadid.health.stored",
-    "quadid.health.trims", "quadid_replay.mcap_reader",
+    "quadid.health.trim_estimation", "quadid_replay.mcap_reader",
 )  # fmt: skip
 """What a process has imported from which all workers are forked, those that replace dead ones too."""
 

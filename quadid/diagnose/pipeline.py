@@ -9,7 +9,6 @@ import numpy as np
 
 from quadid.data_faults import data_faults, without_copies
 from quadid.diagnose.attribution import NominalFit, stated_errors, worths
-from quadid.diagnose.beside_moments import Held, held_by_quick_motion, refitted
 from quadid.diagnose.candidates import Candidate, candidates
 from quadid.diagnose.cross_validation import BLOCKS
 from quadid.diagnose.log_evidence import better
@@ -19,13 +18,14 @@ from quadid.diagnose.residual_tests import Remainder, inconstant_causes, remaind
 from quadid.diagnose.result import Diagnosis, Explanation, describe
 from quadid.diagnose.segment_schedule import LINEAR_MISFIT
 from quadid.diagnose.selection import Search, from_everything, pruned, select
+from quadid.diagnose.unmodelled_moments import Held, held_by_fast_motion, refitted
 from quadid.effects import EFFECTS
 from quadid.errors import NotIdentifiableError
-from quadid.identify.answer import on_bounds, possible_moments, tied
 from quadid.identify.covariance import SPREAD_LIMIT, parameter_set
 from quadid.identify.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identify.gauss_newton import polish
 from quadid.identify.global_search import Progress, swarm_search
+from quadid.identify.identifiability import on_bounds, possible_moments, tied
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, residual_noise
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
@@ -80,7 +80,7 @@ def diagnose(
     vehicle = with_reference_voltage(vehicle, windows)
     begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     schedule, search = _select(windows, begun, report)
-    held = held_by_quick_motion(windows, schedule[-1], search.model)
+    held = held_by_fast_motion(windows, schedule[-1], search.model)
     if held is not None:
         schedule, search = refitted(held, schedule, search)
     decisive, model = search.shooting, search.model

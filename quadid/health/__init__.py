@@ -8,7 +8,7 @@ from quadid.health.changes import Health as Health
 from quadid.health.changes import assess as assess
 from quadid.health.spread import Healthy as Healthy
 from quadid.health.spread import healthy_spread as healthy_spread
-from quadid.health.trims import FlightTrim as FlightTrim
-from quadid.health.trims import flight_trim as flight_trim
+from quadid.health.trim_estimation import FlightTrim as FlightTrim
+from quadid.health.trim_estimation import flight_trim as flight_trim
 
 make_callable(__name__)

@@ -13,7 +13,7 @@ from scipy.stats import qmc
 
 from quadid.health.hypotheses import Hypothesis, hypotheses
 from quadid.health.spread import Healthy
-from quadid.health.trims import AXES
+from quadid.health.trim_estimation import AXES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 

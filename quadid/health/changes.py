@@ -13,7 +13,7 @@ from quadid.chi_square import Z95
 from quadid.health.change_evidence import Explained, compare, distance, exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses
 from quadid.health.spread import Healthy, healthy_spread
-from quadid.health.trims import AXES, FlightTrim
+from quadid.health.trim_estimation import AXES, FlightTrim
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 

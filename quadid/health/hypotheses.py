@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.health.trims import trim_directions
+from quadid.health.trim_estimation import trim_directions
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.health.trims import AXES, FlightTrim
+from quadid.health.trim_estimation import AXES, FlightTrim
 from quadid.types import FloatArray
 
 PRIOR_FLIGHTS = 4.0

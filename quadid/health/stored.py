@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.health.trims import AXES, FlightTrim
+from quadid.health.trim_estimation import AXES, FlightTrim
 from quadid.jsonable import jsonable
 
 

@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from quadid.health.change_evidence import distance, p_healthy
 from quadid.health.changes import Change, changes_of
 from quadid.health.spread import Healthy, healthy_spread
-from quadid.health.trims import AXES, FlightTrim, trim_of_load, wander
+from quadid.health.trim_estimation import AXES, FlightTrim, trim_of_load, wander
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 

@@ -11,23 +11,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from quadid.errors import NotIdentifiableError, WindowError
-from quadid.identify.answer import Fit as Fit
-from quadid.identify.answer import final_answer, on_bounds
 from quadid.identify.composite_likelihood import with_second_cut
 from quadid.identify.covariance import SPREAD_LIMIT, parameter_set, uncertainty
+from quadid.identify.fast_motion import MOST_SEGMENTS, FastMotion, fast_motion, with_moments
 from quadid.identify.gauss_newton import Convergence, Polished, polish
 from quadid.identify.global_search import Progress, swarm_search
+from quadid.identify.identifiability import Fit as Fit
+from quadid.identify.identifiability import final_answer, on_bounds
 from quadid.identify.long_logs import spread
 from quadid.identify.noise_estimation import FAR_ITERATIONS, flexible_fit, reweighted_fit
 from quadid.identify.noise_memory import with_memory
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.particle_swarm import SwarmOptions
 from quadid.identify.priors import Prior, default_prior, posterior_covariance
-from quadid.identify.quick_motion import MOST_SEGMENTS, QuickMotion, quick_motion, with_moments
 from quadid.identify.reliability import reliability
+from quadid.identify.scale_uncertainty import with_scale_uncertainty
 from quadid.identify.score import settle_states
 from quadid.identify.shooting import Free, Shooting
-from quadid.identify.uncertain_scale import with_uncertain_scale
 from quadid.parameters import INERTIAS, NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -36,10 +36,10 @@ from quadid.window import Window
 SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 WHITE_SHARE = 0.5
-"""Quick motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
+"""Fast motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
 noise and the rest is made by random moments."""
 YAW = ("d", "J_zz", "J_r")
-"""What quick motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
+"""What fast motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
 _QUICK = (
     "unmodelled moments turn the vehicle, so parameters are estimated from fast motion alone, which does not reveal "
     f"{', '.join(YAW)}; quadid diagnose looks for the cause"
@@ -116,12 +116,12 @@ def fit(
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
-    quick = quick_motion(windows, short, first.theta, free.names) if restless(short, first) else None
+    quick = fast_motion(windows, short, first.theta, free.names) if restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
         starts = [quick.found.theta, first.theta]
         noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
-        found = quick_fit(quick, free.names, options.robust, comparable)
+        found = fast_fit(quick, free.names, options.robust, comparable)
     else:
         noise = flexible_fit(windows, short, [first.theta], free).noise
         report("polish", 0.4)
@@ -157,8 +157,8 @@ def restless(short: Shooting, plain: Polished) -> bool:
     return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
 
 
-def quick_fit(quick: QuickMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
-    """What quick motion says of `names`, with intervals and statuses.
+def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
+    """What fast motion says of `names`, with intervals and statuses.
 
     Args:
         quick: the fit.
@@ -196,7 +196,7 @@ def _finish(
     unc = uncertainty(polished.lin, prior, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.simulated
-    theta, unc = with_uncertain_scale(shooting.vehicle, free, prior, theta, unc)
+    theta, unc = with_scale_uncertainty(shooting.vehicle, free, prior, theta, unc)
     doubts: tuple[str, ...] = ()
     if short is not None and ended:
         trust = reliability(shooting, polished, free, prior, short)

@@ -2,7 +2,7 @@
 
 They turn the vehicle, the controller answers, and a fit that takes the rotors for all there is finds inertias too large
 (an error of closed loop: U. Forssell and L. Ljung, Automatica 35 (1999) 1215).  With the covariance of what they do to
-the rate the fit is consistent: slow motion, which they rule, hardly counts, and quick motion does.  Their angular
+the rate the fit is consistent: slow motion, which they rule, hardly counts, and fast motion does.  Their angular
 acceleration is taken for a random walk, and for unknown where a segment begins: the controller answers it already.
 """
 

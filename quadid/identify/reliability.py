@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.chi_square import exceeded
-from quadid.identify.coarse_grid import SHARE, on_coarse_grid
 from quadid.identify.covariance import SPREAD_LIMIT, Uncertainty, uncertainty
 from quadid.identify.gauss_newton import Polished, bounded_step, polish
 from quadid.identify.initial_states import InitialStates
 from quadid.identify.noise_estimation import flexible_names
 from quadid.identify.priors import Prior, default_prior, normal_equations, posterior_covariance
+from quadid.identify.richardson import SHARE, on_coarse_grid
 from quadid.identify.shooting import Free, Shooting
 from quadid.types import FloatArray, IndexArray
 
@@ -98,7 +98,7 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         short: the fit to short segments, which see faster motion only.
     """
     if problem.vehicle.mass_sigma > 0.0 or problem.vehicle.arm_sigma > 0.0:
-        # Sharp priors pull against a wrong mass or arm; that is settled by `with_uncertain_scale`, and no misfit.
+        # Sharp priors pull against a wrong mass or arm; that is settled by `with_scale_uncertainty`, and no misfit.
         prior = Prior(prior.mean, np.maximum(prior.sigma, WIDE))
         found = polish(problem, found.theta, free, prior, found.states, settled=True)
     own = uncertainty(found.lin, prior)

@@ -16,9 +16,9 @@ from itertools import combinations_with_replacement, islice
 
 import numpy as np
 
-from quadid.identify.run_errors import STAGES, RunErrors
+from quadid.identify.multistep_errors import STAGES, MultistepErrors
 from quadid.identify.schur_complement import eliminated
-from quadid.identify.term_slopes import typical
+from quadid.identify.term_sensitivity import typical
 from quadid.residual import SIGNALS, TARGETS, ResidualTerm
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -149,8 +149,8 @@ def _path(windows: Sequence[Window], physical: Vehicle, candidates: Terms) -> It
         yield terms
 
 
-def _runs(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> RunErrors:
-    return RunErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS)
+def _runs(windows: Sequence[Window], physical: Vehicle, terms: Terms, seconds: Sequence[float]) -> MultistepErrors:
+    return MultistepErrors(windows, physical.model_copy(update={"residual": terms}), seconds, MOST_RUNS)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quadid.identify.multistep_errors import STAGES
 from quadid.identify.open_loop import mean_errors
 from quadid.identify.residual_fit import fit_residual
-from quadid.identify.run_errors import STAGES
 from quadid.jsonable import jsonable
 from quadid.model.layout import Layout
 from quadid.residual import ResidualTerm

@@ -105,11 +105,11 @@ def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagge
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
-    lagged = [_quick_motion(windows, acted, lag) for lag in range(_LAGS)]
+    lagged = [_fast_motion(windows, acted, lag) for lag in range(_LAGS)]
     return lagged if len(lagged[0][0]) >= 100 else "too little flight to check the motor order"
 
 
-def _quick_motion(windows: Sequence[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
+def _fast_motion(windows: Sequence[Window], thrust: list[FloatArray], lag: int) -> tuple[FloatArray, FloatArray]:
     """Returns thrust over b `lag` rows earlier (n, rotors) and angular acceleration (n, 3), no slow parts."""
     squares, gains = [], []
     for w, acted in zip(windows, thrust, strict=True):

@@ -15,11 +15,11 @@ import numpy as np
 
 from quadid.errors import WindowError
 from quadid.model import layout as ix
+from quadid.model.array_cache import ArrayCache
 from quadid.model.channels import channels_of, measurements
 from quadid.model.kernel import Flight
 from quadid.model.layout import places, residual_terms
 from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
-from quadid.model.recent import Recent
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.segments import Segments
@@ -34,7 +34,7 @@ TAU, SLOWER = places("motor_lag")
 (OFFSET,) = places("thrust_curve.offset")
 _PART_ROWS = 800
 """Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
-_TABLES = Recent(32 << 20)
+_TABLES = ArrayCache(32 << 20)
 """Rotor moments kept for the next calls, of all windows together: four tables of a log of 500 s take 26 MB."""
 NUMBERS = itertools.count()
 """Of simulations: what is kept of one is found by it."""

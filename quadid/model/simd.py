@@ -15,7 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
-from quadid.model.piece import PieceCompiler
+from quadid.model.subkernel import SubkernelCompiler
 from quadid.types import FloatArray
 
 LANES = 16
@@ -35,7 +35,7 @@ whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"
 cached: dict[str, Any] = {**whole, "cache": True}
 """Options of the kernels on disk."""
 allocating: dict[str, Any] = {
-    **whole, "no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": PieceCompiler
+    **whole, "no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": SubkernelCompiler
 }  # fmt: skip
 """Options of the pieces of kernels that make arrays."""
 jit: dict[str, Any] = {**allocating, "_nrt": False}
@@ -52,7 +52,7 @@ def _sources() -> int:
     names = sorted(
         entry.name
         for entry in folder.iterdir()
-        if entry.name.endswith(("kernel.py", "work_array.py", "layout.py", "simd.py", "piece.py"))
+        if entry.name.endswith(("kernel.py", "work_array.py", "layout.py", "simd.py"))
     )
     outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
     order = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters).encode()

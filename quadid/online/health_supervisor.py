@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quadid.health.trims import FlightTrim
+from quadid.health.trim_estimation import FlightTrim
 from quadid.health.watch import HealthReport, HealthWatch
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.outbox import Outbox

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from quadid.health.trims import FlightTrim
+from quadid.health.trim_estimation import FlightTrim
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor

@@ -18,7 +18,6 @@ from quadid.identify.priors import Prior
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.channels import channels_of
 from quadid.model.layout import Layout
-from quadid.online.answered import SIX, is_estimate, is_noise, is_vector
 from quadid.online.flexible_fit import (
     alike,
     flexible_fit,
@@ -30,6 +29,7 @@ from quadid.online.flexible_fit import (
 from quadid.online.fusion import WindowEstimate
 from quadid.online.jobs import Job, JobReply
 from quadid.online.lack_of_fit import LackOfFit, lack_of_fit
+from quadid.online.reply_validation import SIX, is_estimate, is_noise, is_vector
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

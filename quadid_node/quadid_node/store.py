@@ -20,7 +20,7 @@ from types import MappingProxyType
 from typing import IO
 
 from quadid.health.stored import flight_from_dict, flight_to_dict
-from quadid.health.trims import FlightTrim
+from quadid.health.trim_estimation import FlightTrim
 from quadid.online.gate import GateSettings
 from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet

@@ -17,7 +17,7 @@ from studies.ablation.variants import modules
 
 FITS = (
     "polish", "settle_states", "flexible_fit", "residual_noise", "with_memory", "mode_power",
-    "quick_motion", "quick_fit", "mse_score", "reliability", "follows",
+    "fast_motion", "fast_fit", "mse_score", "reliability", "follows",
 )  # fmt: skip
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
 NUMBERS = ("quadid.diagnose.residual_regressors", "quadid.diagnose.cross_validation")

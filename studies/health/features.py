@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.special import stdtrit
 
 from quadid.health.changes import SIGNIFICANT
-from quadid.health.trims import trim_directions
+from quadid.health.trim_estimation import trim_directions
 from quadid.inspection.airborne import flying_spans
 from quadid.resample import linear
 from quadid.rotor_signal import rotor_signal

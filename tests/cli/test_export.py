@@ -14,7 +14,7 @@ import pytest
 from quadid_report.programs import FORMATS, export
 from quadid_workflow.init import init as begin
 
-from quadid.proof import Proof
+from quadid.provenance import Proof
 from quadid.residual import ResidualTerm
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command, ParameterPrior

@@ -41,7 +41,7 @@ def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: t
     stated, fitted = found.result["validation"], found.result["sets"][0]["mse"]
     assert stated["on"] == "held-out blocks"
     assert "held-out blocks of the same flight" in found.verdict.details[0]
-    # The weak rotor turns the vehicle, so the nominal numbers come from quick motion, and minimise neither.
+    # The weak rotor turns the vehicle, so the nominal numbers come from fast motion, and minimise neither.
     assert stated["mse_nominal"] / fitted["nominal"] == pytest.approx(1.0, abs=0.05)
     assert 1.0 < stated["mse_extended"] / fitted["extended"] < 1.1
 

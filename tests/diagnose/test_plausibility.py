@@ -14,7 +14,7 @@ from quadid.diagnose.pipeline import _nominal_parameters
 from quadid.diagnose.plausibility import impossible_causes, late_unknown, slight_causes
 from quadid.diagnose.residual_tests import inconstant_causes, remainder
 from quadid.diagnose.result import Explanation
-from quadid.identify.answer import possible_moments
+from quadid.identify.identifiability import possible_moments
 from quadid.identify.result import with_values
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle

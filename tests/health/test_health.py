@@ -10,7 +10,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.health import Health, assess, change_evidence, flight_trim, healthy_spread
 from quadid.health.change_evidence import exact, p_healthy, p_unchanged
 from quadid.health.hypotheses import hypotheses, rotor_effect
-from quadid.health.trims import trim_directions, trim_of_load
+from quadid.health.trim_estimation import trim_directions, trim_of_load
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import Command
 from quadid.window import Recording

@@ -17,7 +17,7 @@ from quadid_replay.mcap_records import McapFile
 
 from quadid.errors import LogError
 from quadid.health.stored import flight_to_dict
-from quadid.health.trims import FlightTrim
+from quadid.health.trim_estimation import FlightTrim
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight

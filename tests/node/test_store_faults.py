@@ -23,7 +23,7 @@ from quadid_node.store import Store
 from quadid_node.store_file import StoreError, read_history
 from quadid_node.worker import InlineWorker
 
-from quadid.health.trims import FlightTrim
+from quadid.health.trim_estimation import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.records import Event, OnlineSet
 from quadid.vehicle import Vehicle

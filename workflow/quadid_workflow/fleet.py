@@ -99,7 +99,7 @@ def _opened(job: Job, cut: LogPart) -> tuple[Vehicle, Recording]:
 def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
     """What a flight shows whether or not anything can be fitted to it; its trim where it flew steadily."""
     from quadid.health.stored import flight_to_dict
-    from quadid.health.trims import flight_trim
+    from quadid.health.trim_estimation import flight_trim
 
     row: Row = {
         "vehicle": vehicle.name,

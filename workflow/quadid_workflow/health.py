@@ -77,7 +77,7 @@ class HealthOutcome(Reported):
         from quadid_report.page import render
 
         from quadid.health.change_evidence import distance
-        from quadid.health.trims import AXES
+        from quadid.health.trim_estimation import AXES
 
         found, healthy = self.found, self.found.healthy
         now = np.mean([flight.shares for flight in found.flights], axis=0)
@@ -117,7 +117,7 @@ def health(
         NotIdentifiableError: too little steady flight.
     """
     from quadid.health.changes import assess
-    from quadid.health.trims import flight_trim
+    from quadid.health.trim_estimation import flight_trim
 
     tested, healthy = listed(logs), listed(baseline)
     if not tested or not healthy:

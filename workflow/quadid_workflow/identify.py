@@ -221,7 +221,7 @@ def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]]
         sets: its scored logs, as in ``quadid.identify/1``.
         train: the logs that were fitted.
     """
-    from quadid.proof import Proof
+    from quadid.provenance import Proof
     from quadid_workflow.overlap import remembered
 
     unseen = [s for s in sets if s["role"] == "validate"]

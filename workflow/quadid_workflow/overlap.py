@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadid.errors import LogError
-from quadid.proof import MOST_FLIGHTS, FittedFlight
+from quadid.provenance import MOST_FLIGHTS, FittedFlight
 from quadid.resample import linear
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray

@@ -48,7 +48,7 @@ def search(
 
     if name == "pso_polish":
         return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
-    from quadid.identify.answer import final_answer
+    from quadid.identify.identifiability import final_answer
     from quadid.identify.shooting_objective import BoxProblem
     from quadid.optimisers.minimise import minimise
 

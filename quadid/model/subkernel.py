@@ -17,7 +17,7 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
 
-class Piece(JITCodeLibrary):
+class Subkernel(JITCodeLibrary):
     """Code of one function and of all it calls."""
 
     def finalize(self) -> None:
@@ -68,14 +68,14 @@ class Remembering:
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class PieceLowering(NativeLowering):
+class SubkernelLowering(NativeLowering):
     """Writes the code of a piece, and none that Python could call."""
 
     _name = "piece_lowering"
 
     def run_pass(self, state: Any) -> bool:
         """Lowers as numba does, into a library that is not made machine code."""
-        state.library = Piece(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = Subkernel(state.targetctx.codegen(), state.func_id.func_qualname)
         super().run_pass(state)
         lowered = state["cr"]
         # numba tells compiled functions apart by what Python would call, which has to be a builtin; this one raises.
@@ -85,7 +85,7 @@ class PieceLowering(NativeLowering):
         return True
 
 
-class PieceCompiler(CompilerBase):
+class SubkernelCompiler(CompilerBase):
     """`pipeline_class` of numba for pieces."""
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, returns: Any, flags: Any, names: Any) -> None:
@@ -97,6 +97,6 @@ class PieceCompiler(CompilerBase):
     def define_pipelines(self) -> list[Any]:
         """Takes the passes of numba, but for the last."""
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        manager.passes = [(PieceLowering if p is NativeLowering else p, why) for p, why in manager.passes]
+        manager.passes = [(SubkernelLowering if p is NativeLowering else p, why) for p, why in manager.passes]
         manager.finalize()
         return [manager]

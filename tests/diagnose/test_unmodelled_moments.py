@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose.beside_moments import held_by_quick_motion
 from quadid.diagnose.model import Model, fit_model
+from quadid.diagnose.unmodelled_moments import held_by_fast_motion
 from quadid.flight import draw_truth, fly
 from quadid.identify import fit as fitting
 from quadid.identify.shooting import Shooting
@@ -34,7 +34,7 @@ def diagnosed(seed: int = SEED, **effects: dict[str, float]) -> Diagnosis:
 
 
 def errors(found: Diagnosis, seed: int = SEED) -> dict[str, float]:
-    """Relative errors of what quick motion shows."""
+    """Relative errors of what fast motion shows."""
     truth = draw_truth(PELICAN, seed).as_dict()
     return {p.name: p.value / truth[p.name] - 1.0 for p in found.parameters if p.name in SHOWN}
 
@@ -52,7 +52,7 @@ def test_turbulence_does_not_pass_for_inertia() -> None:
     assert all(written[n].initial == pytest.approx(parameters[n].value, rel=1e-6) for n in SHOWN)
 
 
-def test_without_quick_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_fast_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "WHITE_SHARE", 0.0)
     found = errors(diagnosed())
     assert max(found.values()) > 0.2, found
@@ -60,7 +60,7 @@ def test_without_quick_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
-    """Quick motion without the cause would count it as a random moment."""
+    """Fast motion without the cause would count it as a random moment."""
     found = diagnosed(seed, cg_offset={"x": 0.01, "y": -0.01})
     assert "cg_offset" in {f.effect for f in found.findings}
     assert max(map(abs, errors(found, seed).values())) < 0.05, errors(found, seed)
@@ -69,7 +69,7 @@ def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
 def held(window: Window, shooting: Shooting, model: Model) -> object:
     """What is held of a model."""
     short = Shooting.cut([window], shooting.vehicle, fitting.SWARM_SECONDS, shooting.noise, shooting.layout)
-    return held_by_quick_motion([window], short, model)
+    return held_by_fast_motion([window], short, model)
 
 
 def test_a_model_that_leaves_noise_keeps_its_numbers() -> None:

@@ -8,7 +8,7 @@ import pytest
 from quadid.flight import fly
 from quadid.identify.open_loop import OpenLoop
 from quadid.identify.residual_fit import candidate_terms
-from quadid.identify.term_slopes import term_slopes, typical
+from quadid.identify.term_sensitivity import term_sensitivity, typical
 from quadid.model.layout import Layout
 from quadid.residual import ResidualTerm
 from quadid.types import FloatArray
@@ -44,7 +44,7 @@ def test_they_are_differences_of_the_simulation(
     candidates = (*candidate_terms()[::37], ResidualTerm(acts_on="force_z", product=("T",), value=0.0))
     assert {c.acts_on for c in candidates} > {"force_x", "moment_x"}
     vehicle: Vehicle = own.model_copy(update={"residual": found})
-    slopes = term_slopes(OpenLoop(window, vehicle, int(AT[-1]), 10), vehicle, candidates, AT)
+    slopes = term_sensitivity(OpenLoop(window, vehicle, int(AT[-1]), 10), vehicle, candidates, AT)
     before, sizes = misses(window, own, found), typical(vehicle, candidates)
     for i, term in enumerate(candidates):
         moved = (*found, term.model_copy(update={"value": SHARE * float(sizes[i])}))

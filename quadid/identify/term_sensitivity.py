@@ -35,7 +35,9 @@ def typical(vehicle: Vehicle, terms: tuple[ResidualTerm, ...]) -> FloatArray:
     return np.array([term.typical(vehicle.mass * GRAVITY, vehicle.arm) for term in terms])
 
 
-def term_slopes(loop: OpenLoop, vehicle: Vehicle, candidates: tuple[ResidualTerm, ...], at: IndexArray) -> SingleArray:
+def term_sensitivity(
+    loop: OpenLoop, vehicle: Vehicle, candidates: tuple[ResidualTerm, ...], at: IndexArray
+) -> SingleArray:
     """Slopes of what runs miss by along the coefficients of candidates, each in units of its typical size.
 
     A sensor's scale, at most some per cent, is left out: slopes point the way, errors are those of the simulation.

@@ -9,7 +9,7 @@ from threading import Lock
 from quadid.types import FloatArray
 
 
-class Recent:
+class ArrayCache:
     """Arrays by key; the least recently used go first.
 
     Args:

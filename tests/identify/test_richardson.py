@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth, fly
-from quadid.identify.coarse_grid import coarse
 from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.richardson import coarse
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray
 from quadid.window import Window

@@ -21,7 +21,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 
-def with_uncertain_scale(
+def with_scale_uncertainty(
     vehicle: Vehicle, free: Free, prior: Prior, theta: FloatArray, unc: Uncertainty
 ) -> tuple[FloatArray, Uncertainty]:
     """Posterior of the parameters when mass and arm are known to `Vehicle.mass_sigma` and `Vehicle.arm_sigma` only.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.model.recent import Recent
+from quadid.model.array_cache import ArrayCache
 
 
 def test_the_least_recently_used_goes_first() -> None:
-    kept = Recent(3 * 80)
+    kept = ArrayCache(3 * 80)
     for key in "abc":
         kept.keep(key, np.full(10, float(ord(key))))
     assert kept.get("a") is not None
@@ -18,7 +18,7 @@ def test_the_least_recently_used_goes_first() -> None:
 
 
 def test_what_is_larger_than_allowed_is_not_kept_and_a_key_counts_once() -> None:
-    kept = Recent(100)
+    kept = ArrayCache(100)
     kept.keep("large", np.zeros(20))
     assert kept.get("large") is None
     for _ in range(5):

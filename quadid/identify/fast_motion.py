@@ -1,8 +1,8 @@
-"""The fit to quick motion alone, for vehicles that turn by moments which no model of theirs has.
+"""The fit to fast motion alone, for vehicles that turn by moments which no model of theirs has.
 
 Inertias and drag torque are read from the rates, the thrust coefficient from the specific force along the rotors' axis;
 everything else that is measured only tells where segments begin, because it repeats, smoothed and late, what random
-moments did to the rates.  How late rotors and gyro are is fitted along: in quick motion that passes for inertia.
+moments did to the rates.  How late rotors and gyro are is fitted along: in fast motion that passes for inertia.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ SETTLED = 0.01
 
 
 @dataclass(frozen=True)
-class QuickMotion:
-    """A fit to quick motion.
+class FastMotion:
+    """A fit to fast motion.
 
     Attributes:
         shooting: the problem, with its random moments; found: the optimum; free: nominal parameters and what is late.
@@ -61,10 +61,10 @@ class QuickMotion:
     simulated: int
 
 
-def quick_motion(
+def fast_motion(
     windows: Sequence[Window], short: Shooting, theta: FloatArray, names: Sequence[str]
-) -> QuickMotion | None:
-    """Fits `names` and what is late to quick motion, and estimates the random moments with them.
+) -> FastMotion | None:
+    """Fits `names` and what is late to fast motion, and estimates the random moments with them.
 
     Args:
         windows: data.
@@ -107,7 +107,7 @@ def quick_motion(
     open_by = dict(zip(INERTIAS[:2], undecided(windows, short.vehicle, shooting.noise.white[:2]), strict=True))
     unsure = np.array([open_by.get(n, 0.0) for n in free.names])
     simulated = (spent + quicker.iterations) * (len(free.entries) + 10) + prompt.iterations * (len(told.entries) + 10)
-    return QuickMotion(shooting, found, free, prior, quicker, step, unsure, simulated)
+    return FastMotion(shooting, found, free, prior, quicker, step, unsure, simulated)
 
 
 def _late(window: Window) -> list[str]:

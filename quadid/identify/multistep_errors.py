@@ -13,7 +13,7 @@ import numpy as np
 
 from quadid.errors import NotIdentifiableError
 from quadid.identify.open_loop import OpenLoop, lengths, mean_of_known
-from quadid.identify.term_slopes import term_slopes
+from quadid.identify.term_sensitivity import term_sensitivity
 from quadid.model.layout import Layout
 from quadid.residual import ResidualTerm
 from quadid.types import FloatArray, IndexArray, SingleArray
@@ -28,7 +28,7 @@ _CALM = 0.1
 """A flight counts as if no change missed by at least this share of what it misses by in all flights."""
 
 
-class RunErrors:
+class MultistepErrors:
     """Errors at some times after the start, over all flights."""
 
     def __init__(self, windows: Sequence[Window], vehicle: Vehicle, seconds: Sequence[float], most: int) -> None:
@@ -75,7 +75,7 @@ class RunErrors:
         """
         slopes, errors = [], []
         for loop, misses, scale in zip(self._loops, self._misses, self._scales, strict=True):
-            slope = term_slopes(loop, self._vehicle, candidates, self.at)
+            slope = term_sensitivity(loop, self._vehicle, candidates, self.at)
             usable = np.asarray(np.isfinite(misses).all(axis=3) & np.isfinite(slope).all(axis=(3, 4)))
             weight = np.where(usable, 1.0 / np.maximum(lengths(misses) / scale, _NEAR), 0.0)
             root = (np.sqrt(weight / np.maximum(self._counts, 1)) / scale)[..., None]

@@ -1,9 +1,9 @@
-"""Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that quick motion shows.
+"""Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that fast motion shows.
 
 The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
-motion by itself (`quadid.identify.quick_motion`) is free of that.  The selected model is fitted to it too, its causes
+motion by itself (`quadid.identify.fast_motion`) is free of that.  The selected model is fitted to it too, its causes
 as they were found but for what is late: without them an offset of the centre of gravity would count as a random moment,
-free they would take up random moments.  Unless quick motion confirms b, J_xx and J_yy, all three are held at what it
+free they would take up random moments.  Unless fast motion confirms b, J_xx and J_yy, all three are held at what it
 says and the causes refitted.
 """
 
@@ -20,10 +20,10 @@ from quadid.diagnose.segment_schedule import Stage
 from quadid.diagnose.selection import Search, pruned
 from quadid.effects import EFFECTS
 from quadid.identify.covariance import SPREAD_LIMIT
-from quadid.identify.fit import YAW, quick_fit, restless
+from quadid.identify.fast_motion import MOST_SEGMENTS, fast_motion
+from quadid.identify.fit import YAW, fast_fit, restless
 from quadid.identify.gauss_newton import polish
 from quadid.identify.noise_estimation import residual_noise
-from quadid.identify.quick_motion import MOST_SEGMENTS, quick_motion
 from quadid.identify.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet
@@ -33,12 +33,12 @@ from quadid.vehicle_parts import ParameterPrior
 from quadid.window import Window
 
 SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
-"""What quick motion shows."""
+"""What fast motion shows."""
 
 
 @dataclass(frozen=True)
 class Held:
-    """Parameters held at what quick motion shows.
+    """Parameters held at what fast motion shows.
 
     Attributes:
         parameters: by name, as an identification gives them.
@@ -58,13 +58,13 @@ class Held:
         return replace(shooting, vehicle=self.vehicle, layout=Layout(self.vehicle))
 
     def among(self, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-        """Parameters with those held in their place, and no trust in what quick motion does not show."""
+        """Parameters with those held in their place, and no trust in what fast motion does not show."""
         told = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
         return tuple(self.parameters.get(p.name, p) for p in told)
 
     def regardless(self) -> set[str]:
-        """Names of those that quick motion shows without any cause too."""
-        alone = quick_motion(self.windows, self.short, self.theta, NOMINAL_NAMES)
+        """Names of those that fast motion shows without any cause too."""
+        alone = fast_motion(self.windows, self.short, self.theta, NOMINAL_NAMES)
         if alone is None:
             return set()
         told = dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
@@ -79,7 +79,7 @@ class Held:
         )
 
 
-def held_by_quick_motion(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
+def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
     """What the selected model has wrong because moments that no model has turn the vehicle; None where it has not.
 
     Args:
@@ -92,10 +92,10 @@ def held_by_quick_motion(windows: Sequence[Window], short: Shooting, model: Mode
     if not restless(short.with_noise(residual_noise(short, brief)), brief):
         return None
     names = free_names(tuple(c for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns))
-    quick = quick_motion(windows, short, model.theta, names)
+    quick = fast_motion(windows, short, model.theta, names)
     if quick is None:
         return None
-    shown = {p.name: p for p in quick_fit(quick, names).parameters if p.name in SHOWN}
+    shown = {p.name: p for p in fast_fit(quick, names).parameters if p.name in SHOWN}
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
     if all(p.status not in UNKNOWN and p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
         return None

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identify.answer import final_answer, possible_inertia
 from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identify.identifiability import final_answer, possible_inertia
 from quadid.identify.result import fitted_vehicle, parameter_entry
 from quadid.parameters import INERTIAS, ParameterSet, Status, at_bound, impossible_inertia
 from quadid.vehicle import Vehicle
