@@ -1,6 +1,6 @@
 """Errors a caller can act on.
 
-Every error says what was found, what is allowed and what to do about it.  The command line turns any
+Every error states what was found, what is allowed and what to do about it.  The command line turns any
 `QuadidError` into one line and exit code 2 (bad input) or 3 (the data cannot support an answer).
 """
 
@@ -22,7 +22,7 @@ class QuadidError(Exception):
     exit_code = 2
 
     def __init__(self, found: str, allowed: str = "", fix: str = "") -> None:
-        fix = "" if allowed and fix == _one_of(allowed) else fix  # what is allowed is said once
+        fix = "" if allowed and fix == _one_of(allowed) else fix  # what is allowed is stated once
         self.found, self.allowed, self.fix = found, allowed, fix
         parts = [found]
         if allowed:

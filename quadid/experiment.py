@@ -169,14 +169,14 @@ def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Mo
 def design_manoeuvre(
     simulator: Simulator, known: FloatArray, limits: Limits, seconds: float, advance: Advance
 ) -> Proposal:
-    """Chooses a manoeuvre of about `seconds` and says what it would give.
+    """Chooses a manoeuvre of about `seconds` and predicts what it would give.
 
     Args:
         simulator: what is believed of the vehicle.
         known: information there already is, prior included, shape (P, P).
         limits: largest tilt and rate.
         seconds: length of the manoeuvre.
-        advance: told how far it is.
+        advance: called with the progress.
 
     Raises:
         NotIdentifiableError: no movement stays within the limits.

@@ -92,7 +92,7 @@ def grid_recording(
 
     Args:
         recording: a log in core units and frames.
-        vehicle: tells what the rotor columns mean and how many there must be.
+        vehicle: defines what the rotor columns mean and how many there must be.
         rate: grid rate [Hz]; None for the log's own (that of its gyro, else of its rotor signal).
         parts: first and last time [s] of each part to use, rising, in the recording's time.
 

@@ -6,14 +6,14 @@ sample.  Within the sample they follow the feedback: the angular acceleration ab
 does: over a sample of length T it moves further than the trapezoidal rule makes of the rates at both ends, and all
 together by T^2 / 12 (kp angle + kd rate).  With kp = 66 1/s^2, kd = 14 1/s and T = 20 ms that is 0.2 % and 0.5 ms:
 little, but the moment (J_zz - J_xx) p r that couples the axes is larger by these 0.2 % too, and with it J_zz and d,
-which two minutes of flight tell to 0.1 %.
+which two minutes of flight give to 0.1 %.
 
 The surplus of the measured angle's change is compared with measured rate and acceleration, frequency by frequency, so
 that kp and kd are read off a flight without knowing any parameter of the vehicle, and speeds get their slope from them.
 A gyro with a wrong scale makes a surplus of the same form as kp, but one of its own on each axis.  Where roll and pitch
 disagree, or their kp would hardly damp, only kd is believed, and kp follows from it as in a well damped loop.
 Motors that lag behind, or a delay, smooth the torque: then nothing is found, and the speeds stay as they were logged,
-unless the vehicle file tells its stabiliser and how often it runs: then that control law gives the slope.
+unless the vehicle file holds its stabiliser and how often it runs: then that control law gives the slope.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from quadid.window import Window
 STRETCH_SECONDS = 10.0
 """Stretches compared by themselves [s], each half over the one before."""
 LEAST_STRETCHES, MOST_STRETCHES = 8, 1000
-"""More than the latter are thinned evenly: they tell kp and kd to a hundredth, and memory would grow with the log."""
+"""More than the latter are thinned evenly: they give kp and kd to a hundredth, and memory would grow with the log."""
 NEIGHBOURS = 5
 """Frequencies over which the spectrum of the errors is smoothed."""
 FALSE_ALARM = 0.01
@@ -47,11 +47,11 @@ STEEPEST_PITCH = 1.2
 _UNIT = {"thrust_coefficient": 1.0, "drag_coefficient": 1.0}
 """Torques for the squares of the speeds, where the coefficients are not known."""
 DAMPING = 0.85
-"""Damping ratio of a loop whose kp cannot be told from the gyro's scale: between Butterworth and critical …"""
+"""Damping ratio of a loop whose kp cannot be distinguished from the gyro's scale: between Butterworth and critical …"""
 LEAST_DAMPING = 0.5
 """… and the least that is believed of one whose kp can."""
 LEAST_CORRELATION = 0.5
-"""Of angular acceleration and rotor moment; below it the speeds do not tell what slope they need."""
+"""Of angular acceleration and rotor moment; below it the speeds do not determine their slope."""
 
 
 class Feedback(NamedTuple):
@@ -76,22 +76,22 @@ def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[W
         vehicle: where its rotors are; its stabiliser, where known.
 
     Returns:
-        The windows with `rotor_slope`, and a sentence that says so; the same windows and "" without evidence.
+        The windows with `rotor_slope`, and a sentence for people; the same windows and "" without evidence.
     """
     slopes: list[FloatArray | None] = []
     known = vehicle.stabiliser
     if known is not None and known.rate is not None:
         slopes = [_slope_of_law(w, vehicle, known.gains, known.rate) for w in windows]
-        told = f"the vehicle file's stabiliser runs at {known.rate:.0f} Hz, faster than this log"
+        why = f"the vehicle file's stabiliser runs at {known.rate:.0f} Hz, faster than this log"
     else:
         found = find_feedback(windows)
         if found is not None:
             slopes = [_slope_of_motion(w, vehicle, found) for w in windows]
             loop = f"about {found.proportional:.0f} 1/s^2 on the angle, {found.derivative:.0f} 1/s on the rate"
-            told = f"the flight controller acted faster than this log ({loop})"
+            why = f"the flight controller acted faster than this log ({loop})"
     if not slopes or any(slope is None for slope in slopes):
         return list(windows), ""
-    text = f"{told}; the rotor speeds follow it within each sample, nothing to do"
+    text = f"{why}; the rotor speeds follow it within each sample, nothing to do"
     return [replace(w, rotor_slope=slope) for w, slope in zip(windows, slopes, strict=True)], text
 
 
@@ -108,7 +108,7 @@ def find_feedback(windows: Sequence[Window]) -> Feedback | None:
     every = max(math.ceil(2.0 * dt * sum(map(len, windows)) / STRETCH_SECONDS / MOST_STRETCHES), 1)
     spectra = np.array([spectrum for w in windows for spectrum in _spectra(w, every)])
     if len(spectra) < LEAST_STRETCHES or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
-        return None  # too little, or a sensor that always says the same
+        return None  # too little, or a sensor that never changes
     shares, covariance = _weighted(spectra)
     scale = 12.0 / dt**2
     found = _feedback(scale * shares, scale**2 * covariance)
@@ -132,12 +132,12 @@ def _feedback(gains: FloatArray, covariance: FloatArray) -> Feedback | None:
     strongest = (0.5 * (kd + 2.0 * sigma_d) / LEAST_DAMPING) ** 2 + 2.0 * sigma_p
     if apart < exceeded(FALSE_ALARM, 1) and 0.0 < kp < strongest:
         evidence = float(gains @ precision @ same @ both @ same.T @ precision @ gains)
-        told = evidence > exceeded(FALSE_ALARM, 2) and kd > LEAST_RATE * sigma_d
-        return Feedback(kp, kd, (sigma_p, sigma_d)) if told else None
+        significant = evidence > exceeded(FALSE_ALARM, 2) and kd > LEAST_RATE * sigma_d
+        return Feedback(kp, kd, (sigma_p, sigma_d)) if significant else None
     kd, sigma_d = float(gains[2]), float(np.sqrt(covariance[2, 2]))
     kp = (0.5 * kd / DAMPING) ** 2
-    told = kd > np.sqrt(exceeded(FALSE_ALARM, 1)) * sigma_d
-    return Feedback(kp, kd, (2.0 * kp / kd * sigma_d, sigma_d)) if told else None
+    significant = kd > np.sqrt(exceeded(FALSE_ALARM, 1)) * sigma_d
+    return Feedback(kp, kd, (2.0 * kp / kd * sigma_d, sigma_d)) if significant else None
 
 
 def _spectra(window: Window, every: int) -> list[ComplexArray]:
@@ -228,7 +228,7 @@ def _motion(window: Window) -> tuple[FloatArray, FloatArray]:
 
 
 def _torques(speed: FloatArray, mixer: FloatArray) -> FloatArray:
-    """Torques about the body axes that a mixer asked for with these speeds, shape (n, 3)."""
+    """Torques about the body axes that a mixer commanded with these speeds, shape (n, 3)."""
     return np.asarray((speed**2 @ np.linalg.pinv(mixer).T)[:, 1:])
 
 

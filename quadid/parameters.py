@@ -14,7 +14,7 @@ from quadid.types import FloatArray
 
 
 class Status(StrEnum):
-    """What the data say about one parameter."""
+    """What the data determine of one parameter."""
 
     IDENTIFIED = "identified"
     RATIO_ONLY = "ratio_only"
@@ -61,7 +61,7 @@ class Parameter:
         sigma: standard deviation of the estimate, same unit; NaN when unknown.
         initial: value the fit started from.
         bounds: allowed interval.
-        status: what the data say about it.
+        status: what the data determine of it.
         relative_to: for `ratio_only`, the parameter whose ratio to this one is known.
         ci95: 95 % interval; derived from `sigma` by the fit, which may use the log scale.
         prior_share: share of what is known about it that was known before the flight, 0 to 1; NaN when unknown.
@@ -82,7 +82,7 @@ class Parameter:
 
 
 def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple[Parameter, ...]:
-    """Parameters, with those of `names` that data tell not to be used."""
+    """Parameters, with the identified ones of `names` marked unreliable."""
     return tuple(
         replace(p, status=Status.UNRELIABLE, relative_to=None) if p.name in names and p.status not in UNKNOWN else p
         for p in parameters
@@ -118,7 +118,7 @@ class ParameterSet:
         return ParameterSet(tuple(kept), np.array(self.covariance[:n, :n]))
 
     def unreliable(self, names: Sequence[str]) -> ParameterSet:
-        """The same, with those of `names` that data tell not to be used."""
+        """The same, with the identified ones of `names` marked unreliable."""
         return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))
 
     @property

@@ -129,7 +129,7 @@ def reach(track: Track, cut: slice, plan: Plan) -> tuple[float, float]:
 
 
 def on_grid(name: str, track: Track, at: FloatArray, plan: Plan) -> FloatArray:
-    """Reads one channel at the grid times; NaN where it says nothing."""
+    """Reads one channel at the grid times; NaN where nothing was measured."""
     out = np.full((len(at), track.values.shape[1]), np.nan)
     tolerance = COINCIDENT * plan.step
     for cut in track.stretches_within(at[0] - tolerance, at[-1] + tolerance):

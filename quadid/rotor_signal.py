@@ -1,4 +1,4 @@
-"""Which channel tells the rotor speeds, and what its numbers mean: readings, or commands as the vehicle file says."""
+"""Which channel holds the rotor speeds, and what its numbers mean: readings, or commands, by the vehicle file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quadid.vehicle import Vehicle
 from quadid.window import Channel, Recording, Sampling
 
 SLOWEST_RATE = 6.0
-"""Below this rate [Hz] a rotor signal says nothing about what happened between its samples; it is refused."""
+"""Below this rate [Hz] a rotor signal does not show what happened between its samples; it is refused."""
 INERTIA_RATE = 30.0
 """Rotor signal and gyro below this rate [Hz] reveal no inertia, lag or delay: the rate loop acts faster."""
 _HIGHEST_COMMAND = 1.5
@@ -25,7 +25,7 @@ _HOW_TO_GET_MOTORS = (
 
 
 class RotorSignal(NamedTuple):
-    """Rotor speeds as a log tells them: times [s], values (n, rotors) [rad/s], meaning in time, source, notes."""
+    """Rotor speeds of a log: times [s], values (n, rotors) [rad/s], meaning in time, source, notes."""
 
     t: FloatArray
     values: FloatArray
@@ -74,7 +74,7 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
 
 
 def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channel | None, tuple[str, ...]]:
-    """Picks the channel that drives the rotors, as `rotor_signal` says; None where there is none.
+    """Picks the channel that drives the rotors, as `rotor_signal` declares; None where there is none.
 
     Mixer inputs go through the vehicle's mixer where neither speeds nor commands of rotors are logged.
 

@@ -62,7 +62,7 @@ class Vehicle(Strict):
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
         arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
         proof: what shows that the values predict; None for values that nobody fitted.
-        thrust_stand: readings that tell b before any flight; take the place of its guess as prior.
+        thrust_stand: readings that give b before any flight; take the place of its guess as prior.
     """
 
     name: str = Field(max_length=LONGEST_NAME)

@@ -24,7 +24,7 @@ MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
 
 
 class Strict(BaseModel):
-    """A frozen part of a file that knows no other keys."""
+    """A frozen part of a file that allows no other keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -138,7 +138,7 @@ class Recording:
         grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
         epoch: UNIX time of its time 0 [s]; None where its clock has no date.
-        modes: when the autopilot entered a flight mode [s], and its name; empty where the log does not say.
+        modes: when the autopilot entered a flight mode [s], and its name; empty where the log lacks them.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""YAML from strangers: a mapping of mappings, lists, numbers and text, or one line that says what is wrong.
+"""YAML from strangers: a mapping of mappings, lists, numbers and text, or one line on what is wrong.
 
 YAML 1.1 reads `1:30` as 90, `yes` as true and `010` as 8, keeps the last of two equal keys, and lets a few hundred
 bytes expand without end.  A vehicle file needs none of that, so here it is refused.
@@ -68,7 +68,7 @@ def read_mapping(text: str, origin: str, wanted: str = "a YAML mapping") -> dict
 
 def _check_depth(text: str) -> None:
     depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # libyaml reads on 1000 levels before it tells of the first
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # libyaml reads on 1000 levels before it yields the first
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
             raise _RefusedError("anchors and aliases (& and *)", "write the values out")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)

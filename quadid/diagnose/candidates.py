@@ -20,7 +20,7 @@ class Candidate:
         start: non-neutral starting values of those entries, for causes that cannot be linearised at neutral.
         requires: effect, or label of a cause, that must be in the model first.
         timed: index of its time entry, when it begins at an unknown moment.
-        label: tells candidates of one effect apart.
+        label: distinguishes candidates of one effect.
         refines: it frees optional numbers of an effect that is in the model, and shares its finding.
         split: what it stands for once accepted, where that shows only together.
     """

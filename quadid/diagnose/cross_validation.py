@@ -6,7 +6,7 @@ that only fits noise; the paired differences between two models, one a block, ca
 the correlation inside a block.
 
 A block that moves the vehicle as no other does is an extrapolation of parameters that the others hardly determine.  Its
-error says nothing of the model, so each block is scored by its predictive density, in which that uncertainty has its
+error is no evidence on the model, so each block is scored by its predictive density, in which that uncertainty has its
 share (Geisser and Eddy, J. Am. Stat. Assoc. 74 (1979) 153).
 """
 

@@ -2,7 +2,7 @@
 
 Twice the logarithm of the marginal likelihood by Laplace's approximation, with the priors that exist: on parameters
 those of the fit, on models that a cause is absent until proven (`FALSE_ALARM` shared by all that were tried).  Where
-the model leaves more than noise, or noise with a memory, squared errors count for less than they say: deviances are
+the model leaves more than noise, or noise with a memory, squared errors are worth less than their size: deviances are
 divided by the ratio of the scores' true variance to that which the model counts on (Godambe, Ann. Math. Stat. 31 (1960)
 1208; as magnitude adjustment of a composite likelihood in Ribatet, Cooley and Davison, Statistica Sinica 22 (2012)
 813).  A cause must besides be of use: on blocks of data that its fit did not see it has to gain a share of the noise.

@@ -40,7 +40,7 @@ from quadid.vehicle import Vehicle
 from quadid.window import Window
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
-"""Lengths of segments that may decide (`segment_schedule.USUAL_SECONDS` says when the longest may), longest first;
+"""Lengths of segments that may decide (the longest as `segment_schedule.USUAL_SECONDS` allows), longest first;
 below them only the short ones of the first fit."""
 NOISE_FELL = 0.7
 """When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
@@ -263,7 +263,7 @@ def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -
         nominal: model without causes.
         model: the selected one.
         left: what it leaves.
-        unnamed: deviance that causes which are not what their names say take away; it counts as left.
+        unnamed: deviance that causes with implausible numbers take away; it counts as left.
     """
     explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
     least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)

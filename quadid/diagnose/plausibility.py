@@ -1,7 +1,7 @@
 """Numbers that no vehicle has: what carries them fits, but stands for something else.
 
 A fit takes whatever lowers its cost.  Air that pushes, drag that acts a foot above the vehicle, an accelerometer off by
-half of gravity may all be near enough to something that the catalogue lacks; they are not what their names say.  The
+half of gravity may all be near enough to something that the catalogue lacks; their names are then wrong.  The
 selection prefers causes whose numbers are possible; where none is, the finding is listed without confidence.
 """
 
@@ -24,8 +24,8 @@ WRONG_SIGN = 0.1
 
 def impossible_causes(model: Model) -> dict[str, str]:
     """Causes of `model` with a number that no vehicle has, and which, by label."""
-    told = {c.label: impossible(model, c) for c in model.causes}
-    return {label: reason for label, reason in told.items() if reason}
+    reasons = {c.label: impossible(model, c) for c in model.causes}
+    return {label: reason for label, reason in reasons.items() if reason}
 
 
 def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str]:

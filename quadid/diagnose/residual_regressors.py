@@ -42,7 +42,7 @@ class Site:
     Attributes:
         name: for people.
         channels: residual channels that it moves, with how often the signal is integrated before it shows there.
-        group: sites that cannot be told apart from afar; only the best of a group counts.
+        group: sites that cannot be distinguished from afar; only the best of a group counts.
     """
 
     name: str
@@ -186,7 +186,7 @@ def signals(part: Columns) -> dict[str, FloatArray]:
 
 
 def _inputs(part: Columns) -> dict[str, FloatArray]:
-    """What the rotors were told, by row of the window: thrust and differences of squared speeds, their shapes."""
+    """Rotor commands, by row of the window: thrust and differences of squared speeds, their shapes."""
     square = part.window.rotor_speed**2
     mean = square.mean(axis=1)
     # Principal differences between rotors stand for the moments, whatever the geometry.

@@ -121,11 +121,11 @@ def inconstant_causes(model: Model, left: Remainder) -> dict[str, str]:
     """Offsets in `model` that are not constant, and what they follow, by label.
 
     A bias is constant.  Anything whose mean is not zero looks like one at first: a gyro that senses acceleration, warms
-    up or is shaken.  What tells them apart is small beside the mean: the rest at the same sensor follows acceleration,
+    up or is shaken.  The difference is small beside the mean: the rest at the same sensor follows acceleration,
     thrust or time.  A test of all generic signals together is too blunt for that; each alone is not.
     """
-    told = {c.label: _inconstant(model, c, left) for c in model.causes}
-    return {label: reason for label, reason in told.items() if reason}
+    reasons = {c.label: _inconstant(model, c, left) for c in model.causes}
+    return {label: reason for label, reason in reasons.items() if reason}
 
 
 def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
@@ -134,7 +134,7 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
     if not kind:
         return ""
     least = max(ALARM**2, CHANGE_SHARE * model.wald(cause))
-    told = [
+    followed = [
         (chi_square, f.site.name, signal)
         for f in left.sites
         if f.site.name.startswith(kind)
@@ -143,5 +143,5 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
         if signal.startswith(CHANGES)
         and chi_square >= max(g.alone[signal] for g in left.sites if g.site.group == f.site.group)
     ]
-    chi_square, site, signal = max(told, default=(0.0, "", ""))
+    chi_square, site, signal = max(followed, default=(0.0, "", ""))
     return f"{cause.effect} is not constant (what remains at {site} follows {signal})" if chi_square > least else ""

@@ -1,4 +1,4 @@
-"""What a diagnosis says: verdict, findings with numbers, intervals and what lost against them; and as data for JSON."""
+"""Result of a diagnosis: verdict, findings with numbers, intervals and what lost against them; and as data for JSON."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from quadid.parameters import Parameter
 
 STEP_SIGMA = 3e-4
 """Standard deviation [s] added to lags and delays: commands and samples of a loop at 1 kHz keep whole steps, and stamps
-no more; two minutes of data would tell a delay ten times better than that."""
+no more; two minutes of data alone would give a delay ten times more precisely."""
 TIME_SIGMA = 0.1
 """Standard deviation [s] given to a change time, the resolution of its scan."""
 
@@ -163,7 +163,7 @@ def describe(
 def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, float], confident: bool) -> Finding:
     cause = worth.cause
     numbers = _numbers(shooting, search.model, cause, sigma)
-    body, benefit = EFFECTS[cause.effect].told({p.name: p.value for p in numbers}), worth.benefit
+    body, benefit = EFFECTS[cause.effect].describe({p.name: p.value for p in numbers}), worth.benefit
     return Finding(
         effect=cause.effect,
         confident=confident,

@@ -232,7 +232,7 @@ def _refine_time(shooting: Shooting, model: Model, candidate: Candidate) -> Mode
         return shooting.linearise(theta, none, model.states).total_cost
 
     theta = model.theta
-    step = 0.25 * shooting.seconds  # the scan knows it to a segment
+    step = 0.25 * shooting.seconds  # the scan resolves one segment
     while step > 0.01:
         moved = np.repeat(theta[None], 5, axis=0)
         moved[:, candidate.timed] += step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])

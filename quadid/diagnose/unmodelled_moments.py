@@ -3,8 +3,8 @@
 The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
 motion by itself (`quadid.identify.fast_motion`) is free of that.  The selected model is fitted to it too, its causes
 as they were found but for what is late: without them an offset of the centre of gravity would count as a random moment,
-free they would take up random moments.  Unless fast motion confirms b, J_xx and J_yy, all three are held at what it
-says and the causes refitted.
+free they would take up random moments.  Unless fast motion confirms b, J_xx and J_yy, all three are held at its
+estimates and the causes refitted.
 """
 
 from __future__ import annotations
@@ -59,16 +59,16 @@ class Held:
 
     def among(self, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
         """Parameters with those held in their place, and no trust in what fast motion does not show."""
-        told = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
-        return tuple(self.parameters.get(p.name, p) for p in told)
+        listed = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
+        return tuple(self.parameters.get(p.name, p) for p in listed)
 
     def regardless(self) -> set[str]:
         """Names of those that fast motion shows without any cause too."""
         alone = fast_motion(self.windows, self.short, self.theta, NOMINAL_NAMES)
         if alone is None:
             return set()
-        told = dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
-        return {n for n, p in self.parameters.items() if abs(np.log(told[n] / p.value)) <= SPREAD_LIMIT}
+        fitted = dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
+        return {n for n, p in self.parameters.items() if abs(np.log(fitted[n] / p.value)) <= SPREAD_LIMIT}
 
     @property
     def sentence(self) -> str:

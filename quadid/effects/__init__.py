@@ -1,4 +1,4 @@
-"""The effects a simulation may lack: everything that is said of each of them, in one table (`quadid.effects.table`).
+"""The effects a simulation may lack: one table with all properties of each (`quadid.effects.table`).
 
 It is the vocabulary shared by the vehicle file, the model, the diagnosis, its reports and the flown truth.  It holds no
 equations: those of the model under test are in `quadid.model`, those of the flown vehicle in `quadid.flight`.

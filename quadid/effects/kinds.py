@@ -108,7 +108,7 @@ class Effect:
 
     @property
     def turns(self) -> bool:
-        """Whether angular acceleration shows it, of which a moment of inertia is told."""
+        """Whether angular acceleration shows it, from which a moment of inertia is estimated."""
         return any("':" in s or s.endswith("_dot") for s in self.shows)
 
     @property
@@ -133,7 +133,7 @@ class Effect:
         start = tuple(p.start for p in self.parameters if p.name != "time" and not p.optional)
         return start if any(start) else ()
 
-    def told(self, values: Mapping[str, float]) -> str:
+    def describe(self, values: Mapping[str, float]) -> str:
         """The sentence with these values, in contract units."""
         factor = {p.name: p.factor for p in self.parameters}
         return self.sentence.format(**{k: v * factor.get(k, 1.0) for k, v in values.items()})

@@ -1,4 +1,4 @@
-"""The one place that knows how kernels of the flown vehicle are compiled.
+"""The one place that sets how kernels of the flown vehicle are compiled.
 
 numba keeps machine code on disk by the content of the file a kernel is in, and does not see that a kernel it calls, in
 another file, has changed: after an upgrade the old physics would go on flying.  The stamp of every kernel here

@@ -169,7 +169,7 @@ def shake(phase: FloatArray, omega: FloatArray, mode: FloatArray, hover: float, 
 def pull_attitude(error: FloatArray, estimate: FloatArray, force: FloatArray, amount: float) -> None:
     """Turns the attitude filter's world-frame error towards the accelerometer's idea of down.
 
-    With n = -f/|f| (down, says the accelerometer) and d the estimate's down, both in body axes, a complementary filter
+    With n = -f/|f| (down, by the accelerometer) and d the estimate's down, both in body axes, a complementary filter
     adds k (n x d) to its body rate.  Seen from the world the error matrix turns by R_hat k (n x d) dt.
 
     Args:

@@ -61,7 +61,7 @@ ARRANGE: dict[Arrange, Sizes] = {
     f.dead_time_jitter: {"jitter": Size(0.02, 0.045)},  # [s]
     f.lost_commands: {"probability": Size(0.15, 0.4)},
 }  # fmt: skip
-"""What changes a flight: the function, by whose name the effect goes and which says what it is, and its numbers."""
+"""What changes a flight: the function, which names and describes the effect, and its numbers."""
 DISTORT: dict[Distort, Sizes] = {
     g.vibration_rectification: {"shift": Size(0.3, 0.8)},  # [m/s^2]
     g.gyro_g_sensitivity: {"gain": Size(0.004, 0.012)},  # [rad s/m]

@@ -82,7 +82,7 @@ def excited(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def gentle(rng: np.random.Generator, n: int) -> FloatArray:
-    """Near hover with slow small moves; says little about inertia."""
+    """Near hover with slow small moves; reveals little about inertia."""
     a, b, c, d = rng.spawn(4)
     tilt = [band_noise(stream, n, 0.04, 0.15, 0.02) for stream in (a, b)]
     yaw = np.cumsum(band_noise(c, n, 0.02, 0.08, 0.04)) * PILOT_STEP

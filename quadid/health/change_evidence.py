@@ -18,7 +18,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 _DRAWS = 8192
-"""Healthy flights that are drawn to tell how rare an evidence of change is among them."""
+"""Healthy flights that are drawn to estimate how rare an evidence of change is among them."""
 LEAST_CHANCE = 1.0 / (_DRAWS + 1)
 """The smallest `p_unchanged`: no drawn flight speaks for a change as much."""
 
@@ -136,14 +136,14 @@ def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Veh
     points of a Sobol sequence in the predictive distribution of the spread.
     """
     offered = hypotheses(vehicle, healthy.shares, healthy.mean)
-    drawn = _evidence_of_draws(_Asked(_bytes(healthy, offered), healthy, flights, tuple(offered)))
+    drawn = _evidence_of_draws(_Question(_bytes(healthy, offered), healthy, flights, tuple(offered)))
     own = _changed_over_unchanged(exact(change)[None], healthy, flights, offered)
     return float((1 + np.count_nonzero(drawn >= own)) / (len(drawn) + 1))
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What the evidence of draws follows from, and the bytes of it that tell one such question from another."""
+class _Question:
+    """What the evidence of draws follows from, and its bytes, the key of the cache."""
 
     key: tuple[bytes, ...]
     healthy: Healthy = field(compare=False)
@@ -157,10 +157,10 @@ def _bytes(healthy: Healthy, offered: Sequence[Hypothesis]) -> tuple[bytes, ...]
 
 
 @lru_cache(maxsize=32)
-def _evidence_of_draws(asked: _Asked) -> FloatArray:
+def _evidence_of_draws(question: _Question) -> FloatArray:
     """Evidence of change in draws of healthy flights, which all flights after one baseline share, shape (draws,)."""
-    points = _healthy_points(*asked.healthy.freedom) * asked.healthy.predictive(asked.flights)
-    return _changed_over_unchanged(exact(points), asked.healthy, asked.flights, asked.offered)
+    points = _healthy_points(*question.healthy.freedom) * question.healthy.predictive(question.flights)
+    return _changed_over_unchanged(exact(points), question.healthy, question.flights, question.offered)
 
 
 @cache

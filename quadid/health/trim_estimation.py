@@ -95,7 +95,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
             f"{_FEWEST * BLOCK:.0f} s or more between take-off and landing", "fly longer, a hover will do",
         )  # fmt: skip
     edges, load = edges[kept], load[kept]
-    force, told = _specific_force(recording, edges)
+    force, from_what = _specific_force(recording, edges)
     total = load.sum(axis=1)
     trims = trim_of_load(load, force, vehicle)
     motion, moved = _motion(recording, edges)
@@ -103,7 +103,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
         recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), wander(rest),
-        len(edges) * BLOCK, f"{rotors.source}; {told}; {moved}",
+        len(edges) * BLOCK, f"{rotors.source}; {from_what}; {moved}",
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """Parameters from two cuts of the same flight, the second half a segment later.
 
 What happens across the borders of segments is lost with their initial states.  The second cut has its borders where the
-first has the middle of its segments, so that each tells what the other loses.  Both see the same noise; what their
+first has the middle of its segments, so that each holds what the other loses.  Both see the same noise; what their
 scores share where segments overlap decides how much is gained (a composite likelihood with its Godambe information;
 Varin, Reid and Firth, Statistica Sinica 21 (2011) 5).
 """
@@ -26,14 +26,14 @@ ITERATIONS = 8
 WORSE = 1.2
 """Cost per row of the second cut over that of the first beyond which it went astray: both see the same data."""
 MOST_COMPARED = 120
-"""Segments of the second cut, those that tell most, from which follows what both share."""
+"""Segments of the second cut, the most informative, from which follows what both share."""
 SINGULAR = 1e-12
 """Share of information below which a direction counts as not known."""
 
 
 @dataclass(frozen=True)
 class BothCuts:
-    """What two cuts tell together.
+    """Estimate from two cuts together.
 
     Attributes:
         theta: full parameter vector.
@@ -80,7 +80,7 @@ def _shared(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of the score of the second cut, and of that with the score of the first, both (P, P).
 
-    From the segments that tell most; exact for white noise, and nearly for the slow noise of an attitude, whose
+    From the most informative segments; exact for white noise, and nearly for the slow noise of an attitude, whose
     whitening begins anew with each segment.
     """
     p = len(free.entries)
@@ -101,10 +101,10 @@ def _shared(
 
 
 def _compared(first: Shooting, second: Shooting, other: Polished) -> tuple[list[IndexArray], list[IndexArray]]:
-    """Places, window by window, of segments of the first cut that overlap those of the second that tell most; these."""
-    told = np.diagonal(other.lin.gram, axis1=1, axis2=2)
-    total = told.sum(axis=0)
-    weight = np.sum(told / np.where(total > 0.0, total, 1.0), axis=1)
+    """Places, window by window, of segments of the first cut that overlap the most informative of the second; these."""
+    known = np.diagonal(other.lin.gram, axis1=1, axis2=2)
+    total = known.sum(axis=0)
+    weight = np.sum(known / np.where(total > 0.0, total, 1.0), axis=1)
     chosen = np.zeros(len(weight), dtype=bool)
     chosen[np.argsort(-weight, kind="stable")[:MOST_COMPARED]] = True
     later = [np.flatnonzero(chosen[other.lin.window == w]) for w in range(len(second.rollouts))]

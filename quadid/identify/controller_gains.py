@@ -2,7 +2,7 @@
 
 The control law is that of `quadid.attitude_controller`: angle P, rate PI, mixer.  Its inputs (references, measured
 attitude and rate) and its output (rotor commands) are all logged, so the gains follow from a regression; how much of
-the commands it leaves unexplained says whether the vehicle flies this law at all.
+the commands it leaves unexplained shows whether the vehicle flies this law at all.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def find_autopilot(windows: Sequence[Window], vehicle: Vehicle) -> Autopilot | N
     b, d = (vehicle.parameters[n].initial for n in NOMINAL_NAMES[:2])
     throttle, ceiling = _throttle(rows)
     arms = vehicle.torque_arms.T * [[b], [b], [d]]
-    # The first minutes tell whether it runs faster than the log, and the gains to begin with.
+    # The first minutes show whether it runs faster than the log, and the gains to begin with.
     some = [_Rows(*(values[:TRIAL_ROWS] for values in rows[0]))] if len(rows[0].rate) >= SHORTEST else rows
     found = []
     for late in (False, True):
@@ -133,9 +133,9 @@ def _throttle(rows: Sequence[_Rows]) -> tuple[float, float]:
     return _explained(lift, slope * throttle), float(np.sqrt(max(slope, 0.0)))
 
 
-def _explained(values: FloatArray, told: FloatArray) -> float:
+def _explained(values: FloatArray, predicted: FloatArray) -> float:
     spread = float(np.sum((values - values.mean()) ** 2))
-    return 1.0 - float(np.sum((values - told) ** 2)) / spread if spread > 0.0 else 0.0
+    return 1.0 - float(np.sum((values - predicted) ** 2)) / spread if spread > 0.0 else 0.0
 
 
 def _fit_axis(
@@ -157,7 +157,7 @@ def _fit_axis(
     measured = np.concatenate(torque)
     scale, most = max(float(np.std(measured)), 1e-12), float(np.max(np.abs(measured)))
 
-    def told(x: FloatArray) -> FloatArray:
+    def predicted(x: FloatArray) -> FloatArray:
         p, rate_p, rate_i, limit = np.exp(x[:4])
         parts = []
         for i, (e, w) in enumerate(zip(error, rate, strict=True)):
@@ -166,11 +166,11 @@ def _fit_axis(
         return np.asarray(np.clip(np.concatenate(parts), -most, most))
 
     def residual(x: FloatArray) -> FloatArray:
-        return (told(x) - measured) / scale
+        return (predicted(x) - measured) / scale
 
     start = np.concatenate([np.log([4.0, 1.0, 1.0, 3.0]), np.zeros(len(rows))])
     # The guesses of both rate gains follow from the size of the commands.
-    start[1:3] += np.log(scale / max(float(np.std(told(start))), 1e-12))
+    start[1:3] += np.log(scale / max(float(np.std(predicted(start))), 1e-12))
     if known is not None and min(known[:4]) > 0.0:
         start[:4] = np.log(known[:4])
     evaluations = 60 if known is None else 20  # it begins near its end
@@ -181,10 +181,10 @@ def _fit_axis(
 
     found = least_squares(residual, start, bounds=bounds, loss="soft_l1", max_nfev=evaluations)
     p, rate_p, rate_i, limit = np.exp(found.x[:4])
-    asked = p * max(float(np.max(np.abs(e))) for e in error)
-    if asked <= limit:
-        limit = 2.0 * asked  # never met, so all that is known is that it is no smaller than what was asked for
-    return _Axis(float(p), float(rate_p), float(rate_i), float(limit), _explained(measured, told(found.x)))
+    largest = p * max(float(np.max(np.abs(e))) for e in error)
+    if largest <= limit:
+        limit = 2.0 * largest  # never met, so it is only known to be no smaller than the largest reference
+    return _Axis(float(p), float(rate_p), float(rate_i), float(limit), _explained(measured, predicted(found.x)))
 
 
 def _limit(values: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""What the data say about each parameter: covariance corrected for autocorrelation, intervals, status."""
+"""What the data determine of each parameter: covariance corrected for autocorrelation, intervals, status."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quadid.types import FloatArray
 LAG_SECONDS = 2.0
 """Scores of segments up to this far apart may be correlated."""
 NOT_NOTHING = 1.0 / 3.0
-"""Relative standard deviation above which what may vanish is not told from nothing."""
+"""Relative standard deviation above which what may vanish is not distinguished from zero."""
 KNOWN = 0.03
 """A log-scale standard deviation below this is identified whatever its correlations."""
 RATIO_SIGMA = 0.05
@@ -84,7 +84,7 @@ class Uncertainty:
 
 
 def uncertainty(lin: Linearised, prior: Prior, information: FloatArray | None = None) -> Uncertainty:
-    """Posterior covariance, widened where the segment scores are larger or more correlated than the noise model says.
+    """Posterior covariance, widened where the segment scores are larger or more correlated than modelled.
 
     The widening is the ratio of the heteroscedasticity- and autocorrelation-consistent ("sandwich") variance (Newey and
     West, Econometrica 55 (1987) 703) to the model's; it is applied only where it exceeds its own sampling error, so
@@ -156,7 +156,7 @@ def _status(
         return Status.UNRELIABLE, None
     if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j] or (entry.name == MAY_VANISH and sigma[j] > NOT_NOTHING):
         return Status.PRIOR_DOMINATED, None
-    if free.is_log[j] and not (entry.lower <= ci[0] and ci[1] <= entry.upper):  # then the bound has a say in the value
+    if free.is_log[j] and not (entry.lower <= ci[0] and ci[1] <= entry.upper):  # then the bound affects the value
         return Status.UNRELIABLE, None
     limit = SPREAD_LIMIT if free.is_log[j] else SPREAD_LIMIT * max(1.0, abs(value) / entry.typical)
     if unc.spread is not None and unc.spread[j] > limit:

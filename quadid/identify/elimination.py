@@ -63,7 +63,7 @@ class Reduced(NamedTuple):
     Attributes:
         gram: (segments, P, P); grad: (segments, P); cost: (segments,).
         occam: log-determinant of the eliminated velocity, (segments,); 0 without its prior.
-        fitted: directions of the initial state that the data tell, (segments,).
+        fitted: directions of the initial state that the data determine, (segments,).
         offset: step of the eliminated directions, (segments, own); slope: its change with parameters (…, P).
         base: residual, channel units, (segments, length, C).
         largest: largest product of two columns, (segments,); infinite when it is none.

@@ -93,7 +93,7 @@ def _squares(y: FloatArray, i: int, row: FloatArray) -> None:
 
 @nb.njit(**jit)
 def _factor(g: FloatArray, lane: IndexArray, s: int, prior: StatePrior, into: Reduced, l: FloatArray) -> None:
-    """Cholesky factor L of the products of the eliminated columns with their prior; writes what it tells."""
+    """Cholesky factor L of the products of the eliminated columns with their prior; writes its results."""
     own, fitted, occam = len(l), 0.0, 0.0
     for i in range(own):
         at = lane[1 + i]
@@ -123,7 +123,7 @@ def _eliminate(
 ) -> None:  # fmt: skip
     """Eliminates the initial state of segment s from products g of its columns, known on and above the diagonal.
 
-    Columns are where `lane` says: base, eliminated, parameters.  y = L^-1 (B, r) for parameters and residual.
+    Columns are laid out as in `lane`: base, eliminated, parameters.  y = L^-1 (B, r) for parameters and residual.
     """
     own, p = y.shape[0], y.shape[1] - 1
     _factor(g, lane, s, prior, into, l)

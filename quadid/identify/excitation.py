@@ -25,7 +25,7 @@ class Excitation:
     Attributes:
         names: parameters.
         bound: smallest reachable relative standard deviation of each (absolute, in typical sizes, for effects),
-            all others unknown too; infinite when the data say nothing.
+            all others unknown too; infinite without information.
         alone: the same if all other parameters were known.
         information: Fisher information of the scaled parameters (P, P).
     """

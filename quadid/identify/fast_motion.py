@@ -1,7 +1,7 @@
 """The fit to fast motion alone, for vehicles that turn by moments which no model of theirs has.
 
 Inertias and drag torque are read from the rates, the thrust coefficient from the specific force along the rotors' axis;
-everything else that is measured only tells where segments begin, because it repeats, smoothed and late, what random
+everything else that is measured only gives the start of segments, because it repeats, smoothed and late, what random
 moments did to the rates.  How late rotors and gyro are is fitted along: in fast motion that passes for inertia.
 """
 
@@ -99,14 +99,14 @@ def fast_motion(
         return None
     brief = short.with_noise(shooting.noise).leaving_out(rest)
     quicker = polish(brief, theta, free, prior, iterations=8)
-    told = shooting.free(names)
+    own = shooting.free(names)
     neutral = theta.copy()
     neutral[shooting.free(late).index] = 0.0
-    prompt = polish(shooting, neutral, told, states=found.states, iterations=8)
+    prompt = polish(shooting, neutral, own, states=found.states, iterations=8)
     step = np.where(np.isin(free.names, names), free.step(theta, prompt.theta), 0.0)
     open_by = dict(zip(INERTIAS[:2], undecided(windows, short.vehicle, shooting.noise.white[:2]), strict=True))
     unsure = np.array([open_by.get(n, 0.0) for n in free.names])
-    simulated = (spent + quicker.iterations) * (len(free.entries) + 10) + prompt.iterations * (len(told.entries) + 10)
+    simulated = (spent + quicker.iterations) * (len(free.entries) + 10) + prompt.iterations * (len(own.entries) + 10)
     return FastMotion(shooting, found, free, prior, quicker, step, unsure, simulated)
 
 

@@ -1,6 +1,6 @@
 """Identification from first guess to parameters with intervals: swarm, polish, noise, covariance.
 
-`fit_at` says what the data tell of the parameters where some other search ended.
+`fit_at` estimates intervals of the parameters where some other search ended.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def fit(
     options = options or FitOptions()
     report = progress or (lambda stage, share: None)
     check_windows(windows)
-    windows, said = spread(windows)
+    windows, thinned = spread(windows)
     short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
     free = short.free(list(names or NOMINAL_NAMES))
     theta, evaluations = short.layout.initial(vehicle), 0
@@ -139,7 +139,7 @@ def fit(
         found = replace(found, warnings=(*found.warnings, *_warnings(found)))
     report("polish", 1.0)
     evaluations += first.simulated + found.evaluations
-    found = replace(found, noise=noise, evaluations=evaluations, warnings=(*said, *found.warnings))
+    found = replace(found, noise=noise, evaluations=evaluations, warnings=(*thinned, *found.warnings))
     return final_answer(found, out_of_reach or {})
 
 
@@ -158,18 +158,18 @@ def restless(short: Shooting, plain: Polished) -> bool:
 
 
 def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
-    """What fast motion says of `names`, with intervals and statuses.
+    """Estimates of `names` from fast motion, with intervals and statuses.
 
     Args:
         quick: the fit.
         names: of the vehicle's own parameters.
         robust: down-weight outliers of the second cut.
-        comparable: whether short segments and other models tell what the numbers are worth.
+        comparable: whether short segments and other models test the numbers.
     """
-    said = [_QUICK]
+    remarks = [_QUICK]
     if late := [n for n, step in zip(quick.free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
-        said.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
-    said += [
+        remarks.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
+    remarks += [
         f"{name}: the rotors' torque accounts for {np.exp(-by):.0%} of quick angular acceleration only"
         for name, by in zip(quick.free.names, quick.undecided, strict=True)
         if by > SPREAD_LIMIT
@@ -180,7 +180,7 @@ def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, compa
         names
     )
     found = replace(found, parameters=found.parameters.unreliable(YAW))
-    return replace(found, warnings=(*said, *found.warnings, *_warnings(found)))
+    return replace(found, warnings=(*remarks, *found.warnings, *_warnings(found)))
 
 
 def _finish(
@@ -189,7 +189,7 @@ def _finish(
 ) -> Fit:  # fmt: skip
     """Intervals and statuses.
 
-    The fit to `short` segments tells what the numbers are worth, and so do `others`, scaled steps to other estimates.
+    The fit to `short` segments tests the numbers, and so do `others`, scaled steps to other estimates.
     """
     theta, ended = polished.theta, np.isfinite(polished.cost)
     both = with_second_cut(shooting, polished, free, prior, robust) if ended else None

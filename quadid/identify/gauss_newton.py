@@ -31,7 +31,7 @@ LONGEST_STEP = 3.0
 """No scaled parameter moves farther than this in one step."""
 _REFUSALS, _SETTLED = 3, 0.01
 """Steps refused in a row after which initial states are looked at alone, and the share of the cost by which their own
-step may miss what it promised.  Beyond, they have gone where linearisation, and the cost it tells, is worth nothing."""
+step may miss what it promised.  Beyond, they have gone where linearisation, and its cost, is worth nothing."""
 _STEADY_WEIGHT = 0.01
 """Robust weights are renewed while any of them changes by more than this."""
 
@@ -149,7 +149,7 @@ def _descend(
             break
         settled = True
         if robust and (weights := _renewed(shooting, lin)) is not None:
-            # A cost under old weights says nothing about one under new weights.
+            # Costs under old and new weights cannot be compared.
             shooting = shooting.with_robust(weights)
             lin = shooting.linearise(theta, free, lin.states)
             spent, cost = spent + 1, lin.total_cost + prior_terms(free, prior, theta)[2]

@@ -60,7 +60,7 @@ def swarm_search(
 
 
 def _resolved(swarm: Swarm, settings: SwarmOptions) -> bool:
-    """True when no particle's best is worse than the best of all by more than the data can tell."""
+    """True when no particle's best is worse than the best of all by more than the data resolve."""
     worst = float(np.max(swarm.personal_bests[1]))
     return settings.tolerance > 0.0 and np.isfinite(worst) and worst - swarm.best_cost < RESOLUTION
 

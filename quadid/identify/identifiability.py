@@ -39,7 +39,7 @@ class Fit:
         uncertainty: covariance of the scaled parameters.
         outcome: how the polish ended.
         evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
-        warnings: what a user should know.
+        warnings: for the user.
     """
 
     vehicle: Vehicle
@@ -77,7 +77,7 @@ def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
 
 
 def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
-    """The fit without what these data cannot tell: such parameters keep the vehicle file's value and say nothing.
+    """The fit with parameters that these data cannot identify reset to the vehicle file's values.
 
     Args:
         fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
@@ -103,22 +103,22 @@ def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
                         status=Status.PRIOR_DOMINATED)  # fmt: skip
         rows.append(p)
     why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
-    told = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
+    reset = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
     kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
-    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*told, *kept))
+    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*reset, *kept))
 
 
 def possible_inertia(fit: Fit) -> Fit:
     """The fit with moments of inertia that a rigid body can have; see `possible_moments`."""
-    parameters, said = possible_moments(tuple(fit.parameters))
-    if said is None:
+    parameters, remark = possible_moments(tuple(fit.parameters))
+    if remark is None:
         return fit
     theta, layout = fit.theta.copy(), Layout(fit.vehicle)
     for p in parameters:
         theta[layout.entry(p.name).index] = p.value
     return replace(
         fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
-        warnings=(*fit.warnings, said),
+        warnings=(*fit.warnings, remark),
     )  # fmt: skip
 
 
@@ -126,7 +126,7 @@ def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter
     """Parameters with guessed moments of inertia moved to where a rigid body can have them beside those identified.
 
     Each principal moment lies between the difference and the sum of the other two; what breaks that by more than a
-    vehicle file may is moved there, and a sentence says so.  Where identified ones alone are impossible, the largest is
+    vehicle file may is moved there, with a remark.  Where identified ones alone are impossible, the largest is
     not to be used, and is moved as a guess is.
     """
     values = {p.name: p for p in parameters if p.name in INERTIAS}
@@ -141,11 +141,11 @@ def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter
     value = min(max(old.value, abs(one - two)), one + two)
     status = old.status if old.status in UNKNOWN else Status.UNRELIABLE
     moved = replace(old, value=value, status=status, relative_to=None)
-    said = (
+    remark = (
         f"{name}: moved from {old.value:.4g} to {value:.4g} {old.unit}, because no rigid body has the former beside "
         "the other two moments of inertia"
     )
-    return tuple(moved if p.name == name else p for p in parameters), said
+    return tuple(moved if p.name == name else p for p in parameters), remark
 
 
 def on_bounds(parameters: Iterable[Parameter]) -> list[str]:

@@ -13,7 +13,7 @@ STRETCH = 60.0
 
 
 def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
-    """Stretches spread evenly over a flight that is longer than needed, and a sentence that says so; else all of it."""
+    """Stretches spread evenly over a flight that is longer than needed, and a sentence for people; else all of it."""
     total = sum(len(w) * w.dt for w in windows)
     if total <= MOST_SECONDS:
         return list(windows), ()

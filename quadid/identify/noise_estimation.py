@@ -20,7 +20,7 @@ from quadid.window import Window
 
 SPECTRUM_SECONDS = 0.5
 LINE_SECONDS = 1.0
-"""Segments of this length tell a line of vibration, as in calm flight, from a hump; used where the model follows."""
+"""Segments of this length separate a line of vibration, as in calm flight, from a hump; where the model follows."""
 LINE_SEGMENTS = 100
 """Fewest of them: from fewer, so fine a spectrum would be known too poorly to weigh by."""
 FLEXIBLE_DRAG = 0.1
@@ -38,7 +38,7 @@ FROM_START = 8
 LONG_SEGMENTS = 300
 """Most longer segments it is fitted to afterwards: its parameters need no more."""
 MOST_SEGMENTS = 4000
-"""Most longer segments that the noise is measured on; they tell it to a thousandth."""
+"""Most longer segments that the noise is measured on; they give it to a thousandth."""
 _SETTLING = ("imu_lag.period", "rotor_drag.k_x")
 
 
@@ -141,7 +141,7 @@ def flexible_fit(
 
 
 def _settled(shooting: Shooting, theta: FloatArray, names: Sequence[str]) -> Polished:
-    """Initial states of all segments at `theta`: all of them tell the level of the noise.
+    """Initial states of all segments at `theta`: all of them show the level of the noise.
 
     Two parameters move beside the initial states, so that segments are started and filters warmed up as for all.
     """

@@ -21,20 +21,20 @@ from quadid.types import FloatArray
 from quadid.window import Window
 
 MEMORY_SECONDS = 4.0
-"""Segments of this length tell the memory …"""
+"""Segments of this length show the memory …"""
 MEMORY_SEGMENTS = 40
-"""… and about so many of them tell it well enough."""
+"""… and about so many of them give it precisely enough."""
 ITERATIONS = 3
 """Linearisations from the optimum on segments of another length."""
 
 MEMORIES = np.geomspace(0.15, 10.0, 13)
 """Correlation times that are compared [s]."""
 FEWEST_SEGMENTS = 10
-"""Complete segments of a channel below which its likelihood is not asked."""
+"""Complete segments of a channel below which its likelihood is not evaluated."""
 ROUNDS = 6
 """Of the search for two variances."""
 FINEST_ROWS = 100
-"""Rows of a segment beyond which neighbours are averaged: they tell nothing of a memory."""
+"""Rows of a segment beyond which neighbours are averaged: they do not show a memory."""
 
 
 def with_memory(windows: Sequence[Window], problem: Shooting, theta: FloatArray, names: Sequence[str]) -> NoiseModel:
@@ -79,20 +79,20 @@ def attitude_memory(residuals: FloatArray, weights: FloatArray, dt: float) -> fl
     """
     share = max(residuals.shape[1] // FINEST_ROWS, 1)
     rows = residuals.shape[1] // share
-    told = np.zeros(len(MEMORIES))
+    log_likelihood = np.zeros(len(MEMORIES))
     for c in ATTITUDE:
         complete = np.all(weights[:, :, c] > 0.0, axis=1)
         if np.count_nonzero(complete) < FEWEST_SEGMENTS:
             continue
         blocks = residuals[complete, : rows * share, c].reshape(-1, rows, share).mean(axis=2)
         if np.any(blocks):
-            told += [_log_likelihood(blocks, share * dt / memory) for memory in MEMORIES]
-    best = int(np.argmax(told))
-    if np.ptp(told) == 0.0:
+            log_likelihood += [_log_likelihood(blocks, share * dt / memory) for memory in MEMORIES]
+    best = int(np.argmax(log_likelihood))
+    if np.ptp(log_likelihood) == 0.0:
         return None
     if best in (0, len(MEMORIES) - 1):
         return float(MEMORIES[best])
-    left, middle, right = told[best - 1 : best + 2]
+    left, middle, right = log_likelihood[best - 1 : best + 2]
     peak = 0.5 * (left - right) / (left - 2.0 * middle + right)
     return float(MEMORIES[best] * (MEMORIES[1] / MEMORIES[0]) ** peak)
 

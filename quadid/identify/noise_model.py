@@ -53,7 +53,7 @@ class NoiseModel:
 
     @classmethod
     def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
-        """Typical MEMS noise, or what the vehicle file knows."""
+        """Typical MEMS noise, or what the vehicle file gives."""
         white = _DEFAULT[:channels].copy()
         for i, name in enumerate(("gyro", "attitude", "accel", "velocity", "position")):
             value = getattr(known, name) if known is not None else None
@@ -125,7 +125,7 @@ def _whitening(noise: NoiseModel, length: int, dt: float) -> Whitening:
 
 @lru_cache(maxsize=16)
 def _whitener(noise: NoiseModel, length: int, dt: float) -> FloatArray:
-    """`NoiseModel.whitener`, read-only; the same one is asked for again and again."""
+    """`NoiseModel.whitener`, read-only; computed once for the same arguments."""
     out = np.zeros((len(noise.white), length, length))
     for c, (white, slow) in enumerate(zip(noise.white, noise.slow, strict=True)):
         if not noise.coloured[c]:

@@ -25,7 +25,7 @@ DRAWS = 4
 SMOOTH = 3
 LEAST_SEGMENTS = 20
 LEAST_LEFT = 0.3
-"""Share of its power that the elimination must leave a mode of noise for it to tell anything."""
+"""Share of its power that the elimination must leave a mode of noise for it to count."""
 
 
 def mode_power(
@@ -102,9 +102,9 @@ def shaped_noise(shooting: Shooting, theta: FloatArray, free: Free, states: Init
 
 
 def band_power(found: FloatArray, null: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
-    """Power over `width` modes around each relative to that of noise, and how many of them tell it.
+    """Power over `width` modes around each relative to that of noise, and how many of them count.
 
-    Modes that the initial state takes away tell nothing.
+    Modes that the initial state takes away do not count.
 
     Args:
         found: power of each mode, shape (length,).

@@ -70,8 +70,8 @@ class OpenLoop:
         """Yields rows of starts and what runs from them miss by, in turns.
 
         Args:
-            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the gyro of the first
-                tells.
+            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the first derives
+                from the gyro.
             at: samples after the start, 1 to `longest`.
 
         Yields:

@@ -1,7 +1,7 @@
 """Particle swarm: the paper's Algorithm 1, and the constriction swarm that is the default.
 
 An optimiser is a state machine with two verbs: `Swarm.ask` hands out positions to be evaluated, `Swarm.tell` takes
-their costs.  It knows nothing of the problem, draws all randomness from its seed, prints nothing and starts no threads.
+their costs.  It sees no more of the problem, draws all randomness from its seed, prints nothing and starts no threads.
 
 Sources:
     Kennedy & Eberhart 1995, doi:10.1109/ICNN.1995.488968 (the swarm);

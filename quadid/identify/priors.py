@@ -57,5 +57,5 @@ def normal_equations(lin: Linearised, free: Free, prior: Prior, theta: FloatArra
 
 
 def posterior_covariance(information: FloatArray, prior: Prior) -> FloatArray:
-    """Covariance (P, P) of the scaled parameters, given what the data say of them, (P, P), and the prior."""
+    """Covariance (P, P) of the scaled parameters, given their information from data, (P, P), and the prior."""
     return np.asarray(np.linalg.inv(information + np.diag(prior.precision)))

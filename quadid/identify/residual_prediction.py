@@ -49,7 +49,7 @@ class Prediction:
 
     @property
     def sentence(self) -> str:
-        """What a user of the file must know."""
+        """What a user of the file must heed."""
         return (
             f"the prediction file adds {len(self.terms)} residual terms to unchanged physics (rate error "
             f"{AHEAD:g} s ahead {self.physical['rate']:.3g} -> {self.predicted['rate']:.3g} rad/s on {self.on}); "

@@ -19,7 +19,7 @@ from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
 
 NOTHING_NEW = 0.9
-"""Share of the information that the prior brings, above which the data say nothing."""
+"""Share of the information that the prior brings, above which the data add nothing."""
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 
@@ -115,9 +115,9 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
 
 
 def answered(parameters: ParameterSet) -> bool:
-    """True when the data say anything beyond the vehicle file about at least one parameter.
+    """True when the data add to the vehicle file for at least one parameter.
 
-    A sharp prior may decide a value about which the data say much, too.
+    A sharp prior may decide a value on which the data are informative, too.
     """
     return any(p.status is not Status.PRIOR_DOMINATED or p.prior_share < NOTHING_NEW for p in parameters)
 

@@ -1,6 +1,6 @@
 """What an uncertain mass or arm does to the result.
 
-Motion tells ratios only.  Scaling mass, b, d, all inertias and J_r by one factor leaves every motion as it is; so does
+Motion shows ratios only.  Scaling mass, b, d, all inertias and J_r by one factor leaves every motion as it is; so does
 scaling the arm, d, all inertias and J_r.  The logarithms of both factors are nuisance parameters with a known spread;
 they are marginalised from the Gaussian posterior, so that what is known of one inertia from elsewhere (CAD, a swing
 test) tightens the others and b as well.

@@ -1,4 +1,4 @@
-"""What normal equations say of some parameters once others are fitted along: the Schur complement.
+"""Normal equations of some parameters once others are fitted along: the Schur complement.
 
 Minimised over the others o, the cost ``2 g z + z h z`` is that of the parameters m alone, with ``h_mm - gain h_om``
 for h and ``g_m - gain g_o`` for g, where ``gain = h_mo h_oo^-1``.  Inverse covariances are marginalised alike.

@@ -94,7 +94,7 @@ def mse_score(
         windows: data on one grid.
         vehicle: geometry and mass.
         theta: full parameter vector, shape (size,).
-        noise: sensor noise, from the fit; typical MEMS noise by default.  Channels it does not know are simulated and
+        noise: sensor noise, from the fit; typical MEMS noise by default.  Channels it lacks are simulated and
             compared, but do not count in `mse`.
 
     Raises:
@@ -134,10 +134,10 @@ class Tally:
     def ratio(self) -> FloatArray:
         """Squares over what pure noise leaves, shape (channels,); NaN where nothing is known.
 
-        A channel whose samples are so few that the initial states take them all says nothing about the model.
+        A channel whose samples are so few that the initial states take them all is no evidence on the model.
         """
-        told = self.expected > 1e-9 * np.maximum(self.squares, 1e-300)
-        return np.asarray(np.divide(self.squares, self.expected, out=np.full(len(told), np.nan), where=told))
+        counts = self.expected > 1e-9 * np.maximum(self.squares, 1e-300)
+        return np.asarray(np.divide(self.squares, self.expected, out=np.full(len(counts), np.nan), where=counts))
 
     @property
     def mse(self) -> float:

@@ -1,4 +1,4 @@
-"""The identification as a plain problem in a box, for optimisers that know nothing of vehicles.
+"""The identification as a plain problem in a box, for general optimisers.
 
 Coordinates are logarithms of the free parameters.  The residual is that of short segments with their initial states
 projected out at the start (variable projection), as the swarm sees it; half its sum of squares is the cost.

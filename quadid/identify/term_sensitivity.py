@@ -23,7 +23,7 @@ _PROBES = (
     *(ResidualTerm(acts_on=target, value=0.0) for target in TARGETS),
     *(ResidualTerm(acts_on="force_x", product=(name,), value=0.0) for name in SIGNALS),
 )
-"""Terms whose effect over one step tells the answer to unit forces and moments, and the signals."""
+"""Terms whose effect over one step gives the answer to unit forces and moments, and the signals."""
 _STEP = 1e-4
 """Of a state [rad, rad/s, m/s, m], and of a probe as a share of its typical size, for differences."""
 _AT_ONCE = 4096

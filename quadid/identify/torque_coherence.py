@@ -1,9 +1,9 @@
 """How much of quick turning the rotors make: what that leaves undecided of roll and pitch inertia.
 
-Inertia is torque over angular acceleration.  Where the two are not coherent, one of them holds what the other does not
-know: an error of rotor speeds makes the inertia too large, one of the motion too small, by up to the coherence (the
+Inertia is torque over angular acceleration.  Where the two are not coherent, one of them holds what the other
+lacks: an error of rotor speeds makes the inertia too large, one of the motion too small, by up to the coherence (the
 estimators H1 and H2 of a frequency response; J. S. Bendat and A. G. Piersol, Random Data, 4th ed. (2010), ch. 6).
-Beside moments that no model has it cannot be told which, so an inertia is not known better than that.
+Beside moments that no model has the two cannot be distinguished, so an inertia is not known better than that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SECONDS = 1.0
 BAND = (2.5, 12.5)
 """Frequencies [Hz] that count: slower ones are ruled by unmodelled moments, faster ones by noise and vibration."""
 LEAST = 0.01
-"""Smallest share told apart from nothing; also where no stretch is long enough for a spectrum."""
+"""Smallest share distinguished from zero; also where no stretch is long enough for a spectrum."""
 
 
 def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""When the vehicle flies, as far as its motors or its vibration tell."""
+"""When the vehicle flies, from its motors or its vibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CARRIES = 0.9
 _IDLE = 0.15
 """Commands that never exceed this fraction of full are idling motors."""
 _NOTHING = 0.1
-"""A rotor below this share of the median speed of all says nothing."""
+"""A rotor below this share of the median speed of all is ignored."""
 _GROUND = 3.0
 """Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
 _MARGIN = 2.0
@@ -32,7 +32,7 @@ _SHORTEST, _BRIDGE = 1.0, 0.5
 
 
 def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
-    """Returns the spans [s] in which the vehicle flies; empty when nothing tells.
+    """Returns the spans [s] in which the vehicle flies; empty without evidence.
 
     Thrust and weight are those of the vehicle file where rotor speeds and a vehicle are known; else thrust grows with
     the square of the command, and hover is the median of the powered part of the log.  A flying vehicle also feels its
@@ -104,7 +104,7 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
 
 
 def _beside_others(speeds: FloatArray) -> FloatArray:
-    """Speeds with the others' median for a rotor that says nothing: it is dead, or its signal is; no ground carries."""
+    """Speeds with the others' median for a rotor that is ignored: it is dead, or its signal is; no ground carries."""
     usual = np.median(speeds, axis=1, keepdims=True)
     return np.asarray(np.where(speeds < _NOTHING * usual, usual, speeds))
 

@@ -1,4 +1,4 @@
-"""Units and frames, told by physics: gravity, gyro against attitude, velocity against attitude and accelerometer."""
+"""Units and frames, tested by physics: gravity, gyro against attitude, velocity against attitude and accelerometer."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     """Rates as of `_rates` over steps long enough for the motion to stand above the attitude's noise; none if still.
 
     White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
-    steps tell them apart: motion = (4 var(2 step) - var(step)) / 3.
+    steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
     stride = max(1, round(_STEP / sample_period(t)))
     measured, derived = _rates(gyro, t[::stride], q[::stride])

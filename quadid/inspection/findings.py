@@ -1,4 +1,4 @@
-"""What an inspection says: facts of channels, checks, what is missing and how to get it."""
+"""Result of an inspection: facts of channels, checks, what is missing and how to get it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ChannelFacts:
         longest_gap: [s], 0 when there is none.
         bridged: lost samples too few for a gap.
         repeated: fraction of rows equal to the row before.
-        stuck: longest time in flight without any change [s]; 0 where nothing tells when it flies.
+        stuck: longest time in flight without any change [s]; 0 where it is unknown when it flies.
         saturated: samples at a limit that the channel hits several times.
         dropped: samples the reader dropped, by reason.
     """
@@ -67,7 +67,7 @@ class Check:
     """One question put to the data.
 
     Attributes:
-        name: what was asked: gravity, gyro_attitude, velocity_attitude, position_velocity, rotor_speed, hover,
+        name: of the check: gravity, gyro_attitude, velocity_attitude, position_velocity, rotor_speed, hover,
             motor_order, rotor_timing, geometry, mass, clock, timing.
         verdict: the answer.
         message: one sentence with numbers and units.
@@ -114,7 +114,7 @@ class Inspection:
         missing: signals to add to the log.
         parameters: what the channels allow.
         excitation: rows computed elsewhere, as given.
-        warnings: what the reader had to say.
+        warnings: of the reader.
         zero: time of the log's first IMU sample [s]: ``LOG@from:to``, and tables for people, count from there.
     """
 
@@ -134,7 +134,7 @@ class Inspection:
 
     @property
     def usable(self) -> bool:
-        """Whether at least one parameter can be identified and no check says that the data are wrong."""
+        """Whether at least one parameter can be identified and no check finds the data wrong."""
         wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
         return any(outlook.possible for outlook in self.parameters) and not wrong
 

@@ -1,4 +1,4 @@
-"""Mass and rotor positions against what the flight shows, as far as physics lets them be told.
+"""Mass and rotor positions against what the flight shows, as far as physics reveals them.
 
 Mass and thrust coefficient only ever show as their ratio, arm and inertia likewise.  So a wrong mass is seen when the
 thrust coefficient is known (thrust stand, or a sigma of its own), a wrong arm when the inertias are known too; that the
@@ -21,7 +21,7 @@ from quadid.window import Recording
 _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
 _MASS_OFF, _ARM_OFF = 0.08, 0.2
-"""Relative differences that are told: of mass; of arm, whose effect slow motors weaken."""
+"""Relative differences that are reported: of mass; of arm, whose effect slow motors weaken."""
 _TURNED = math.radians(20.0)
 _CLEAR = 0.1
 """Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
@@ -53,7 +53,7 @@ def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hove
 
 
 def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
-    """Thrust coefficient and its relative standard deviation, where something beside a guess tells it."""
+    """Thrust coefficient and its relative standard deviation, where it rests on more than a guess."""
     if vehicle.stand_thrust is not None:
         return vehicle.stand_thrust
     return _known(vehicle, "b")
@@ -67,7 +67,7 @@ def _known(vehicle: Vehicle, name: str) -> tuple[float, float] | None:
 
 
 def _load(recording: Recording, spans: Spans) -> float:
-    """Mean thrust over weight in flight, by the accelerometer; 1 where that says nothing sensible."""
+    """Mean thrust over weight in flight, by the accelerometer; 1 where that is implausible."""
     accel = recording.channels.get("accel")
     if accel is None:
         return 1.0

@@ -25,7 +25,7 @@ _RATE = 50.0
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
 _LEAST_RATE = 30.0
-"""Slower rotor readings [Hz] miss the motion that orders are told apart by."""
+"""Slower rotor readings [Hz] miss the motion that distinguishes orders."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
 _CLEAR, _MARGIN = 0.25, 0.15
@@ -35,7 +35,7 @@ _MOST_ROTORS = 6
 
 
 def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
-    """Thrust by the vehicle file, its effects included, against weight in flight; tells rpm and rev/s from rad/s."""
+    """Thrust by the vehicle file, with its effects, against weight in flight; separates rpm and rev/s from rad/s."""
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:

@@ -50,7 +50,7 @@ def _compared(position: Channel, velocity: Channel) -> Check:
             "use NED for both; ROS' ENU swaps x and y", {"r2": horizontal.r2},
         )  # fmt: skip
     numbers: dict[str, float] = {}
-    told: list[str] = []
+    scales: list[str] = []
     off: list[str] = []
     for where, axes in _PAIRS:
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
@@ -61,13 +61,13 @@ def _compared(position: Channel, velocity: Channel) -> Check:
         scale = float(np.sqrt(np.sum(v * v) / np.sum(p * p)))
         error = scale * np.sqrt(max(1.0 - correlation**2, 0.0) / (independent * len(axes)))
         numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
-        told.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
+        scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
         if abs(scale - 1.0) > max(SCALE, SIGMAS * error):
             off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
-    if not told:
+    if not scales:
         message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
         return Check("position_velocity", CheckResult.UNKNOWN, message)
-    measured = f"velocity against change of position: {', '.join(told)}"
+    measured = f"velocity against change of position: {', '.join(scales)}"
     if not off:
         return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
     return Check(

@@ -13,11 +13,11 @@ from quadid.types import BoolArray, FloatArray
 from quadid.window import CHANNELS, Channel, Recording
 
 _GRID = 0.02
-"""Step of the grid [s] for which gaps are told, that of the fit."""
+"""Step of the grid [s] for which gaps are reported, that of the fit."""
 _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
 FILLED = 1.5
-"""Rows for each measured one above which it is said."""
+"""Rows for each measured one above which it is reported."""
 _UNSTEADY = 0.25
 """Jitter above which the log's timing is worth a warning."""
 

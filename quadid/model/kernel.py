@@ -146,7 +146,7 @@ def flight_factors(t: float, span0: float, span1: float, dt: float, s: FloatArra
 
 @nb.njit(**jit)
 def copy(source: FloatArray, target: FloatArray) -> None:
-    """Copies an array of two axes; loops, because an assignment of arrays compiles what tells shapes that differ."""
+    """Copies an array of two axes; loops, because an assignment of arrays compiles a check of their shapes."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]

@@ -67,11 +67,11 @@ that is called, and would run an old version of what that function calls."""
 def variant(which: str) -> Callable[[Any], Any]:
     """Names a function that is compiled several times, each time with other constants of the function around it.
 
-    The linker knows compiled functions by name, types of arguments, and a number counted anew in each process.  Kernels
+    The linker finds compiled functions by name, types of arguments, and a number counted anew in each process.  Kernels
     on disk come from several processes: without names of their own, one kernel may be given the other's variant.
 
     Args:
-        which: tells the variants of one function apart.
+        which: distinguishes the variants of one function.
     """
 
     def name(function: Any) -> Any:
@@ -83,7 +83,7 @@ def variant(which: str) -> Callable[[Any], Any]:
 
 
 def _lane_kernel(context: Any) -> Any:
-    """Called first in a kernel whose loops run over lanes; tells the compiler three things about that kernel.
+    """Called first in a kernel whose loops run over lanes; gives the compiler three facts about that kernel.
 
     Registers may be 512 bits wide where the processor has them: the compiler prefers 256, out of care for code that
     mixes wide and scalar work, but lane loops are nearly all arithmetic and gain 1.6 times.  No two array arguments
@@ -95,7 +95,7 @@ def _lane_kernel(context: Any) -> Any:
         function = builder.function
         function.attributes.add("noinline")
         function.attributes.alignstack = 64
-        set.add(function.attributes, '"prefer-vector-width"="512"')  # the builder knows no such attribute; LLVM does
+        set.add(function.attributes, '"prefer-vector-width"="512"')  # the builder lacks this attribute; LLVM has it
         for argument in function.args[2:]:  # after the places for result and error
             if argument.type.is_pointer:
                 argument.add_attribute("noalias")
@@ -158,7 +158,7 @@ def _tile_product(typing_context: Any, a: Any, a_first: Any, a_k: Any, a_i: Any,
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         builder.function.attributes.add("noinline")
-        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # the builder knows no such attribute
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')  # the builder lacks this attribute
         arrays = _data(context, builder, signature, values)
         left, left_first, left_k, left_i, right, right_first, right_k, terms, out, out_first, out_i = arrays
         zero = ir.Constant(_VECTOR, [0.0] * CACHE_LINE)

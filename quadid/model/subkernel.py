@@ -78,7 +78,7 @@ class SubkernelLowering(NativeLowering):
         state.library = Subkernel(state.targetctx.codegen(), state.func_id.func_qualname)
         super().run_pass(state)
         lowered = state["cr"]
-        # numba tells compiled functions apart by what Python would call, which has to be a builtin; this one raises.
+        # numba distinguishes compiled functions by what Python would call, which has to be a builtin; this one raises.
         entry = f"{{{lowered.fndesc.qualname} is called by kernels only}}".format
         state["cr"] = lowered._replace(cfunc=entry)
         state.targetctx.insert_user_function(entry, lowered.fndesc, [state.library])

@@ -71,10 +71,10 @@ class Ledger:
         affordable = u[: self.remaining]
         costs = np.full(len(u), np.inf)
         if len(affordable):
-            told = np.asarray(self._cost(self.to_box(affordable)), dtype=np.float64)
-            if told.shape != (len(affordable),):
-                raise ParameterError(f"cost_batch returned shape {told.shape}", f"({len(affordable)},)")
-            costs[: len(affordable)] = np.where(np.isfinite(told), told, np.inf)
+            found = np.asarray(self._cost(self.to_box(affordable)), dtype=np.float64)
+            if found.shape != (len(affordable),):
+                raise ParameterError(f"cost_batch returned shape {found.shape}", f"({len(affordable)},)")
+            costs[: len(affordable)] = np.where(np.isfinite(found), found, np.inf)
         self.evaluations += len(affordable)
         leader = int(np.argmin(costs))
         if costs[leader] < self.best_cost:

@@ -1,7 +1,7 @@
 """L-SHADE: differential evolution that learns its own step sizes and shrinks its population.
 
 Success-history adaptation of F and CR, mutation current-to-pbest/1 with an archive of beaten parents, linear population
-size reduction.  Ask/tell, one seed, no printing, no threads; it knows nothing of the problem.
+size reduction.  Ask/tell, one seed, no printing, no threads; it is independent of the problem.
 
 Source: Tanabe & Fukunaga, "Improving the search performance of SHADE using linear population size reduction", CEC 2014,
 doi:10.1109/CEC.2014.6900380.  Equation and algorithm numbers below are that paper's.
@@ -184,15 +184,15 @@ class LShade:
 
     def _select(self, cost: FloatArray) -> None:
         # Eq. (6): the trial replaces a parent it equals or beats; only a strict success enters archive and history.
-        told = len(cost)
-        parent = self._cost[:told].copy()
+        k = len(cost)
+        parent = self._cost[:k].copy()
         success, accept = cost < parent, cost <= parent
-        self._archive = np.concatenate([self._archive, self._x[:told][success]])
+        self._archive = np.concatenate([self._archive, self._x[:k][success]])
         with np.errstate(over="ignore"):
             gain = parent[success] - cost[success]
-        self._learn(gain, self._cr[:told][success], self._f[:told][success])
-        self._x[:told][accept] = self._trials[accept]
-        self._cost[:told][accept] = cost[accept]
+        self._learn(gain, self._cr[:k][success], self._f[:k][success])
+        self._x[:k][accept] = self._trials[accept]
+        self._cost[:k][accept] = cost[accept]
 
     def _learn(self, gain: FloatArray, cr: FloatArray, f: FloatArray) -> None:
         # Algorithm 1 and Eqs. (7)-(9): weighted Lehmer means of the successful CR and F replace the oldest entry.

@@ -123,7 +123,7 @@ def _quasi_newton(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """L-BFGS-B (Byrd et al. 1995, doi:10.1137/0916069) with forward differences."""
     import scipy.optimize
 
-    solve: Any = scipy.optimize.minimize  # its stubs know no cost that returns its gradient beside bounds
+    solve: Any = scipy.optimize.minimize  # its stubs lack a cost that returns its gradient beside bounds
     options = {"maxiter": ledger.budget, "maxfun": ledger.budget, "ftol": 1e-12, "gtol": 1e-9}
     box = [(0.0, 1.0)] * len(start)
     found = solve(ledger.cost_and_gradient, start, jac=True, method="L-BFGS-B", bounds=box, options=options)
@@ -159,7 +159,7 @@ def _differential_evolution(ledger: Ledger, start: FloatArray, seed: int) -> Sto
     def cost(u: FloatArray) -> FloatArray:  # (n, k) -> (k,); scipy's own tests need finite numbers
         return np.minimum(ledger.cost(np.clip(u.T, 0.0, 1.0)), WORST)
 
-    evolve: Any = scipy.optimize.differential_evolution  # its stubs know no vectorised cost
+    evolve: Any = scipy.optimize.differential_evolution  # its stubs lack a vectorised cost
     found = evolve(
         cost, [(0.0, 1.0)] * len(start), x0=start, seed=np.random.default_rng(seed), vectorized=True,
         updating="deferred", polish=False, maxiter=ledger.budget, tol=1e-8,
