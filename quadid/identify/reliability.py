@@ -1,6 +1,6 @@
 """Whether a number deserves its name: estimates of one parameter that agree wherever the model is right.
 
-Blocks of time, short segments beside long ones, every second row (`coarse_grid`), and models with each cause added
+Blocks of time, short segments beside long ones, every second row (`richardson`), and models with each cause added
 that the residual asks for, all estimate the same parameters.  What they differ by beyond chance belongs to the
 model, not to the noise: intervals are widened by it, between blocks as random effects (DerSimonian and Laird,
 Controlled Clinical Trials 7 (1986) 177), and beyond `SPREAD_LIMIT` the number is not to be used.
