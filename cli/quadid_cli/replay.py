@@ -204,7 +204,7 @@ def summary(
         **({"candidates": [set_to_dict(s, covariance=False) for s in estimates]} if candidates else {}),
         "refused": refused,
         "diagnoses": [diagnosis_to_dict(o) for o in outputs if o.topic == "diagnosis"],
-        "events": [{**vars(o)} for o in outputs if o.topic == "event"],
+        "events": [dict(vars(o)) for o in outputs if o.topic == "event"],
         "status": status_to_dict(service.session.status()),
         "warnings": list(recording.warnings),
     }

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from quadid_report.parts import rows_of, section
+from quadid_report.parts import section
 from quadid_report.words import effects_words
 
 from quadid.types import Json
 from quadid_paper.figures import FIGURES
-from quadid_paper.tables import all_tables, headings, markdown
+from quadid_paper.tables import all_tables, markdown
 
 TITLE = "The paper, reproduced"
 SHOWN = ("Table", "What the nominal model lacks")
@@ -108,7 +108,7 @@ def paper_sections(result: Json, figures: Sequence[Json]) -> dict[str, Any]:
     """The page for `render`: tables, then interactive figures."""
     said = notes(result)
     sections = [
-        section(f"table-{i}", t.title, " ".join(said[t.title]).replace("*", ""), tables=[rows_of(headings(t), t.rows)])
+        section(f"table-{i}", t.title, " ".join(said[t.title]).replace("*", ""), tables=[t.part()])
         for i, t in enumerate(all_tables(result))
     ]
     intro = "The most excited 20 s of each set; the paper's figures in the same order."

@@ -137,14 +137,8 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Te
     return TextTable(title, tuple(Column(h, right=i > 0) for i, h in enumerate(head)), tuple(map(tuple, rows)))
 
 
-def headings(table: TextTable) -> list[str]:
-    """Its column headings."""
-    return [column.heading for column in table.columns]
-
-
 def markdown(table: TextTable) -> str:
     """A table as Markdown."""
-    head = headings(table)
-    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines = [f"| {' | '.join(c.heading for c in table.columns)} |", f"|{'---|' * len(table.columns)}"]
     lines += [f"| {' | '.join(map(str, row))} |" for row in table.rows]
     return "\n".join(lines)

@@ -112,6 +112,11 @@ class Effect:
         return any("':" in s or s.endswith("_dot") for s in self.shows)
 
     @property
+    def needs_fast_rotors(self) -> bool:
+        """Whether a rotor signal too slow for inertias hides it: a lag or delay is over before the next sample."""
+        return self.family == "late"
+
+    @property
     def refinements(self) -> tuple[str, ...]:
         """Names in the parameter vector of its optional numbers."""
         return tuple(f"{self.name}.{p.entry or p.name}" for p in self.parameters if p.optional)

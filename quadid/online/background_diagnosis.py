@@ -69,7 +69,7 @@ class DiagnosisRequest(Job):
 
 
 def _online(f: Finding, slow: bool) -> OnlineFinding:
-    sure = f.confident and not (slow and EFFECTS[f.effect].family == "late")
+    sure = f.confident and not (slow and EFFECTS[f.effect].needs_fast_rotors)
     return OnlineFinding(
         f.effect, {p.name: p.value for p in f.parameters},
         {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},

@@ -209,17 +209,16 @@ def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:
 
 
 def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis:
-    """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why.
-
-    A rotor signal too slow for inertias is too slow for lags and delays: they are over before its next sample.
-    """
+    """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why."""
     from quadid.effects import EFFECTS
     from quadid.parameters import INERTIAS, Status, unreliable
 
     trusted = [p.name for p in found.parameters if p.name in unreachable and p.status is not Status.PRIOR_DOMINATED]
     told = [f"{name} is not to be used: {unreachable[name]}" for name in trusted]
     parameters = unreliable(found.parameters, trusted)
-    late = [f.effect for f in found.findings if EFFECTS[f.effect].family == "late" and set(INERTIAS) & set(unreachable)]
+    late = [
+        f.effect for f in found.findings if EFFECTS[f.effect].needs_fast_rotors and set(INERTIAS) & set(unreachable)
+    ]
     told += [f"{name} is not named with confidence: {unreachable[INERTIAS[0]]}" for name in dict.fromkeys(late)]
     findings = tuple(replace(f, confident=f.confident and f.effect not in late) for f in found.findings)
     return replace(found, findings=findings, parameters=parameters, warnings=(*found.warnings, *told))
