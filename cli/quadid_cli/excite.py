@@ -103,7 +103,8 @@ def show(result: Mapping[str, Any], quiet: bool) -> None:
         f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the start, "
         f"{e['abort_tilt_deg']:.0f} degrees of tilt, {e['battery_percent']:g} % of the battery left."
     )
-    console.print(f"{result['worst']}, the least certain after a gentle flight: {result['gain']:.1f} times narrower.")
+    gain = f"{result['gain']:.3g} times narrower"
+    console.print(f"The manoeuvre makes the interval of {result['worst']}, the least certain parameter, {gain}.")
     console.print(f"Manoeuvre: {result['manoeuvre_file']}", soft_wrap=True)
     for path in result["files"]:
         console.print(f"To fly it: {path}", soft_wrap=True)

@@ -74,8 +74,8 @@ class Held:
     def sentence(self) -> str:
         """Why they are."""
         return (
-            f"unmodelled moments turn the vehicle, so {', '.join(self.parameters)} are estimated from fast motion "
-            f"alone, which does not reveal {', '.join(YAW)}"
+            f"something that the model lacks turns the vehicle: {', '.join(self.parameters)} were estimated from fast "
+            f"motion, which does not reveal {', '.join(YAW)}"
         )
 
 

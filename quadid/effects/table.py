@@ -64,7 +64,7 @@ TABLE: tuple[Effect, ...] = (
         (*(P(n, "1/s", 0.0, -0.1, 3.0, 0.25, start=0.2, sign=1) for n in ("k_x", "k_y")), _CENTRAL),
         summary="The turning rotors drag against sideways flight.",
         sentence="the rotors drag against sideways flight by {k_x:.2f} and {k_y:.2f} m/s^2 for each m/s",
-        advice="Usual; leaving it out makes a simulated vehicle glide too far.",
+        advice="Normal on every multirotor: keep it in the model, or the simulated vehicle coasts too far.",
         family="drag", shows=_DRAGS,
     ),
     Effect(
@@ -75,14 +75,14 @@ TABLE: tuple[Effect, ...] = (
         ),
         summary="The frame has air drag.",
         sentence="the frame's air drag grows with the square of speed, {c:.3f} 1/m",
-        advice="Usual at speed; leaving it out makes a simulated vehicle too fast.",
+        advice="Normal at speed: keep it in the model, or the simulated vehicle flies too fast.",
         family="drag", flexible="with_velocity", shows=(*_DRAGS, "a_z: v_z"),
     ),
     Effect(
         "translational_lift", "air", (P("k", "1/m", 0.0, 0.0, 0.3, 0.02, start=0.02),),
         summary="Thrust rises in sideways flight.",
         sentence="thrust rises by {k:.3f} m/s^2 for each (m/s)^2 of sideways speed",
-        advice="Usual at speed: the rotors meet fresh air; leaving it out makes a simulated vehicle sink.",
+        advice="Normal at speed, where the rotors meet fresh air: keep it in the model, or the simulated vehicle sinks.",
         needs=("velocity",), flexible="with_velocity", shows=("a_z: v_x", "a_z: v_y"),
     ),
     Effect(

@@ -47,7 +47,7 @@ class FastMotion:
         prior: on these.
         short: the same in segments as short as those of the first fit, whose motion is quicker still.
         prompt: scaled step of the parameters to where they are with nothing late, shape (P,).
-        undecided: what torque and motion that do not cohere leave open of scaled parameters, shape (P,).
+        undecided: share of scaled parameters that stays open where torque and motion have low coherence, shape (P,).
         simulated: parameter vectors simulated for all of it.
     """
 

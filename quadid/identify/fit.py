@@ -41,8 +41,8 @@ noise and the rest is made by random moments."""
 YAW = ("d", "J_zz", "J_r")
 """What fast motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
 _QUICK = (
-    "unmodelled moments turn the vehicle, so parameters are estimated from fast motion alone, which does not reveal "
-    f"{', '.join(YAW)}; quadid diagnose looks for the cause"
+    "something that the model lacks turns the vehicle: b, J_xx and J_yy were estimated from fast motion; "
+    f"{', '.join(YAW[:-1])} and {YAW[-1]} cannot be; `quadid diagnose` looks for the cause"
 )
 
 

@@ -80,11 +80,11 @@ class Reliability:
         for j in np.flatnonzero((self._counted(unc) > SPREAD_LIMIT) & free.is_log):
             k = int(np.argmax(np.abs(self.steps[:, j]))) if len(self.steps) else -1
             close = k < 0 or abs(self.steps[k, j]) < self.spread[j]
-            how = f"different {'in another part of the flight' if close else self.names[k]}"
+            how = f"changes by more than {SPREAD_LIMIT:.0%} {'between parts of the flight' if close else self.names[k]}"
             if self.spread[j] <= SPREAD_LIMIT:
-                how = "uncertain, and the model misses something"
+                how = f"is uncertain by more than {SPREAD_LIMIT:.0%}, and the model misses something"
             why.setdefault(how, []).append(free.names[j])
-        return tuple(f"{', '.join(n)}: more than {SPREAD_LIMIT:.0%} {how}" for how, n in why.items())
+        return tuple(f"{', '.join(n)}: {how}" for how, n in why.items())
 
 
 def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, short: Polished) -> Reliability:
@@ -106,13 +106,13 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
     left = found.lin.reduced_chi_square
     # Beside random moments the model misses something, however well these account for it.
     misfit = problem.noise.moments is not None or left > MISFIT
-    steps, names = [_beyond_chance(found, free, own, short, prior)], ["in short segments"]
+    steps, names = [_beyond_chance(found, free, own, short, prior)], ["when shorter pieces of the flight are fitted"]
     if (rows := on_coarse_grid(problem, found, free, prior)) is not None:
         steps.append(SHARE * _beyond_chance(found, free, own, rows, prior))
-        names.append("on a finer grid")
+        names.append("when the flight is fitted on a finer grid")
     for name, step, remains in _with_causes(problem, found, free, prior):
         steps.append(step)
-        names.append(f"with {name} in the model")
+        names.append(f"when {name} is in the model")
         left = min(left, remains)
     farthest = np.max(np.abs(steps), axis=0)
     return Reliability(

@@ -44,7 +44,10 @@ def diagnose_verdict(result: Json) -> Verdict:
     details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
     deciding = v.get("deciding")
     if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
-        details = (*details, f"Over runs of {deciding['seconds']:g} s, which decided, it {_change(deciding, True)}.")
+        details = (
+            *details,
+            f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, it {_change(deciding, True)}.",
+        )
     level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
     steps = _next_steps(result)
     if level == "good" and (held_out or left is None or left > NOISE_LEVEL):

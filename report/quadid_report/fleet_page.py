@@ -75,7 +75,8 @@ def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
     ]
     steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
     if changed:
-        steps.append(f"How sure that is: `quadid health {shlex.quote(changed[0]['log'])}` against its first flights.")
+        today = shlex.quote(changed[0]["log"])
+        steps.append(f"To see how certain this is: `quadid health {today} --baseline …` (the vehicle's first flights).")
     if summary["drifts"]:
         steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
     if summary["outliers"]:

@@ -65,9 +65,8 @@ def health_verdict(result: Json) -> Verdict:
     """Judges a result of the form ``quadid.health/1``."""
     verdict, changes = result["verdict"], result["changes"]
     n = len(result["baseline"])
-    chance = f"Chance that a healthy flight looks as changed: {_chance(result['p_value'])}"
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
-    details = [f"{chance} ({against})."]
+    details = [f"A healthy flight would look this different {_how_often(result['p_value'])} ({against})."]
     suspects = ", ".join(change_words(c) for c in changes)
     if more := result["baseline_lacking"]:
         flights = "baseline flight does" if n == 1 else "baseline flights do"
@@ -100,9 +99,11 @@ def _first(result: Json) -> tuple[str, ...]:
     return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
 
 
-def _chance(p_value: float) -> str:
-    """A chance; at `LEAST_CHANCE` the bound that 95 % of such draws keep to (rule of three)."""
-    return f"below {3.0 * LEAST_CHANCE:.1g}" if p_value <= LEAST_CHANCE else f"{p_value:.2g}"
+def _how_often(p_value: float) -> str:
+    """``about once in 4,000 flights``; at `LEAST_CHANCE` the bound that 95 % of such draws keep to (rule of three)."""
+    if p_value <= LEAST_CHANCE:
+        return f"less than once in {1.0 / (3.0 * LEAST_CHANCE):,.0f} flights"
+    return f"about once in {float(f'{1.0 / p_value:.2g}'):,.0f} flights" if p_value < 0.5 else "in most flights"
 
 
 def _step(change: Json) -> str:

@@ -72,7 +72,7 @@ def identify_verdict(result: Json) -> Verdict:
     unseen = [s for s in sets if s["role"] == "validate"]
     judged = unseen or sets
     ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
-    level, match = _match(ratio, "a flight it has not seen" if unseen else "the fitted flight")
+    level, match = _match(ratio, "the validation flight" if unseen else "the fitted flight")
     lacking = _lacking(sets)
     if not known and not before:
         level = "poor"
@@ -85,7 +85,7 @@ def identify_verdict(result: Json) -> Verdict:
     details = (*([rest] if before else []), *lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
-        found = "Parameters absorb missing effects: values and intervals may be wrong, however narrow."
+        found = "The fit bends the parameters to make up for missing physics; they can be wrong even where the interval is narrow."
         details = (found, *_details(known, judged)[1:]) if known else details
     steps = _next_steps(result, open_ones, stuck, ratio)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
@@ -136,10 +136,11 @@ def _match(ratio: float, where: str) -> tuple[Level, str]:
     if ratio <= ROUGH:
         return (
             "fair",
-            f"the simulation follows {where}, with errors above the sensor noise ({ratio:.2g} times its variance)",
+            f"the simulation follows {where} to {math.sqrt(ratio):.2g} times the sensor noise",
         )
     if math.isfinite(ratio):
-        return "poor", f"the simulation misses much of {where} (error {ratio:.3g} times the noise variance)"
+        off = f"{math.sqrt(ratio):.2g} times the sensor noise ({ratio:.3g} in variance)"
+        return "poor", f"on {where} the simulation is off by {off}"
     return "poor", f"the simulation diverges on {where}"
 
 
@@ -154,14 +155,12 @@ def _details(known: Sequence[Json], judged: Sequence[Json]) -> tuple[str, ...]:
     if known:
         widest = max(known, key=relative_halfwidth)
         out.append(f"The least certain is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval).")
-    fits = [
-        max(v, -999.0) for s in judged for n, v in s["fit_percent"].items() if n in ("p", "q", "r") and v is not None
-    ]
+    fits: list[str] = []
+    for name, axis in (("p", "roll"), ("q", "pitch"), ("r", "yaw")):
+        values = [max(v, -999.0) for s in judged if (v := s["fit_percent"].get(name)) is not None]
+        fits += [f"{axis} {min(values):.0f} %"] if values else []
     if fits:
-        out.append(
-            f"Over one second of simulation, rates fit the measured ones by {min(fits):.0f} to "
-            f"{max(fits):.0f} % (100 % is perfect, 0 % is no better than the mean)."
-        )
+        out.append(f"Fit over one second: {', '.join(fits)} (100 % is perfect, 0 % is no better than the mean).")
     return tuple(out)
 
 
@@ -194,7 +193,7 @@ def _next_steps(result: Json, open_ones: Sequence[Json], stuck: Sequence[str], r
         out.append(_DIAGNOSE)
     if not out:
         out.append(
-            "Nothing is applied by itself: `quadid export` writes the values for PX4, ArduPilot, Gazebo or RotorPy."
+            "`quadid export` writes the values for PX4, ArduPilot, Gazebo or RotorPy. Nothing is sent to the vehicle."
         )
     return tuple(dict.fromkeys(out))
 

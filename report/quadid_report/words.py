@@ -16,7 +16,7 @@ PARAMETER_NAMES: dict[str, str] = {
 STATUS_WORDS: dict[str, str] = {
     "identified": "identified",
     "ratio_only": "only its ratio to {}",
-    "prior_dominated": "guess kept",
+    "prior_dominated": "not observable",
     "unreliable": "unreliable",
 }
 

@@ -80,7 +80,8 @@ def _ahead(rows: Mapping[str, Row]) -> str:
     """Half-second errors of all sets beside each other."""
     lines = [
         f"Errors {AHEAD:g} s ahead on unseen flights, relative to predicting no change: {', '.join(QUANTITIES)}; "
-        "bold: better than ridge and random features. Without a prediction file, its column has the physical file.", "",
+        "bold: better than ridge and random features. Without a prediction file, its column has the physical file. "
+        "Iris: the other half of the same flight.", "",
         "| data | physical file | prediction file | ridge | random features | position error, scale of its velocity |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip

@@ -12,7 +12,8 @@ class FlightSet:
 
     Attributes:
         vehicle: vehicle file, in the data folder, or a path of its own.
-        train, unseen: logs, in the data folder; spans as ``log@start:stop``.
+        train, unseen: logs, in the data folder; spans as ``log@start:stop``. `unseen` names other flights, never the
+            tail of one that was fitted; without another flight it is empty.  (Iris: two halves of one flight.)
         truth: parameters known from elsewhere, each with the interval [low, high] in which the truth lies, in the units
             of the vehicle file: its mass, and rotor speeds as its command gives them.
         beside_curve: truth of those that mean something else beside a thrust curve.
@@ -74,19 +75,17 @@ SETS: dict[str, FlightSet] = {
         {"b": (2.15e-5, 3.19e-5)},  # of its curve about vertex and tangent
     ),
     "brushed rpm": FlightSet(
-        "brushed/vehicle.yaml", ("brushed/jana00.csv@:6", "brushed/jana02.csv@:5"),
-        ("brushed/jana00.csv@6:", "brushed/jana02.csv@5:"), _BRUSHED, "thrust stand; published inertias",
+        "brushed/vehicle.yaml", ("brushed/jana00.csv",), ("brushed/jana02.csv",), _BRUSHED,
+        "thrust stand; published inertias",
     ),
     "brushed PWM": FlightSet(
-        "brushed/vehicle_pwm.yaml", ("brushed/jana00_pwm.csv@:6", "brushed/jana02_pwm.csv@:5"),
-        ("brushed/jana00_pwm.csv@6:", "brushed/jana02_pwm.csv@5:"), {}, "",
+        "brushed/vehicle_pwm.yaml", ("brushed/jana00_pwm.csv",), ("brushed/jana02_pwm.csv",),
     ),
     "nanobench PWM": FlightSet(
-        "nanobench/vehicle.yaml", ("nanobench/B2_circle_fast_rep1.csv@:10", "nanobench/B9_trefoil_fast_rep10.csv@:8"),
-        ("nanobench/B2_circle_fast_rep1.csv@10:", "nanobench/B9_trefoil_fast_rep10.csv@8:"),
+        "nanobench/vehicle.yaml", ("nanobench/B2_circle_fast_rep1.csv",), ("nanobench/B9_trefoil_fast_rep10.csv",),
     ),
     "arpl": FlightSet(
-        "arpl/vehicle.yaml", ("arpl/log15.csv@:18",), ("arpl/log15.csv@18:",),
+        "arpl/vehicle.yaml", ("arpl/log15.csv",), (),
         {"J_xx": (1.0e-5, 1.8e-5), "J_yy": (1.0e-5, 1.8e-5)}, "authors' notebook and plain regression",
     ),
     "crazyflie rpm": FlightSet(
@@ -100,7 +99,7 @@ SETS: dict[str, FlightSet] = {
         ("nanodrone/random_run3.csv",), _NANO, "its authors; others on the same airframe",
     ),
     "ardupilot log171": FlightSet(
-        f"{_VEHICLES}/log171.yaml", ("ardupilot/log171.bin@76:146",), ("ardupilot/log171.bin@146:216",),
+        f"{_VEHICLES}/log171.yaml", ("ardupilot/log171.bin@76:216",), (),
     ),
     "px4 ascend": FlightSet(f"{_VEHICLES}/ascend.yaml", ("px4/ascend_cubeorange_test.ulg",), ()),
 }  # fmt: skip

@@ -27,7 +27,7 @@ def test_the_tutorial_runs_as_written(
         said.append(run.out)
     red, _, green, poor, good = said[4:9]
     assert "Not to be used yet" in red
-    assert "All 6 parameters identified; the simulation matches a flight it has not seen" in green
+    assert "All 6 parameters identified; the simulation matches the validation flight" in green
     assert "Not to be used" in poor
     assert "at the noise floor" in good
     page = (repository / "docs" / "tutorial.md").read_text(encoding="utf-8")

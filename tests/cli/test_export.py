@@ -187,7 +187,7 @@ def test_every_form_from_the_command_line(inside: Cli, tmp_path: Path, form: str
     assert list(result) == ["schema", "vehicle", "format", "files", "warnings"]
     for file in result["files"]:
         assert "pelican" in Path(file).read_text(encoding="utf-8")
-    assert "not from data" in result["warnings"][0]
+    assert "guesses from the vehicle file" in result["warnings"][0]
     assert ("max_speed" in result["warnings"][-1]) == (form in ("px4", "ardupilot"))
 
 

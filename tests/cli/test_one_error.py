@@ -31,7 +31,7 @@ def test_on_an_unseen_flight(flown: tuple[Log, Log]) -> None:
     assert stated["mse_extended"] == pytest.approx(1.0, abs=0.1)
     assert stated["deciding"]["seconds"] == found.result["findings"][0]["gain"]["seconds"] != 1.0
     assert f"falls from {stated['mse_nominal']:.3g} to" in found.verdict.details[0]
-    assert f"Over runs of {stated['deciding']['seconds']:g} s" in found.verdict.details[1]
+    assert f"In simulations of {stated['deciding']['seconds']:g} s" in found.verdict.details[1]
 
 
 def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: tuple[Log, Log]) -> None:

@@ -67,9 +67,7 @@ def export(
         )  # fmt: skip
     texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, format, origin).items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
-    warnings = (
-        [f"not from data, but as the vehicle file has them, without a sigma: {', '.join(guessed)}"] if guessed else []
-    )
+    warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight was fitted"] if guessed else []
     if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
     result = {
