@@ -82,7 +82,7 @@ TABLE: tuple[Effect, ...] = (
         "translational_lift", "air", (P("k", "1/m", 0.0, 0.0, 0.3, 0.02, start=0.02),),
         summary="Thrust rises in sideways flight.",
         sentence="thrust rises by {k:.3f} m/s^2 for each (m/s)^2 of sideways speed",
-        advice="Normal at speed, where the rotors meet fresh air: keep it in the model, or the simulated vehicle sinks.",
+        advice="Normal at speed, where the rotors meet fresh air: without it the simulated vehicle sinks.",
         needs=("velocity",), flexible="with_velocity", shows=("a_z: v_x", "a_z: v_y"),
     ),
     Effect(

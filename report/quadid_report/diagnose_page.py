@@ -46,7 +46,8 @@ def diagnose_verdict(result: Json) -> Verdict:
     if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
         details = (
             *details,
-            f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, it {_change(deciding, True)}.",
+            f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, "
+            f"it {_change(deciding, True)}.",
         )
     level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
     steps = _next_steps(result)

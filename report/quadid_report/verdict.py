@@ -85,7 +85,10 @@ def identify_verdict(result: Json) -> Verdict:
     details = (*([rest] if before else []), *lacking, *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
-        found = "The fit bends the parameters to make up for missing physics; they can be wrong even where the interval is narrow."
+        found = (
+            "The fit bends the parameters to make up for missing physics; they can be wrong even where the interval is "
+            "narrow."
+        )
         details = (found, *_details(known, judged)[1:]) if known else details
     steps = _next_steps(result, open_ones, stuck, ratio)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
