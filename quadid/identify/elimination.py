@@ -79,12 +79,17 @@ class Reduced(NamedTuple):
     base: FloatArray
     largest: FloatArray
 
+    @staticmethod
+    def shapes(count: int, own: int, parameters: int, length: int, channels: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the fields, in order."""
+        one, p = (count,), parameters
+        ends = ((count, own), (count, own, p), (count, length, channels), one)
+        return ((count, p, p), (count, p), one, one, one, *ends)
+
     @classmethod
     def room(cls, count: int, own: int, parameters: int, length: int, channels: int) -> Reduced:
         """Arrays to be written."""
-        one, p = (count,), parameters
-        shapes = ((count, p, p), (count, p), one, one, one, (count, own), (count, own, p), (count, length, channels))
-        return cls(*(np.empty(shape) for shape in (*shapes, one)))
+        return cls(*(np.empty(shape) for shape in cls.shapes(count, own, parameters, length, channels)))
 
     def part(self, which: slice) -> Reduced:
         """Views of some segments."""

@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from quadid.identify.elimination import VELOCITY, Reduced, StatePrior, Whitening
-from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shapes
 
 # isort: off
 from quadid.model.simd import (
@@ -39,10 +39,26 @@ def reduce_segments(
         whitening: of the channels.
         prior: of the initial states.
         into: written.
+
+    Raises:
+        ValueError: arrays whose shapes do not belong together.
     """
+    w, own = whitening, len(prior.ridge)
+    count, length, channels = weights.shape
+    check_shapes(
+        "reduce_segments",
+        ("out", out, (len(out), count, length, max(channels, out.shape[3]), LANES)),
+        ("lane", lane, (1 + len(steps),)),
+        ("precision", w.precision, (channels,)), ("coloured", w.coloured, (channels,)),
+        ("matrix", w.matrix, (channels, -(-length // TILE_ROWS) * TILE_ROWS, length)),
+        ("reach", w.reach, (channels, -(-length // TILE_ROWS))),
+        ("away", prior.away, (count, 3)),
+        *((name, array, (*shape,)) for name, array, shape in zip(
+            into._fields, into, Reduced.shapes(count, own, len(steps) - own, length, channels), strict=True
+        )),
+    )  # fmt: skip
     inverse = np.zeros(len(out) * LANES)
-    inverse[lane[1:]] = 1.0 / steps
-    w = whitening
+    inverse[lane[1:]] = 1.0 / steps  # raises IndexError for a lane that is none
     # A copy, because read-only arrays are another type, for which all would be compiled again.
     own_lane = np.array(lane)
     _reduce_on_disk(out, inverse, weights, w.precision, w.coloured, w.matrix, w.reach, own_lane, prior, into)

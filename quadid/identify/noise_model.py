@@ -8,7 +8,7 @@ J. Multivariate Analysis 1 (1971) 257).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -60,6 +60,13 @@ class NoiseModel:
             if value is not None and 3 * i < channels:
                 white[3 * i : 3 * i + 3] = value
         return cls(white, np.zeros(channels))
+
+    def first(self, channels: int) -> NoiseModel:
+        """Noise of the first so many channels; itself where it has no more."""
+        if channels == len(self.white):
+            return self
+        shape = None if self.shape is None else self.shape[:channels]
+        return replace(self, white=self.white[:channels], slow=self.slow[:channels], shape=shape)
 
     @property
     def variance(self) -> FloatArray:

@@ -28,7 +28,7 @@ from quadid.model.packing import packed, packing
 from quadid.model.rollout import Rollout
 from quadid.model.segments import Segments
 from quadid.model.shared_rollout import shared_rollout
-from quadid.types import FloatArray, IndexArray
+from quadid.types import FloatArray, IndexArray, check_shapes
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -55,7 +55,7 @@ class Shooting:
     Attributes:
         vehicle: the vehicle; layout: of its parameter vector.
         rollouts: simulation of each window; segments: their cuts.
-        channels: residual channels, those that every window has.
+        channels: residual channels, the first 9, 12 or 15.
         length: rows of a segment; lead: rows before it in which filters settle; dt: grid step [s].
         noise: noise model used for weights.
         robust: weights against outliers, 0 where nothing was measured, (segments of all windows, length, channels);
@@ -80,14 +80,25 @@ class Shooting:
         cls, windows: Sequence[Window], vehicle: Vehicle, seconds: float, noise: NoiseModel | None = None,
         layout: Layout | None = None,
     ) -> Shooting:  # fmt: skip
-        """Cuts `windows` into segments of about `seconds` with room for filters and delays before each."""
+        """Cuts `windows` into segments of about `seconds` with room for filters and delays before each.
+
+        Channels count that every window has and whose noise is known; without `noise`, typical noise.
+        """
         dt = windows[0].dt
         length, lead = max(round(seconds / dt), 4), max(round(LEAD_SECONDS / dt), 1)
         rollouts = tuple(shared_rollout(w, vehicle) for w in windows if len(w) > length + lead)
-        channels = min((r.channels for r in rollouts), default=9)
+        known = 15 if noise is None else len(noise.white)
+        channels = min((r.channels for r in rollouts), default=min(known, 9))
+        channels = min(channels, known)
         segments = tuple(Segments.cut(len(r), length, lead) for r in rollouts)
-        noise = noise or NoiseModel.guess(channels, vehicle.noise)
+        noise = NoiseModel.guess(channels, vehicle.noise) if noise is None else noise.first(channels)
         return cls(vehicle, layout or Layout(vehicle), rollouts, segments, channels, length, lead, dt, noise)
+
+    def __post_init__(self) -> None:
+        """Checks noise and weights against the channels; raises ValueError."""
+        check_shapes("shooting", ("noise", self.noise.white, (self.channels,)))
+        if self.robust is not None:
+            check_shapes("shooting", ("robust", self.robust, (self.count, self.length, self.channels)))
 
     @property
     def count(self) -> int:

@@ -18,7 +18,7 @@ from quadid.model.rollout import _threads as worker_threads
 from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.rotation import down
-from quadid.types import FloatArray
+from quadid.types import FloatArray, check_shapes
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.window import Window
 
@@ -84,9 +84,14 @@ class ClosedLoop:
         lanes = len(theta)
         full = np.concatenate([theta, np.repeat(theta[-1:], LANES - lanes, axis=0)])
         out = aligned((len(self.window), OUTPUTS, LANES))
+        rotors = len(self._geometry)
+        check_shapes(
+            "fly_closed_loop", ("theta", full, (LANES, ix.LOSS + 2 * rotors + len(self._terms))),
+            ("references", self._references, (len(self.window), 4)), ("mixer", self._mixer, (rotors, 4)),
+        )  # fmt: skip
         fly_closed_loop(
             self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._terms, self._flight,
-            full, needs_of(full, len(self._geometry), 9), self._x0, out,
+            full, needs_of(full, rotors, 9), self._x0, out,
         )  # fmt: skip
         return np.ascontiguousarray(np.moveaxis(out[..., :lanes], 2, 0))
 

@@ -26,7 +26,7 @@ from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.model.supply import relative_voltage
 from quadid.model.work_array import ALL_MOMENTS, MAX_TANGENTS, N_STATE
-from quadid.types import FloatArray
+from quadid.types import FloatArray, check_shapes
 from quadid.vehicle import Vehicle
 from quadid.window import Window
 
@@ -93,6 +93,7 @@ class Rollout:
         self.channels = channels_of(window)
         self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)
+        self._size = LANES, ix.LOSS + 2 * rotors + len(self._terms)
         speed = window.rotor_speed.view()
         slope = speed[:0] if window.rotor_slope is None else window.rotor_slope.view()
         speed.flags.writeable = slope.flags.writeable = False  # those of a window that was pickled can be written to
@@ -130,11 +131,7 @@ class Rollout:
         blocks = -(-m // LANES)
         shapes = (blocks, count, segments.length, self.channels, LANES), (blocks, count, N_STATE, LANES)
         residuals, ends = (aligned(shapes[0]), aligned(shapes[1])) if out is None else out
-        if residuals.shape != shapes[0] or ends.shape != shapes[1]:
-            raise ValueError(
-                f"out of shapes {residuals.shape}, {ends.shape}; these arguments need {shapes[0]}, {shapes[1]}"
-            )
-
+        check_shapes("roll", ("out", residuals, shapes[0]), ("ends", ends, shapes[1]))
         mask = self.valid.astype(np.float64)
 
         def one(block: int, lanes: _Lanes) -> None:
@@ -203,12 +200,7 @@ class Rollout:
         Returns:
             Costs, shape (m,).
         """
-        n, channels = weights.shape
-        if n != len(self) or channels not in (9, 12, 15) or channels > self.channels:
-            raise ValueError(f"weights of shape {weights.shape}; allowed: ({len(self)}, 9 to {self.channels})")
-        rows = (len(segments.starts), segments.length * channels)
-        if basis.shape[:2] != rows:
-            raise ValueError(f"basis of shape {basis.shape}; allowed: {rows} and any number of directions")
+        channels = weights.shape[1]
         cost = np.zeros((-(-len(theta) // LANES), LANES))
         weights, basis = np.ascontiguousarray(weights), np.ascontiguousarray(basis)
 
@@ -251,6 +243,7 @@ class Rollout:
         return [self._lanes(th[i : i + LANES], offsets[i : i + LANES], channels) for i in range(0, len(th), LANES)]
 
     def _lanes(self, theta: FloatArray, dx: FloatArray, channels: int) -> _Lanes:
+        check_shapes("needs_of", ("theta", theta, self._size))
         need = needs_of(theta, len(self.geometry), channels)
         table = self._table(theta, need) if need.shared else _NO_TABLE
         lag, late = float((theta[:, TAU] + np.maximum(theta[:, SLOWER], 0.0)).max()), float(theta[:, ix.DELAY].max())
@@ -274,10 +267,29 @@ class Rollout:
         self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, scale: FloatArray,
         basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
     ) -> None:  # fmt: skip
+        rows, length, count, channels = len(self), segments.length, len(segments.starts), scale.shape[1]
+        first, last = segments.starts[0] - n_pre, segments.starts[-1] + length
+        if first < 0 or last >= rows:
+            raise ValueError(f"segments over rows {first} to {last}; allowed: 0 to {rows - 1}")
+        if channels not in (9, 12, 15) or channels > self.channels:
+            raise ValueError(f"{channels} residual channels; allowed: 9, 12 or 15, at most {self.channels}")
+        sums = basis is not None
+        given = [
+            ("scale", scale, (rows, channels)), ("x0", x0, (count, N_STATE)), ("theta", lanes.theta, self._size),
+            ("dx", lanes.dx, (MAX_TANGENTS, LANES)),
+            ("out", out, (1, 1, channels * LANES) if sums else (count, length, channels * LANES)),
+        ]  # fmt: skip
+        if basis is None:
+            given.append(("ends", ends, (count, N_STATE, LANES)))
+        else:
+            given += [("basis", basis, (count, length * channels, basis.shape[-1])), ("cost", cost, (LANES,))]
+        if lanes.need.shared:
+            given.append(("table", lanes.table, (rows, 2 * ALL_MOMENTS)))
+        check_shapes("roll_segments", *given)
         x0 = x0 if x0.flags.writeable else x0.copy()  # of read-only states numba would compile the kernel once more
         roll_segments(
             self.drive, self._terms, self.flight, lanes.table, self.measured, scale, lanes.memory, segments.starts,
-            n_pre, x0, lanes.theta, lanes.dx, lanes.need, scale.shape[1], segments.length, basis is not None,
+            n_pre, x0, lanes.theta, lanes.dx, lanes.need, channels, length, sums,
             _NO_BASIS if basis is None else basis, out, ends, cost,
         )  # fmt: skip
 

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 from quadid.chi_square import Z95
 from quadid.effects import EFFECTS
-from quadid.errors import QuadidError
 from quadid.online.consistency import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
-from quadid.online.jobs import Job, JobReply
+from quadid.online.jobs import MOST_ERRORS, Job, JobReply
 from quadid.online.records import OnlineAlternative, OnlineDiagnosis, OnlineFinding
 from quadid.rotor_signal import INERTIA_RATE
 from quadid.vehicle import Vehicle
@@ -53,7 +52,6 @@ class DiagnosisRequest(Job):
     """
 
     background: ClassVar[bool] = True
-    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, ArithmeticError, ValueError)
     reply = DiagnosisReply
 
     seed: int
@@ -93,7 +91,7 @@ class BackgroundDiagnosis:
         self.wrong_scale = ""
         self._asked: DiagnosisRequest | None = None
         self._reply: DiagnosisReply | None = None
-        self._last = -math.inf
+        self._last, self._errors = -math.inf, 0
         self._told: DiagnosisReply | None = None
 
     def ask(self, number: int, tick: float, since: float) -> DiagnosisRequest | None:
@@ -106,7 +104,7 @@ class BackgroundDiagnosis:
         """
         start = max(tick - DIAGNOSED_SECONDS, since)
         early = tick - self._last < self._every or tick - start < DIAGNOSED_SECONDS
-        if not self._every or self._asked is not None or early:
+        if not self._every or self._asked is not None or early or self._errors >= MOST_ERRORS:
             return None
         cut = self._store.cut(start, tick)
         if cut.reason or cut.seconds < COMPLETE * (tick - start):
@@ -132,6 +130,7 @@ class BackgroundDiagnosis:
         if asked is None or reply is None or tick < asked.stop + ANSWER_AFTER:
             return None
         self._asked = self._reply = None
+        self._errors += reply.is_unexpected
         if asked.start < since:
             return None
         self.wrong_scale = next((f.evidence for f in reply.findings if f.confident and _is_wrong_scale(f)), "")

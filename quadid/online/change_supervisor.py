@@ -85,7 +85,7 @@ class ChangeSupervisor:
         cut = self._store.cut(self.seen.at + 0.1, tick - _EPS)
         return ChangeRequest(
             number, estimator.model, cut.windows, self.seen.at, tick, estimator.theta, estimator.z_sigma,
-            estimator.noise, self.seen.change, stamp,
+            estimator.noise_of(cut.windows), self.seen.change, stamp,
         )  # fmt: skip
 
     @staticmethod

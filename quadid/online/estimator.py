@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
+from quadid.model.channels import channels_of
 from quadid.model.layout import B, Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online.active_set import ActiveSet
@@ -50,7 +52,7 @@ class Estimator:
         fusion: the fused windows.
         misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
         theta: full parameter vector, the best at hand.
-        noise: pooled sensor noise; None before the first fit.
+        noises: pooled sensor noise by number of residual channels, as velocity and position come and go in flight.
         learned: whether `theta` rests on data.
         excitation: of the newest window, shape (6,); NaN before.
         start: first time of the data learned from [s]; NaN before.
@@ -63,7 +65,11 @@ class Estimator:
         self.vehicle, self._memory, self._seed = vehicle, memory, seed
         self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
-        self._begin(vehicle, flexible=False)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begins as from the vehicle file: nothing that was learned is kept, not even the noise."""
+        self._begin(self.vehicle, flexible=False)
 
     def fit_along(self) -> None:
         """Later windows are fitted with every effect that moves the vehicle; what was learned is forgotten."""
@@ -77,8 +83,8 @@ class Estimator:
         prior = prior_of(model)
         self._prior_sigma = prior.sigma
         self.fusion = Fusion(np.log(prior.mean), prior.sigma, self._memory)
-        self.noise: NoiseModel | None = None
-        self._pool = 0
+        self.noises: dict[int, NoiseModel] = {}
+        self._pooled: Counter[int] = Counter()
         self.theta = self._initial
         self.misfit = np.full(6, np.nan)
         self.forget()
@@ -133,9 +139,13 @@ class Estimator:
         """The fit of a window."""
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(
-            number, self.model, cut.windows, start, stop, self.theta, self.noise, self._search, self._seed, measure,
-            self.flexible, cut.spacing,
+            number, self.model, cut.windows, start, stop, self.theta, self.noise_of(cut.windows), self._search,
+            self._seed, measure, self.flexible, cut.spacing,
         )  # fmt: skip
+
+    def noise_of(self, windows: Sequence[Window]) -> NoiseModel | None:
+        """Sensor noise of the channels that these windows have; None where no such window was fitted yet."""
+        return self.noises.get(min(map(channels_of, windows), default=0))
 
     def take(self, request: FitRequest, reply: FitReply) -> None:
         """Fuses a reply, where it holds an estimate."""
@@ -165,18 +175,20 @@ class Estimator:
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
             return
-        if self.noise is None or self._search or not np.array_equal(reply.noise.white, self.noise.white):
-            self.noise, self._pool = reply.noise, 1  # the first one, or the fit had to find it anew
+        channels = len(reply.noise.white)
+        known = self.noises.get(channels)
+        if known is None or self._search or not np.array_equal(reply.noise.white, known.white):
+            self.noises[channels], self._pooled[channels] = reply.noise, 1  # the first, or the fit had to find it anew
             return
         if reply.measured is None:
             return
-        self._pool = min(self._pool + 1, NOISE_POOL)
-        share = 1.0 / self._pool
+        self._pooled[channels] = min(self._pooled[channels] + 1, NOISE_POOL)
+        share = 1.0 / self._pooled[channels]
         white, slow = (
             np.sqrt((1.0 - share) * old**2 + share * new**2)
-            for old, new in ((self.noise.white, reply.measured.white), (self.noise.slow, reply.measured.slow))
+            for old, new in ((known.white, reply.measured.white), (known.slow, reply.measured.slow))
         )
-        self.noise = NoiseModel(white, slow, self.noise.slow_time)
+        self.noises[channels] = NoiseModel(white, slow, known.slow_time)
 
     def parameters(self) -> ParameterSet | None:
         """The fused estimate with intervals and status; None before data."""

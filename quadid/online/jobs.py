@@ -5,8 +5,10 @@ Whoever drives the session runs it, in its own process or another, and delivers 
 
 from __future__ import annotations
 
+import traceback
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, TypeGuard
 
 import numpy as np
@@ -14,6 +16,18 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
 from quadid.window import Window
+
+UNEXPECTED = "unexpected error, please report it: "
+"""Begins the problem of a job that failed by an error of this program, not by what its data are."""
+
+MOST_ERRORS = 5
+"""After so many of them in a row no more such jobs are begun by themselves."""
+
+
+def unexpected(error: BaseException) -> str:
+    """The problem that an error is which nobody foresaw: what, and where it arose."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return f"{UNEXPECTED}{type(error).__name__}: {str(error)[:200]} ({Path(last.filename).name}, line {last.lineno})"
 
 
 @dataclass(frozen=True)
@@ -28,6 +42,11 @@ class JobReply:
     number: int
     problem: str = ""
 
+    @property
+    def is_unexpected(self) -> bool:
+        """Whether the job failed by an error of this program."""
+        return self.problem.startswith(UNEXPECTED)
+
 
 @dataclass(frozen=True)
 class Job(ABC):
@@ -35,7 +54,6 @@ class Job(ABC):
 
     Attributes:
         background: whether the session goes on meanwhile; it stands still for all others.
-        trouble: what may go wrong with data that nobody foresaw.
         reply: what it is answered with.
         number: counts the jobs of a session.
         vehicle: the vehicle.
@@ -44,7 +62,6 @@ class Job(ABC):
     """
 
     background: ClassVar[bool] = False
-    trouble: ClassVar[tuple[type[Exception], ...]] = (QuadidError, np.linalg.LinAlgError)
     reply: ClassVar[type[JobReply]]
 
     number: int
@@ -54,15 +71,19 @@ class Job(ABC):
     stop: float
 
     def run(self) -> JobReply:
-        """Does it; trouble is the reply's `problem`, never raised."""
+        """Does it; an error is the reply's `problem`, never raised."""
         try:
             return self.answer()
-        except self.trouble as error:
+        except (QuadidError, np.linalg.LinAlgError) as error:
             return self.failed(str(error))
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever it is, the flight goes on, and it is told with its input
+            return self.failed(unexpected(error))
 
     @abstractmethod
     def answer(self) -> JobReply:
-        """Does it; raises what is `trouble`."""
+        """Does it; raises QuadidError or LinAlgError for data that allow no answer."""
 
     def failed(self, problem: str) -> JobReply:
         """The reply of a job that could not be run."""

@@ -170,9 +170,10 @@ class Resampler:
                 self._restart(due.arrived)
                 return None
             self._making = self._make(due)
-        rows = next(self._making)
-        if rows is not None:
-            self._making = None
+        making, self._making = self._making, None  # a block that cannot be made is left out
+        rows = next(making)
+        if rows is None:
+            self._making = making
         return rows
 
     def _restart(self, arrived: tuple[int, ...]) -> None:

@@ -26,7 +26,7 @@ from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.health_supervisor import HealthSupervisor
-from quadid.online.jobs import Job, JobReply
+from quadid.online.jobs import MOST_ERRORS, Job, JobReply, unexpected
 from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, Phase, Publish, SessionStatus, SetState
@@ -159,7 +159,11 @@ class Session:
         """
         done = 0
         while self.busy and (most is None or done < most):
-            self._piece()
+            try:
+                self._piece()
+            except Exception as error:  # noqa: BLE001 - whatever it is, the flight goes on, and it is told
+                self._work = None
+                self._fail(self._now, unexpected(error))
             done += 1
         return self._outbox.take()
 
@@ -282,8 +286,25 @@ class Session:
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
+        if reply.is_unexpected:
+            self._fail(request.stop, reply.problem)
+            return
+        self._windows.errors = 0
         if isinstance(request, FitRequest) and isinstance(reply, FitReply):
             yield from self._supervisor.fitted(request, reply)
         elif isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
             self._change_supervisor.restart()
             self._supervisor.changed(request, reply)
+
+    def _fail(self, t: float, problem: str) -> None:
+        """After an error that nobody foresaw, at `t` [s]: what was learned may be its cause and is forgotten."""
+        self._windows.errors += 1
+        left = MOST_ERRORS - self._windows.errors
+        what = "learning restarts" if left > 0 else f"{MOST_ERRORS} in a row: no more fits until fit_now or a restart"
+        self._change_supervisor.restart()
+        self._consistency.restart()
+        self._estimator.reset()
+        self._supervisor.relearn(t, "an unexpected error")
+        if left >= 0:
+            self._outbox.say(t, "error", "unexpected", f"{problem}; {what}")
+        self._outbox.state(Phase.FAILED, f"{problem}; {what}")

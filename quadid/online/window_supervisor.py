@@ -7,6 +7,7 @@ from collections.abc import Generator
 
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.jobs import MOST_ERRORS
 from quadid.online.outbox import Outbox
 from quadid.online.quality import Quality, judge, mistake
 from quadid.online.records import Phase
@@ -28,6 +29,7 @@ class WindowSupervisor:
     Attributes:
         cut: the newest window, complete or not.
         quality: of the newest complete one.
+        errors: fits in a row that failed by an error of this program; after `MOST_ERRORS` none begins by itself.
     """
 
     def __init__(
@@ -37,15 +39,16 @@ class WindowSupervisor:
         self._vehicle, self._store, self._settings = vehicle, store, settings
         self._outbox, self._supervisor = outbox, supervisor
         self.cut, self.quality = Cut((), 0.0, 0), Quality()
-        self._last_fit, self._asked_now = -math.inf, False
+        self._last_fit, self._asked_now, self.errors = -math.inf, False, 0
 
     def fit_now(self) -> None:
-        """Makes the next tick due, without waiting for a full window."""
-        self._asked_now = True
+        """Makes the next tick due, without waiting for a full window, whatever failed before."""
+        self._asked_now, self.errors = True, 0
 
     def due(self, tick: float) -> bool:
         """Whether it is time for a fit."""
-        return self._asked_now or tick - self._last_fit >= self._settings.refit - _EPS
+        by_itself = self.errors < MOST_ERRORS
+        return self._asked_now or (by_itself and tick - self._last_fit >= self._settings.refit - _EPS)
 
     def ask(self, number: int, tick: float, estimator: Estimator) -> Generator[None, None, FitRequest | None]:
         """The fit of the window before `tick` [s], piece by piece; None, and the outbox says why, where it cannot be.

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from quadid.online.jobs import Job
+from quadid.online.jobs import Job, unexpected
 from quadid_node.parcel import LARGEST, ParcelError, content, pack, unpack
 from quadid_node.zenoh_session import ROOT, ZenohError, config_of, open_session
 
@@ -110,10 +110,11 @@ def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
         return
     try:
         reply = request.run()
-    except Exception as error:  # noqa: BLE001 - a request that makes no sense ends, and the machine serves the next
+    except MemoryError as error:
+        reply = request.failed(unexpected(error))
+    if reply.is_unexpected:
         done.refused += 1
-        told(f"refused: a request that cannot be worked on ({type(error).__name__})")
-        reply = request.failed("the request makes no sense")
+        told(f"refused: a request that cannot be worked on ({reply.problem})")
     else:
         done.answered += 1
     query.reply(query.key_expr, pack(reply))

@@ -184,6 +184,9 @@ class RemoteWorker:
         if self._asked is None or not self._asked.is_answered_by(reply):
             self._fall_back("refused the request" if data is None else "answers something else")
             return
+        if reply.is_unexpected:
+            self._fall_back("fails at the request")
+            return
         self._asked = None
         self.far += 1
         out.append(reply)

@@ -18,6 +18,7 @@ from quadid.online.outbox import Action
 from quadid.online.records import Event, OnlineSet, SessionStatus, SetState
 from quadid.vehicle import Vehicle
 from quadid.window import Block, Sample
+from quadid_node.failures import keep
 from quadid_node.publication import Output, Publication
 from quadid_node.store import Restored, Store
 from quadid_node.worker import Trouble, Worker
@@ -91,6 +92,7 @@ class Service:
         self._decided: list[Output] = []
         self._worker, self._store, self._clock = worker, store, clock
         self._studying: Worker | None = None
+        self._jobs: dict[bool, Job] = {}
         self._arrived: dict[str, float] = {}
         self._counted: dict[str, tuple[float, int]] = {}
         self._rates: dict[str, float] = {}
@@ -170,7 +172,9 @@ class Service:
         for action in actions:
             if not isinstance(action, Job):
                 outputs.append(action)
-            elif action.background:
+                continue
+            self._jobs[action.background] = action
+            if action.background:
                 self._studying = self._studying or self._worker.sibling()
                 self._studying.submit(action)
             else:
@@ -191,6 +195,10 @@ class Service:
                 continue
             if self.session.running is not None and item.number == self.session.running.number:
                 self._fit_seconds = self._clock() - self._fit_began
+            job = next((job for job in self._jobs.values() if job.number == item.number), None)
+            if item.is_unexpected and job is not None:
+                kept = keep(self._store.path, job) if self._store is not None else "without a history nothing is kept"
+                outputs.append(self._trouble(Trouble("error", f"{item.problem}; {kept}")))
             self.session.deliver(item)
         return [*outputs, *self._history_trouble()]
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from quadid.online.jobs import Job, JobReply
+from quadid.online.jobs import UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
 from quadid_node.warm_up import WarmUp
 from quadid_node.worker_main import READY, THREADS, frame, unframe
@@ -237,6 +237,7 @@ class ProcessWorker:
         self._tries += 1
         if self._request is not None and self._tries >= TRIES:
             problem = f"{TRIES} {self._name} processes failed before this window was done (the last one {why})"
+            problem = UNEXPECTED + problem if code is not None else problem
             replies.append(self._request.failed(problem))
             self._told.append(Trouble("error", problem))
             self._request = None

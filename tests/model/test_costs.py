@@ -81,9 +81,9 @@ def test_projection_removes_what_the_initial_state_explains() -> None:
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
     rollout, segments, x0, weights, basis = problem(noisy_window(motion=False), 9, 6)
-    with pytest.raises(ValueError, match="weights of shape"):
+    with pytest.raises(ValueError, match="scale of shape|channels; allowed"):
         rollout.costs(segments, NOMINAL[None], x0, weights[:-1], basis, N_PRE)
-    with pytest.raises(ValueError, match="weights of shape"):
+    with pytest.raises(ValueError, match="scale of shape|channels; allowed"):
         rollout.costs(segments, NOMINAL[None], x0, np.ones((len(rollout), 12)), basis, N_PRE)
     with pytest.raises(ValueError, match="basis of shape"):
         rollout.costs(segments, NOMINAL[None], x0, weights, basis[:, 1:], N_PRE)

@@ -82,7 +82,7 @@ def test_results_can_be_written_into_earlier_ones() -> None:
     again = rollout.roll(segments, NOMINAL[None], x0, out=first)
     assert again[0] is first[0]
     assert np.array_equal(again[0], kept)
-    with pytest.raises(ValueError, match="out of shapes"):
+    with pytest.raises(ValueError, match="out of shape"):
         rollout.roll(segments, np.tile(NOMINAL, (LANES + 1, 1)), x0, out=first)
 
 

@@ -53,14 +53,13 @@ def test_a_spoilt_noise_is_found_anew_and_the_fit_done(windows: tuple[Window, ..
 def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, ...]) -> None:
     learner = Estimator(PELICAN, 60.0, 0)
     learner.take(learner.request(1, Cut(windows, 10.0, 0), 0.0, 10.0), fitted(windows, None, search=True))
-    assert learner.noise is not None
-    good = learner.noise
-    learner.noise = spoilt(len(good.white))
+    (good,) = learner.noises.values()
+    learner.noises[len(good.white)] = spoilt(len(good.white))
     asked = learner.request(2, Cut(windows, 10.0, 0), 0.0, 10.0)
     assert asked.noise is not None
     assert asked.noise.white[0] == 3.0
     learner.take(asked, asked.answer())
-    assert np.allclose(learner.noise.white, good.white, rtol=0.3)
+    assert np.allclose(learner.noises[len(good.white)].white, good.white, rtol=0.3)
 
 
 def test_calm_flight_is_still_not_excited(windows: tuple[Window, ...]) -> None:
