@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quadid_node.store_file import begin_anew, connect, is_damage
+from quadid_node.store_file import StoreError, begin_anew, connect, is_damage
+from quadid_node.store_lock import HistoryLock
 
 MOST_WAITING = 5000
 """Rows kept while the disk cannot take them; beyond, the oldest that pass are lost, and that is said."""
@@ -47,6 +48,7 @@ class HistoryWriter:
 
     def __init__(
         self, path: Path, kept: Mapping[str, int], standing: Callable[[], list[Row]], notes: list[str],
+        lock: HistoryLock,
     ) -> None:  # fmt: skip
         """Begins to write.
 
@@ -55,7 +57,9 @@ class HistoryWriter:
             kept: rows that stay, by table.
             standing: the rows with which a new file begins.
             notes: gets what people should know of what is past: a damaged file set aside, a row that was no row.
+            lock: the right to write; it follows the file that stands under the name.
         """
+        self._lock = lock
         self._path, self._kept, self._standing, self._notes = path, kept, standing, notes
         self.problem = ""
         self._rows: list[Row] = []
@@ -113,9 +117,9 @@ class HistoryWriter:
         """One transaction for all rows that wait; they leave the queue only when it is on the disk."""
         try:
             unfit = self._commit(batch)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError, StoreError) as error:
             self.problem = f"{self._path} cannot be written ({error}): kept in memory until it can"
-            if is_damage(error):
+            if isinstance(error, sqlite3.Error) and is_damage(error):
                 self._replace(error)
             return
         except Exception as error:  # noqa: BLE001 - whatever it is, a history that nobody writes must be said
@@ -134,6 +138,7 @@ class HistoryWriter:
     def _commit(self, batch: list[Row]) -> list[tuple[Row, str]]:
         """Writes and commits; returns the rows that can never be written, with the reason."""
         unfit = []
+        self._lock.moved()
         with contextlib.closing(connect(self._path)) as db, db:
             for row in batch:
                 try:
@@ -148,13 +153,15 @@ class HistoryWriter:
                 self._since_pruned = 0
                 for table, kept in self._kept.items():
                     db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
+            if self._lock.moved():
+                raise sqlite3.OperationalError("another file stands there now")
         return unfit
 
     def _replace(self, error: sqlite3.Error) -> None:
         """After damage while running: a new file that begins with what stands."""
         try:
             note = begin_anew(self._path, error)
-        except (sqlite3.Error, OSError) as failure:
+        except (sqlite3.Error, OSError, StoreError) as failure:
             self.problem = f"{self._path} cannot be written ({failure}): kept in memory until it can"
             return
         self._notes += [note] if note else []

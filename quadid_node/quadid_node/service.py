@@ -102,7 +102,7 @@ class Service:
 
         if restored.approval not in ("", self._configured):
             self.session.active_set.approval = self._approval = restored.approval
-            text = f"approval is {restored.approval}, as a person decided in an earlier run, not {self._configured}"
+            text = f"approval is {restored.approval}, not {self._configured}: {restored.decided}"
             self._decided = self._journalled([Event(math.nan, "warning", "approval", text)])
 
     @property

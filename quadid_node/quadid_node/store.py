@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO
+from typing import Any
 
 from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.health.trim_estimation import FlightTrim
@@ -29,7 +29,7 @@ from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
 from quadid_node.restored_set import why_none
 from quadid_node.store_file import UNREADABLE, StoreError, connect, is_damage, make_tables, set_aside
-from quadid_node.store_lock import real, take_lock, text
+from quadid_node.store_lock import HistoryLock, real, text
 
 KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
 """Rows kept; older ones are forgotten, numbered sets and decisions never."""
@@ -64,7 +64,9 @@ class Restored:
         next_sequence: the first number of this run.
         baseline: what creeping counts from.
         healthy: trims of healthy flights, the oldest first.
-        approval: auto or manual where a person decided so while the earlier run was configured as this one; else empty.
+        approval: auto or manual where a person decided so while the earlier run was configured as this one, manual
+            where that cannot be read; else empty.
+        decided: why.
     """
 
     item: OnlineSet | None
@@ -72,6 +74,7 @@ class Restored:
     baseline: OnlineSet | None = None
     approval: str = ""
     healthy: tuple[FlightTrim, ...] = ()
+    decided: str = "a person decided so in an earlier run"
 
 
 class Store:
@@ -90,24 +93,26 @@ class Store:
             kept: rows that stay, by table; older ones are forgotten.
 
         Raises:
-            StoreError: name or path is none, or another program writes this vehicle's history or holds the file.
+            StoreError: name or path is none, another program writes this vehicle's history or holds the file, the file
+                has a second name, or it is of a newer version.
         """
         self.path, self.vehicle = real(path), text(vehicle)
         self.notes: list[str] = []
         self._problem = ""
-        self._lock: IO[str] | None = None
+        self._lock: HistoryLock | None = None
         self._writer: HistoryWriter | None = None
+        self._unread = False
         self._standing: dict[str, Row] = {}
         self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = take_lock(self.path, vehicle)
+            self._lock = HistoryLock(self.path, self.vehicle)
         except OSError as error:
             why = f"{self.path} cannot be written ({error.strerror})"
             self._problem = f"{why}: nothing of this run is kept or published"
         if self._lock is not None:
-            self._prepare()
-            self._writer = HistoryWriter(self.path, kept, self._begins_with, self.notes)
+            self._prepare(self._lock)
+            self._writer = HistoryWriter(self.path, kept, self._begins_with, self.notes, self._lock)
             self._writer.problem, self._problem = self._problem, ""
 
     @property
@@ -117,14 +122,16 @@ class Store:
 
     def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
         """What the last run left; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
-        if self._lock is None or not self.path.is_file():
+        if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
             return Restored(None, first_number())
         try:
             with contextlib.closing(connect(self.path)) as db:
                 return self._restored(db, gate or GateSettings(), vehicle)
         except sqlite3.Error as error:
             self.notes.append(f"the last set cannot be read back ({error})")
-            return Restored(None, first_number())
+            self._unread = True
+            approval, decided = self._decided(None, gate or GateSettings())
+            return Restored(None, first_number(), approval=approval, decided=decided)
 
     def _restored(self, db: sqlite3.Connection, gate: GateSettings, vehicle: Vehicle | None) -> Restored:
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
@@ -144,10 +151,19 @@ class Store:
         row = db.execute(
             "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1", (self.vehicle,)
         ).fetchone()
-        decided = row[1] if row is not None and row[0] == gate.approval and row[1] in ("auto", "manual") else ""
-        if decided:
-            self._standing["decision"] = self._decision_row(gate.approval, decided)
-        return Restored(last, first_number(int(highest or 0)), approved or first, decided, self._healthy(db))
+        approval, decided = self._decided(row, gate)
+        number = first_number(int(highest or 0))
+        return Restored(last, number, approved or first, approval, self._healthy(db), decided)
+
+    def _decided(self, row: tuple[Any, Any] | None, gate: GateSettings) -> tuple[str, str]:
+        """Approval by the newest row of what people decided, and why: manual where that cannot be read."""
+        if self._unread or (row is not None and row[1] not in ("auto", "manual")):
+            self.decision(gate.approval, "manual")
+            return "manual", "what people decided in earlier runs cannot be read"
+        if row is None or row[0] != gate.approval:
+            return "", ""
+        self._standing["decision"] = self._decision_row(gate.approval, row[1])
+        return str(row[1]), Restored.decided
 
     def _healthy(self, db: sqlite3.Connection) -> tuple[FlightTrim, ...]:
         """Trims of the newest healthy flights; a row that is none is left out, and said."""
@@ -275,7 +291,7 @@ class Store:
         if self._writer is not None:
             self._writer.put(row)
 
-    def _prepare(self) -> None:
+    def _prepare(self, lock: HistoryLock) -> None:
         """Makes the tables; sets a damaged file aside, and one whose numbers are used up."""
         try:
             make_tables(self.path)
@@ -283,6 +299,8 @@ class Store:
         except sqlite3.DatabaseError as error:
             if is_damage(error):
                 self.notes.append(set_aside(self.path, error))
+                self._unread = True
+                lock.moved()
             elif "locked" in str(error):
                 self.close()
                 raise StoreError(
@@ -291,6 +309,9 @@ class Store:
                 ) from error  # fmt: skip
             else:
                 self._problem = f"{self.path} cannot be written ({error})"
+        except StoreError:
+            self.close()
+            raise
 
     def _check_numbers(self) -> None:
         """Raises DatabaseError where a number stands that this program never gives."""

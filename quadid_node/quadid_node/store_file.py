@@ -98,20 +98,38 @@ def _rows(db: sqlite3.Connection, statement: str, values: tuple[Any, ...]) -> li
 
 
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
-    """Opens the file; for writing in WAL mode, every transaction on the disk before it counts."""
-    if read_only:
-        db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
+    """Opens the file; for writing in WAL mode, every transaction on the disk before it counts.
+
+    Raises:
+        StoreError: a history of a newer version: it is not damaged, and nothing in it is changed.
+        sqlite3.Error: it cannot be opened.
+    """
+    name = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
+    db = sqlite3.connect(name, uri=read_only, timeout=BUSY_SECONDS)
+    try:
         db.execute("PRAGMA trusted_schema = OFF")
-        return db
-    db = sqlite3.connect(path, timeout=BUSY_SECONDS)
-    db.execute("PRAGMA trusted_schema = OFF")
-    db.execute("PRAGMA journal_mode = WAL")
-    db.execute("PRAGMA synchronous = FULL")
+        (version,) = db.execute("PRAGMA user_version").fetchone()
+        if not 0 <= version <= VERSION:
+            raise StoreError(
+                f"the history {path} has version {version}", f"up to {VERSION}",
+                "use the version of quadid that wrote it, or another history",
+            )  # fmt: skip
+        if not read_only:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+    except BaseException:
+        db.close()
+        raise
     return db
 
 
 def make_tables(path: Path) -> None:
-    """Makes what tables are missing; raises sqlite3.Error for a file that is damaged or cannot be written now."""
+    """Makes what tables are missing.
+
+    Raises:
+        sqlite3.Error: the file is damaged, or cannot be written now.
+        StoreError: it is of another version of this program.
+    """
     with contextlib.closing(connect(path)) as db:
         check_tables(db)
         if db.execute("PRAGMA quick_check(1)").fetchone()[0] != "ok":

@@ -235,7 +235,7 @@ def second_service(scene: Scene) -> str:
 
 def history_removed(scene: Scene) -> str:
     for path in Path(scene.service.history.parent).glob("h.sqlite*"):
-        if not path.name.endswith(".lock"):
+        if path.is_file():
             path.unlink()
     return "every file of it deleted"
 

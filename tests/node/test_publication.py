@@ -242,27 +242,17 @@ def test_two_services_that_reach_one_history_by_two_links_never_give_one_number_
     with pytest.raises(StoreError, match="another service writes the history"):
         Store(soft, "pelican")
     hard.hardlink_to(path)
-    other = service_with(Store(hard, "pelican"))
+    with pytest.raises(StoreError, match="has 2 names"):
+        Store(hard, "pelican")
     first = accept(one)
     assert [o.item.sequence for o in said(one, 1.5) if isinstance(o, Publish)] == [first.sequence]
-    second = accept(other, b=1.01 * TRUE["b"])
-    assert second.sequence == first.sequence
-    outputs = list(said(other, 1.5))
-    assert not any(isinstance(o, Publish) for o in outputs)
-    (note,) = (o.text for o in outputs if isinstance(o, Event) and o.kind == "history")
-    assert f"number {first.sequence} stands for another set already" in note
     assert numbers_of(path) == [first.sequence]
     one.close()
-    other.close()
-    happened(23, "two services on one history by a hard link, numbered alike: the second's set is not published, said")
-
-
-def test_a_lock_that_is_a_link_empties_nothing(tmp_path: Path) -> None:
-    victim = tmp_path / "precious"
-    victim.write_text("kept")
-    (tmp_path / "h.sqlite.pelican.lock").symlink_to(victim)
-    Store(tmp_path / "h.sqlite", "pelican").close()
-    assert victim.read_text() == "kept"
+    with pytest.raises(StoreError, match="has 2 names"):
+        Store(path, "pelican")
+    hard.unlink()
+    Store(path, "pelican").close()
+    happened(23, "a second service on one history by a symbolic or a hard link: refused, the first one's rows stay")
 
 
 @pytest.mark.parametrize("name", ["", ":memory:", "loop", "fifo"])

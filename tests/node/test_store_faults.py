@@ -352,11 +352,11 @@ def test_a_file_that_computes_is_set_aside(tmp_path: Path, what: str, happened: 
     happened(12, f"a history with {what}: '{store.notes[0][:90]}'")
 
 
-def test_an_approval_that_is_none_is_not_taken_up(tmp_path: Path) -> None:
+def test_an_approval_that_is_none_is_taken_for_manual(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
     kept(path)
     with contextlib.closing(sqlite3.connect(path)) as db, db:
         db.execute("INSERT INTO decisions (vehicle, configured, approval, wall) VALUES ('v', 'auto', 'yes', 1)")
     store = Store(path, "v")
-    assert store.restore().approval == ""
+    assert store.restore().approval == "manual"
     store.close()
