@@ -59,19 +59,20 @@ def frame_of(parameters: Mapping[str, float], arm: float) -> Frame | None:
         parameters: as logged (`Recording.autopilot`).
         arm: distance of the rotors from the centre [m], used where the autopilot stores none.
     """
-    return _px4(parameters) or _ardupilot(parameters, arm)
-
-
-def _ardupilot(parameters: Mapping[str, float], arm: float) -> Frame | None:
+    if "yaw_motors_reversed" in parameters:  # Betaflight's quadrotor; the default has propellers turning inwards
+        name = "QUAD/BF_X_REV" if parameters["yaw_motors_reversed"] else "QUAD/BF_X"
+        return _numbered(name, "Betaflight", arm)
     kind = _CLASSES.get(_whole(parameters, "FRAME_CLASS"), "")
     name = f"{kind}/{_TYPES.get(_whole(parameters, 'FRAME_TYPE'), '')}"
-    if name not in ARDUPILOT:
-        return None
+    return _px4(parameters) or (_numbered(name, "ArduPilot", arm) if name in ARDUPILOT else None)
+
+
+def _numbered(name: str, autopilot: str, arm: float) -> Frame:
     rotors = [
         Place(arm * math.cos(math.radians(angle)), arm * math.sin(math.radians(angle)), 0.0, spin)
         for angle, spin in ARDUPILOT[name]
     ]
-    return Frame(f"ArduPilot {name}", tuple(rotors), scaled=True)
+    return Frame(f"{autopilot} {name}", tuple(rotors), scaled=True)
 
 
 def _px4(parameters: Mapping[str, float]) -> Frame | None:

@@ -1,8 +1,10 @@
 """Frames of a Betaflight blackbox log: variable-length numbers, predicted from the frames before.
 
 After the text header come main frames (I: complete, P: differences), slow, GPS and event frames.  A frame that cannot
-be decoded, or after which no frame begins, is skipped to the next I frame, for what follows builds on it.  Format:
-docs of Cleanflight, "Blackbox logging internals".
+be decoded, after which no frame begins, or whose time is impossible, is skipped to the next I frame, for what follows
+builds on it.  There an I frame counts once the main frame after it decodes, too: its mark alone stands in any data.
+Format: docs of Cleanflight, "Blackbox logging internals".  Own, for orangebox is GPL, does not know encoding 10 (the
+accelerometer's) and neither wraps in 32 bits nor tests where it resumes.
 """
 
 from __future__ import annotations
@@ -14,9 +16,18 @@ from dataclasses import dataclass, field
 
 MAIN, MARKS = b"IP", b"IPSGHE"
 _LOG_END = b"End of log\x00"
-_MOST_VALUE = 1 << 31
+_TURN = 1 << 32
+"""All numbers have 32 bits, and predictions wrap in them as in the firmware."""
+LONGEST_STEP = 10_000_000
+"""Time [us] between main frames without an event that says why: more is damage."""
+_PACE = 2.0
+"""Time for each iteration of the loop may differ by this factor from what it was."""
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}
 """Events by the unsigned numbers that follow them."""
+_RESUMED, _LOG_ENDS = 14, 255
+"""The events that logging goes on, with iteration and time, and that it ends."""
+_NEXT_FRAME = 1024
+"""Within so many bytes of an I frame the next main frame begins."""
 
 
 class BadFrameError(Exception):
@@ -139,11 +150,12 @@ _SINGLE: Mapping[int, Callable[[Reader], int]] = {
 
 @dataclass(frozen=True)
 class FrameDefinition:
-    """Fields of one kind of frame: names, and the numbers of their predictors and encodings."""
+    """Fields of one kind of frame: names, numbers of their predictors and encodings, which have a sign (as I frames)."""
 
     names: tuple[str, ...]
     predictors: tuple[int, ...]
     encodings: tuple[int, ...]
+    signed: tuple[bool, ...] = ()
 
     def raw(self, r: Reader) -> list[int]:
         """Decodes one frame, before prediction."""
@@ -189,60 +201,108 @@ def decode_frames(
         definitions: by kind; I and P at least.
         constants: values of the predictors that the header holds: 4 minthrottle, 8 (1500), 9 vbatref, 11 minmotor.
     """
-    out = Decoded(len(definitions["I"].names))
+    names = definitions["I"].names
+    out, clock = Decoded(len(names)), _Clock(names.index("time"), names.index("loopIteration"))
     r = Reader(data[:stop], start)
     previous: list[int] | None = None
     before: list[int] = []
+    resumed: int | None = None  # place of an I frame that the next main frame has to confirm
     while r.at < stop:
         place = r.at
         mark = chr(r.byte())
         try:
+            if resumed is not None and place - resumed > _NEXT_FRAME:
+                raise BadFrameError("no main frame follows")
             if mark == "E":
-                out.ended = _event(r)
+                kind, numbers = _event(r)
+                out.ended = kind == _LOG_ENDS
                 if out.ended:
                     break
+                if kind == _RESUMED:
+                    clock.last, previous, resumed = (numbers[1], numbers[0]), None, None
                 continue
             if mark not in definitions or (mark == "P" and previous is None):
                 raise BadFrameError(mark)
             frame = definitions[mark]
             raw = frame.raw(r)
             if mark in "IP":
-                values = _predicted(raw, frame, previous, before, constants)
+                values = _predicted(raw, frame, definitions["I"].signed, previous, before, constants)
                 if r.at < stop and data[r.at] not in MARKS:
                     raise BadFrameError("no frame follows")
+                if not clock.follows(values, previous, whole=mark == "I"):
+                    raise BadFrameError("time")
+                if previous is None:
+                    resumed = place
+                else:
+                    if resumed is not None:
+                        clock.take(previous)
+                        out.rows.extend(previous)
+                        resumed = None
+                    if mark == "I":
+                        clock.take(values)
+                    out.rows.extend(values)
                 before, previous = (values, values) if mark == "I" else (previous or values, values)
-                out.rows.extend(values)
         except BadFrameError:
             previous = None
+            place, resumed = place if resumed is None else resumed, None
             following = data.find(b"I", place + 1, stop)
             following = stop if following < 0 else following
             out.skipped += following - place
             r.at = following
+    if resumed is not None and previous is not None and not len(out.rows):
+        out.rows.extend(previous)
     return out
 
 
-def _event(r: Reader) -> bool:
-    """Reads an event; True at the end of the log."""
+@dataclass
+class _Clock:
+    """Tells which main frames may follow: columns of time [us] and iteration, and both of the last I frame."""
+
+    time: int
+    iteration: int
+    last: tuple[int, int] | None = None
+    pace: float | None = None
+
+    def follows(self, values: Sequence[int], previous: Sequence[int] | None, whole: bool) -> bool:
+        """Whether a frame, complete or not, may come after `previous`; None: after damage of any length."""
+        if previous is not None and not 0 <= (values[self.time] - previous[self.time]) % _TURN <= LONGEST_STEP:
+            return False
+        if self.last is None or not whole:
+            return True
+        elapsed, turns = self._since(values)
+        if self.pace is None:
+            return elapsed <= LONGEST_STEP
+        return turns * self.pace / _PACE <= elapsed <= turns * self.pace * _PACE
+
+    def take(self, values: Sequence[int]) -> None:
+        """Notes an I frame that is used."""
+        if self.last is not None and (since := self._since(values))[1]:
+            self.pace = since[0] / since[1]
+        self.last = values[self.time], values[self.iteration]
+
+    def _since(self, values: Sequence[int]) -> tuple[int, int]:
+        assert self.last is not None
+        return (values[self.time] - self.last[0]) % _TURN, (values[self.iteration] - self.last[1]) % _TURN
+
+
+def _event(r: Reader) -> tuple[int, list[int]]:
+    """Reads an event: its kind and its unsigned numbers."""
     kind = r.byte()
-    if kind == 255:
+    if kind == _LOG_ENDS:
         if r.data[r.at : r.at + len(_LOG_END)] != _LOG_END:
             raise BadFrameError("end of log")
-        return True
-    if kind == 13:
+    elif kind == 13:
         r.little(4) if r.byte() & 0x80 else r.signed()
-        return False
-    if kind not in _EVENT_NUMBERS:
+    elif kind not in _EVENT_NUMBERS:
         raise BadFrameError("event")
-    for _ in range(_EVENT_NUMBERS[kind]):
-        r.unsigned()
-    return False
+    return kind, [r.unsigned() for _ in range(_EVENT_NUMBERS.get(kind, 0))]
 
 
 def _predicted(
-    raw: Sequence[int], frame: FrameDefinition, previous: Sequence[int] | None, before: Sequence[int],
-    constants: Mapping[int, int],
+    raw: Sequence[int], frame: FrameDefinition, signed: Sequence[bool], previous: Sequence[int] | None,
+    before: Sequence[int], constants: Mapping[int, int],
 ) -> list[int]:  # fmt: skip
-    """Adds to each number what its predictor expects from the header and the two main frames before."""
+    """Adds, in 32 bits, to each number what its predictor expects of the header and the two main frames before."""
     out: list[int] = []
     names = frame.names
     for i, (value, predictor) in enumerate(zip(raw, frame.predictors, strict=True)):
@@ -259,9 +319,7 @@ def _predicted(
                 value += int((previous[i] + before[i]) / 2)
             elif predictor == 6:
                 value += previous[i] + 1
-        if not -_MOST_VALUE < value < 2 * _MOST_VALUE:
-            raise BadFrameError("beyond 32 bits")
-        out.append(value)
+        out.append(extended(value, 32) if signed[i] else value % _TURN)
     return out
 
 

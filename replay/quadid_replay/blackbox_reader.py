@@ -24,7 +24,10 @@ from quadid_replay.motors import RPM
 MAGIC = b"H Product:Blackbox"
 _DEGREE = np.pi / 180.0
 _MOST_FIELDS = 256
-_KEPT = ("gyro_scale", "acc_1G", "minthrottle", "vbatref", "motorOutput", "motor_poles", "maxthrottle")
+_KEPT = (
+    "gyro_scale", "acc_1G", "minthrottle", "vbatref", "motorOutput", "motor_poles", "maxthrottle",
+    "blackbox_high_resolution", "yaw_motors_reversed",
+)  # fmt: skip
 
 
 class _Header(NamedTuple):
@@ -87,13 +90,17 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
                 parts = [
                     tuple(int(v) for v in values[f"Field {kind} {w}"].split(",")) for w in ("predictor", "encoding")
                 ]
+                signs = values.get(f"Field {kind} signed", "").split(",")
+                if len(signs) != len(names):  # P frames have those of I frames
+                    signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
                 if len({len(names), *map(len, parts)}) == 1 and len(names) <= _MOST_FIELDS:
-                    definition = FrameDefinition(tuple(names), parts[0], parts[1])
+                    definition = FrameDefinition(tuple(names), *parts, tuple(sign == "1" for sign in signs))
                     if known_encodings(definition):
                         definitions[kind] = definition
     except (KeyError, ValueError) as error:
         raise _bad_header(origin, str(error)) from error
-    if not {"I", "P"} <= definitions.keys() or "time" not in definitions["I"].names:
+    main = definitions.get("I")
+    if main is None or "P" not in definitions or not {"time", "loopIteration"} <= {*main.names}:
         raise _bad_header(origin, "no main frame that is described whole")
     return _Header(definitions, values, at)
 
@@ -131,7 +138,7 @@ def _parameters(header: _Header) -> dict[str, float]:
 def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawChannel]:
     names = header.definitions["I"].names
     table = np.array(decoded.rows, dtype=np.float64).reshape(-1, decoded.width)
-    t, _ = clock.times(table[:, names.index("time")] * 1e-6)
+    t, _ = clock.times(np.unwrap(table[:, names.index("time")], period=2.0**32) * 1e-6)  # 71.6 minutes of 32 bits
     out: list[RawChannel] = []
 
     def columns(name: str, count: int) -> FloatArray | None:
@@ -146,6 +153,8 @@ def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawCha
     unfiltered = columns("gyroUnfilt", 3)
     used = gyro if unfiltered is None else unfiltered
     scale = _value(header.values, "gyro_scale", 1.0) * _DEGREE
+    if _value(header.values, "blackbox_high_resolution", 0.0) > 0.0:
+        scale *= 0.1
     label = "gyroADC (filtered on board)" if unfiltered is None else "gyroUnfilt"
     add("gyro", None if used is None else flip_body(used * scale), label)
     one = _value(header.values, "acc_1G", 0.0)

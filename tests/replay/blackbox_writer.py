@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 
 
 def unsigned(value: int) -> bytes:
-    out = bytearray()
+    """As the firmware: a negative number is one of 32 bits."""
+    out, value = bytearray(), value & 0xFFFFFFFF
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
         value >>= 7

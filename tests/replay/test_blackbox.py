@@ -111,6 +111,58 @@ def test_damage_costs_the_frames_up_to_the_next_complete_one(tmp_path: Path) -> 
     assert any("no end-of-log mark" in w for w in recording.warnings)
 
 
+def test_numbers_wrap_in_32_bits_as_in_the_firmware(tmp_path: Path) -> None:
+    """A throttle below `minthrottle`, and a clock that starts over after 71.6 minutes, are no damage."""
+    table = rows()
+    throttle, time = writer.NAMES.index("rcCommand[3]"), writer.NAMES.index("time")
+    for k, row in enumerate(table):
+        row[throttle] = 1000 + k % 3 if k // 50 % 2 else 1300
+        row[time] = (2**32 - 100_000 + 500 * k) % 2**32
+    recording = open_log(log(tmp_path, writer.header() + b"".join(writer.frames(table)) + writer.END))
+    assert recording.warnings == ()
+    np.testing.assert_allclose(recording.channels["gyro"].t, (2**32 - 100_000 + 500.0 * np.arange(400)) * 1e-6)
+    np.testing.assert_allclose(recording.channels["gyro"].values[:, 0], np.radians(column(table, "gyroADC[0]")))
+
+
+def test_high_resolution_is_tenths_of_a_degree(tmp_path: Path) -> None:
+    table = rows()
+    header = writer.header() + b"H blackbox_high_resolution:1\n"
+    recording = open_log(log(tmp_path, header + b"".join(writer.frames(table)) + writer.END))
+    np.testing.assert_allclose(recording.channels["gyro"].values[:, 0], np.radians(column(table, "gyroADC[0]") / 10))
+
+
+def test_a_pause_of_logging_is_no_damage(tmp_path: Path) -> None:
+    """Logging that a switch stops and starts tells so by an event (14) with iteration and time."""
+    table = rows()
+    for row in table[200:]:
+        row[0] += 80_000
+        row[1] += 40_000_000
+    resumed = b"E\x0e" + writer.unsigned(table[200][0]) + writer.unsigned(table[200][1])
+    parts = writer.frames(table)
+    recording = open_log(log(tmp_path, writer.header() + b"".join([*parts[:200], resumed, *parts[200:]]) + writer.END))
+    assert len(recording.channels["gyro"].t) == 397  # three confirm the jump of the clock
+    assert not any("damaged" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_after_damage_no_row_is_invented(tmp_path: Path, seed: int) -> None:
+    """Any `I` in the data may be taken for a frame: only true rows come back, and those after the damage do."""
+    table = rows(1200)
+    data = bytearray(b"".join(writer.frames(table)))
+    rng = Random(seed)
+    for _ in range(20):
+        at = rng.randrange(len(data) // 10, len(data) * 9 // 10)
+        data[at : at + 30] = rng.randbytes(rng.choice((0, 30, 60))).replace(b"\x00", b"I")
+    recording = open_log(log(tmp_path, writer.header() + bytes(data) + writer.END))
+    t, gyro = recording.channels["gyro"].t, np.degrees(recording.channels["gyro"].values[:, 2])
+    known = {round(a * 1e-6, 6): -b for a, b in zip(column(table, "time"), column(table, "gyroADC[2]"), strict=True)}
+    wrong = [a for a, b in zip(t, gyro, strict=True) if abs(known.get(round(float(a), 6), np.inf) - b) > 1e-6]
+    assert len(wrong) <= 2 * 8  # the rest of two groups of frames: the format has no checksum
+    assert len(t) > 700
+    assert t[-1] == pytest.approx(table[-1][1] * 1e-6)
+    assert recording.breaks == ()
+
+
 def test_of_several_logs_the_longest_is_read(tmp_path: Path) -> None:
     short, long = (writer.header() + b"".join(writer.frames(rows(n))) + writer.END for n in (50, 300))
     recording = open_log(log(tmp_path, short + long + short))
