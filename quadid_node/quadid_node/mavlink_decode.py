@@ -6,9 +6,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 from quadid_replay.boot_clock import BootClock
+from quadid_replay.motors import ESCS
 from quadid_replay.tlog_messages import PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
 
 from quadid.window import Sample
@@ -30,6 +32,21 @@ RANKS = {
 """Which message a channel is best taken from."""
 
 
+_MOTORS = {"esc": "rotor_speed", "servo": "motor_command", "actuator": "motor_command"}
+
+
+@dataclass
+class _Round:
+    """Values of the messages of one round, by output, how many outputs they tell, where the last one began, and the
+    time of the first [s].
+    """
+
+    row: list[float] = field(default_factory=lambda: [math.nan] * ESCS)
+    width: int = 0
+    place: float = math.inf
+    t: float = math.nan
+
+
 class MavlinkDecoder:
     """Messages of one vehicle to samples.
 
@@ -42,12 +59,10 @@ class MavlinkDecoder:
         """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
         self.counts: Counter[str] = Counter()
         self.order = MotorOrder(rotors)
-        self._rotors = rotors
         self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
         self._wall, self._epoch, self._newest = wall, 0.0, math.inf
-        self._row: list[float] = []
-        self._row_time = math.nan
+        self._rounds: dict[str, _Round] = {}
 
     def samples(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Sample]:
         """Yields the samples that may be used now.
@@ -85,25 +100,25 @@ class MavlinkDecoder:
 
     def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Sample]:
         source = reading.source.split(" ")[0]
-        if reading.signal == "esc":
-            yield from self._escs(t, reading, source)
-            return
         channel, values = reading.signal, tuple(float(v) for v in reading.values)
-        if channel in ("servo", "actuator"):
-            channel = "motor_command"
-            values = self.order.take(values, source, received)
+        if channel in ("esc", "servo"):
+            t, values = self._joined(t, reading, source)
+        if channel in _MOTORS:
+            channel, values = _MOTORS[channel], self.order.take(values, source, received)
         rank = RANKS.get((channel, source))
-        if rank is not None and values and all(math.isfinite(v) for v in values):
-            yield from self._chooser.take(Sample(t, channel, values), rank)
-
-    def _escs(self, t: float, reading: Reading, source: str) -> Iterator[Sample]:
-        """Joins the messages of one round to a row at the time of the first."""
-        if reading.place == 0:
-            self._row, self._row_time = [math.nan] * self._rotors, t
-        if not self._row:
+        if rank is None or not values or not all(math.isfinite(v) for v in values):
             return
-        for i, value in enumerate(reading.values[: max(self._rotors - reading.place, 0)]):
-            self._row[reading.place + i] = float(value)
-        if all(math.isfinite(v) for v in self._row):
-            row, self._row = tuple(self._row), []
-            yield from self._chooser.take(Sample(self._row_time, "rotor_speed", row), RANKS["rotor_speed", source])
+        if reading.signal in ("esc", "servo"):
+            self._rounds[source].row = [math.nan] * ESCS  # it is told once
+        yield from self._chooser.take(Sample(t, channel, values), rank)
+
+    def _joined(self, t: float, reading: Reading, source: str) -> tuple[float, tuple[float, ...]]:
+        """The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first."""
+        joined = self._rounds.setdefault(source, _Round())
+        if reading.place <= joined.place:
+            joined.row, joined.t = [math.nan] * ESCS, t
+        joined.place = reading.place
+        for k, value in enumerate(reading.values[: max(ESCS - reading.place, 0)]):
+            joined.row[reading.place + k] = float(value)
+        joined.width = ESCS if reading.signal == "esc" else max(joined.width, reading.place + len(reading.values))
+        return joined.t, tuple(joined.row[: joined.width])

@@ -27,7 +27,7 @@ MOTORS = 80.0
 err alike: slow torque by 6 % where at this rate [Hz] it is 0.4 % (`python -m studies.autopilot.readings`)."""
 REQUESTED = {
     "HIGHRES_IMU": 100.0, "RAW_IMU": 100.0, "ATTITUDE_QUATERNION": 50.0, "SERVO_OUTPUT_RAW": MOTORS,
-    "ACTUATOR_OUTPUT_STATUS": MOTORS, "ESC_STATUS": MOTORS, "ESC_TELEMETRY_1_TO_4": MOTORS, "ATTITUDE_TARGET": 50.0,
+    "ACTUATOR_OUTPUT_STATUS": MOTORS, "ESC_STATUS": MOTORS, "ATTITUDE_TARGET": 50.0,
     "LOCAL_POSITION_NED": 20.0, "BATTERY_STATUS": 1.0,
 }  # fmt: skip
 """Messages asked for, with their rates [Hz]."""
@@ -248,11 +248,12 @@ class MavlinkLink:
 
     def _ask(self, now: float) -> None:
         """Asks for the messages that do not come at 60 % of their rate."""
-        lacking = [n for n, rate in REQUESTED.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
+        wanted = REQUESTED | dict.fromkeys(self._decoder.order.esc_groups(), MOTORS)
+        lacking = [n for n, rate in wanted.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
         for name in self._requests.due(lacking, now):
             self._wire.send(dialect.MAVLink_command_long_message(
                 self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
-                float(_IDS[name]), 1e6 / REQUESTED[name], 0.0, 0.0, 0.0, 0.0, 0.0,
+                float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0,
             ))  # fmt: skip
 
     def _measure(self, now: float) -> None:

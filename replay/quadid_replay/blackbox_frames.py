@@ -150,7 +150,7 @@ _SINGLE: Mapping[int, Callable[[Reader], int]] = {
 
 @dataclass(frozen=True)
 class FrameDefinition:
-    """Fields of one kind of frame: names, numbers of their predictors and encodings, which have a sign (as I frames)."""
+    """Fields of one kind of frame: names, numbers of their predictors and encodings, whether they have a sign."""
 
     names: tuple[str, ...]
     predictors: tuple[int, ...]

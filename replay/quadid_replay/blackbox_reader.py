@@ -94,7 +94,7 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
                 if len(signs) != len(names):  # P frames have those of I frames
                     signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
                 if len({len(names), *map(len, parts)}) == 1 and len(names) <= _MOST_FIELDS:
-                    definition = FrameDefinition(tuple(names), *parts, tuple(sign == "1" for sign in signs))
+                    definition = FrameDefinition(tuple(names), parts[0], parts[1], tuple(sign == "1" for sign in signs))
                     if known_encodings(definition):
                         definitions[kind] = definition
     except (KeyError, ValueError) as error:

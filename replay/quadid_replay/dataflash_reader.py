@@ -6,6 +6,7 @@ since boot.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -20,9 +21,12 @@ from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
 from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import (
+    ESCS,
     RPM,
+    Outputs,
     active_outputs,
     changed_within,
+    esc_columns,
     frame_rotors,
     merge_instances,
     motor_outputs,
@@ -33,13 +37,15 @@ _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
 _RATES = ("R", "P", "Y")
 _QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
 _QUATERNION = ("Q1", "Q2", "Q3", "Q4")
-_ESCS = 32
-"""Instances of ESC that ArduPilot may log."""
+_VERSION = re.compile(r"V(\d+)\.(\d+)")
+_OUTPUTS = ("RCOU", "RCO2", "RCO3")
+"""Outputs 1 to 14, and those behind."""
+_OUTPUT = re.compile(r"Ch?(\d{1,2})")
 _VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
 
 
 _STAMPED = (
-    "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", "RCOU", "ESC", "CTUN",
+    "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", *_OUTPUTS, "ESC", "CTUN",
     "MODE",
     *_QUATERNIONS,
 )  # fmt: skip
@@ -241,45 +247,58 @@ def _battery(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawCha
 def _outputs(
     index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
 ) -> list[RawChannel]:
-    description = index.formats.get("RCOU")
-    if description is None:
+    place: dict[int, tuple[str, str]] = {}  # record and column of each output
+    for name in _OUTPUTS:
+        columns = index.formats[name].columns if name in index.formats else ()
+        place |= {int(m[1]) - 1: (name, m[0]) for c in columns if (m := _OUTPUT.fullmatch(c)) and 0 < int(m[1]) <= ESCS}
+    told = {name: _source(index, times, name, ()) for name, _ in place.values()}
+    first = next(iter(told.values()), None)
+    if first is None:
         return []
-    columns = tuple(c for c in description.columns if c.lstrip("Ch").isdigit())
-    source = _source(index, times, "RCOU", columns)
-    if source is None or not columns:
-        return []
-    found = motor_outputs(parameters, frame_rotors(_frame(index)), len(columns), "RCOU", ardupilot=True)
+    pulses = np.full((len(first.t), 1 + max(place)), np.nan)
+    for output, (name, column) in place.items():
+        if (source := told[name]) is not None:
+            _, here, there = np.intersect1d(first.t, source.t, return_indices=True)  # of one moment
+            pulses[here, output] = _stack(index, source, (column,))[there, 0]
+    found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
     notes += [found.problem] if found.problem else []
-    pulses = _stack(index, source, columns)
     motors = [] if found.problem else found.columns or active_outputs(pulses)
     if not motors:
         return []
-    label = "RCOU " + " ".join(columns[i] for i in motors)
-    return [RawChannel("motor_command", source.t, pulses[:, motors], label, source.refused)]
+    label = " ".join([*dict.fromkeys(place[k][0] for k in motors), *(place[k][1] for k in motors)])
+    return [RawChannel("motor_command", first.t, pulses[:, motors], label, first.refused)]
 
 
 def _frame(index: DataflashIndex) -> str:
-    texts = index.text("MSG", "Message") if index.has("MSG", "Message") else []
-    return next((text.split(":", 1)[1].strip() for text in texts if text.startswith("Frame:")), "")
+    return next((text.split(":", 1)[1].strip() for text in _messages(index) if text.startswith("Frame:")), "")
+
+
+def _messages(index: DataflashIndex) -> list[str]:
+    return index.text("MSG", "Message") if index.has("MSG", "Message") else []
 
 
 def _esc(
     index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
 ) -> list[RawChannel]:
-    """ESC telemetry comes one motor at a time; instances are output columns."""
+    """ESC telemetry comes one motor at a time."""
     number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
     if number is None or "ESC" not in times or not index.has("ESC", "RPM"):
         return []
     instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
-    found = motor_outputs(parameters, frame_rotors(_frame(index)), _ESCS, "ESC", ardupilot=True)
+    turning = [bool(np.any(rpm[instance == k] != 0.0)) for k in range(ESCS)]
+    version = next((m for m in map(_VERSION.search, _messages(index)) if m), None)
+    told = (int(version[1]), int(version[2])) if version else None
+    found = esc_columns(parameters, frame_rotors(_frame(index)), turning, "ESC", ardupilot=True, version=told)
+    silent = [k for k in found.columns if not np.any(instance == k)]
+    if silent and any(turning):
+        found = Outputs([], f"ESC: no records of instance {', '.join(map(str, silent))}, a motor: they are not used")
     if found.problem:
         notes.append(found.problem)
         return []
-    motors = found.columns or sorted({int(i) for i in instance})
     series = []
-    for motor in motors:
+    for motor in found.columns:
         rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)
         rising = np.concatenate([[True], np.diff(t[rows]) > 0.0])[: int(rows.sum())]
         series.append((t[rows][rising], rpm[rows][rising] * RPM))
     at, values = merge_instances(series)
-    return [RawChannel("rotor_speed", at, np.abs(values), f"ESC RPM of {len(motors)} motors")]
+    return [RawChannel("rotor_speed", at, np.abs(values), f"ESC RPM of {len(found.columns)} motors")]

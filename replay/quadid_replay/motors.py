@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 
 RPM = 2.0 * np.pi / 60.0
 """One revolution per minute [rad/s]."""
@@ -17,10 +17,16 @@ _FRAMES = {"TRI": 3, "QUAD": 4, "HEXA": 6, "Y6": 6, "OCTA": 8, "OCTAQUAD": 8, "O
 MOST_ROTORS = 12
 """ArduPilot and PX4 mix no more."""
 _LARGEST_WHOLE = 1e9
-MOTOR_FUNCTION = re.compile(r"SERVO([1-9]|[12]\d|3[0-2])_FUNCTION|PWM_(?:MAIN|AUX)_FUNC([1-9]|1[0-6])")
+ESCS = 32
+"""Outputs of ArduPilot, and ESCs that it may report."""
+MOTOR_FUNCTION = re.compile(r"SERVO([1-9]|[12]\d|3[0-2])_FUNCTION|(?:PWM_(?:MAIN|AUX)|UAVCAN_EC)_FUNC([1-9]|1[0-6])")
 """Parameters of ArduPilot and PX4 that say what an output drives."""
 _ARDUPILOT_MOTORS = {**{33 + k: k for k in range(8)}, **{82 + k: 8 + k for k in range(4)}}
 _PX4_MOTORS = {101 + k: k for k in range(MOST_ROTORS)}
+PX4_BANKS = ("PWM_AUX", "PWM_MAIN", "UAVCAN_EC")
+"""PX4's banks of outputs, as its parameters name them."""
+_OLD_ESCS = (4, 4)
+"""The last ArduPilot that counts ESCs from 0, whatever outputs they are on."""
 _TRICOPTER, _TAIL = (0, 1, 3), 6
 """ArduPilot's tricopter has motors 1, 2 and 4; its motor 7 is the servo of the tail."""
 _PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
@@ -89,6 +95,40 @@ def motor_outputs(
     return Outputs(columns, told=told)
 
 
+def esc_columns(
+    parameters: Mapping[str, float], rotors: int, reporting: Sequence[bool] | BoolArray, message: str,
+    ardupilot: bool = False, version: tuple[int, int] | None = None,
+) -> Outputs:  # fmt: skip
+    """Finds the motors among the ESCs that report speeds: they go with the outputs, as `motor_outputs` has them.
+
+    ESC k is the one on output k, or, up to ArduPilot 4.4, the k-th in the order of their outputs.  The one is used of
+    which more ESCs report; if both do alike, the version decides.
+
+    Args:
+        parameters: of the autopilot, by name.
+        rotors: how many the vehicle has; 0 for unknown.
+        reporting: whether each ESC, from the first, ever reports a speed.
+        message: its name.
+        ardupilot: whether it is an ArduPilot, be none of these parameters known.
+        version: of ArduPilot, major and minor; None for unknown.
+    """
+    reports = [bool(reporting[k]) if k < len(reporting) else False for k in range(ESCS)]
+    banks = [px4_motor_outputs(parameters, bank) for bank in PX4_BANKS]
+    px4 = next((columns for columns in banks if columns and (not rotors or len(columns) == rotors)), None)
+    found = motor_outputs(parameters, rotors, ESCS, message, ardupilot) if px4 is None else Outputs(px4, told=True)
+    outputs = found.columns or list(range(min(sum(reports), MOST_ROTORS)))
+    if found.problem or not any(reports):
+        return found if found.problem else Outputs(outputs, told=found.told)
+    by_rank = [sorted(outputs).index(k) for k in outputs]
+    old = version is not None and version <= _OLD_ESCS
+    ways = [by_rank, outputs] if old else [outputs, by_rank]
+    columns = max(ways, key=lambda way: sum(reports[k] for k in way))
+    if any(reports[k] for k in columns):
+        return Outputs(columns, told=found.told)
+    speeds, motors = (", ".join(str(k + 1) for k in which) for which in (np.flatnonzero(reports), outputs))
+    return Outputs([], f"{message}: ESC {speeds} report speeds, but the motors are on {motors}: they are not used")
+
+
 def frame_rotors(frame: str) -> int:
     """Returns how many rotors a frame of ArduPilot has; 0 for one that is not known.
 
@@ -131,20 +171,22 @@ def changed_within(names: Sequence[str], values: Sequence[float]) -> str:
 
 
 def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
-    """Returns the columns of motors 1, 2, 3 … in one bank of outputs.
-
-    PWM_<bank>_FUNCn 101..112 are motors 1..12.
+    """Returns the columns of motors 1, 2, 3 … in one bank of outputs, of `PX4_BANKS`.
 
     Args:
         parameters: PX4 parameters of the log.
-        bank: ``MAIN`` or ``AUX``.
+        bank: the beginning of their names.
     """
-    motors = {}
-    for output in range(1, 17):
-        motor = _PX4_MOTORS.get(_whole(parameters, f"PWM_{bank}_FUNC{output}"))
-        if motor is not None:
-            motors[motor] = output - 1
-    return [motors[i] for i in range(len(motors))] if sorted(motors) == list(range(len(motors))) else []
+    return motor_columns([_whole(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
+
+
+def motor_columns(functions: Sequence[int]) -> list[int]:
+    """Returns the columns of motors 1, 2, 3 … by PX4's functions of each (parameters, `EscReport.actuator_function`).
+
+    Functions 101..112 are motors 1..12; of several columns of one motor the first counts.  Empty where motors lack.
+    """
+    motors = {_PX4_MOTORS[f]: k for k, f in reversed([*enumerate(functions)]) if f in _PX4_MOTORS}
+    return [motors[k] for k in range(len(motors))] if set(motors) == set(range(len(motors))) else []
 
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from quadid.types import FloatArray
 from quadid_replay.clocks import WrapCounter
 from quadid_replay.frames import GRAVITY, from_euler, to_euler
-from quadid_replay.motors import RPM
+from quadid_replay.motors import ESCS, RPM
 
 MILLI = 1e-3
 SERVO_TURN = 2.0**32 * 1e-6
@@ -24,6 +25,8 @@ ZERO_IS_BOOT = 1.0
 _UNIX_US = 1e14
 """Stamps above this [us] count from the UNIX epoch."""
 _NO_VOLTAGE = 65535
+ESC_GROUPS = tuple(f"ESC_TELEMETRY_{k + 1}_TO_{k + 4}" for k in range(0, ESCS, 4))
+"""ArduPilot's messages of four ESCs each."""
 
 
 class Reading(NamedTuple):
@@ -92,7 +95,7 @@ def _local_position(m: Any) -> list[Reading]:
 
 def _servo_output(m: Any) -> list[Reading]:
     outputs = [getattr(m, f"servo{i}_raw", 0) for i in range(1, 17)]
-    return [Reading("servo", outputs, "SERVO_OUTPUT_RAW", known=m.port == 0)]
+    return [Reading("servo", outputs, "SERVO_OUTPUT_RAW", 16 * m.port, known=m.port < 2)]
 
 
 def _battery_status(m: Any) -> list[Reading]:
@@ -124,8 +127,7 @@ READERS: dict[str, Callable[[Any], list[Reading]]] = {
     "SERVO_OUTPUT_RAW": _servo_output,
     "ACTUATOR_OUTPUT_STATUS": lambda m: [Reading("actuator", list(m.actuator), "ACTUATOR_OUTPUT_STATUS")],
     "ESC_STATUS": lambda m: _escs(m, m.index, "ESC_STATUS"),
-    "ESC_TELEMETRY_1_TO_4": lambda m: _escs(m, 0, "ESC_TELEMETRY"),
-    "ESC_TELEMETRY_5_TO_8": lambda m: _escs(m, 4, "ESC_TELEMETRY"),
+    **{name: partial(_escs, place=4 * k, name="ESC_TELEMETRY") for k, name in enumerate(ESC_GROUPS)},
     "BATTERY_STATUS": _battery_status,
     "SYS_STATUS": _system_status,
 }

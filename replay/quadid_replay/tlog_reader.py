@@ -16,7 +16,7 @@ from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.frame_numbers import two_rows
 from quadid_replay.mavlink_decode import decode, intact
 from quadid_replay.mavlink_frames import Frames, read_frames
-from quadid_replay.motors import active_outputs, motor_outputs, px4_rotor_count
+from quadid_replay.motors import active_outputs, esc_columns, motor_outputs, px4_rotor_count
 from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES
 from quadid_replay.tlog_vehicle import Told, VehicleLog, vehicle_log
 
@@ -113,7 +113,7 @@ def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
 
 
 def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
-    """ESC rpm of as many rotors as the vehicle has; outputs that are motors."""
+    """Rotor speeds and outputs, each of the motors in their order."""
     if vehicle.kind and vehicle.kind not in _ROTORCRAFT:
         notes.append(f"the vehicle calls itself MAV_TYPE {vehicle.kind}, no multirotor: its outputs are not used")
         return []
@@ -122,10 +122,13 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
     raw: list[RawChannel] = []
     for (signal, source), (t, values, refused) in vehicle.signals.items():
         if signal == "esc":
-            known = ~np.isnan(values).all(axis=0) & (np.nan_to_num(values) != 0.0).any(axis=0)
-            width = rotors or int(np.count_nonzero(known))
-            raw.append(RawChannel("rotor_speed", t, values[:, :width], f"{source} (rpm)", refused))
+            turning = (np.nan_to_num(values) != 0.0).any(axis=0)
+            found = esc_columns(vehicle.parameters, rotors, turning, source, vehicle.ardupilot)
+            notes += [found.problem] if found.problem else []
+            raw.append(RawChannel("rotor_speed", t, values[:, found.columns], f"{source} (rpm)", refused))
         elif signal in ("servo", "actuator"):
+            told = np.flatnonzero(np.isfinite(values).any(axis=0))
+            values = values[:, : told.max(initial=-1) + 1]
             found = motor_outputs(vehicle.parameters, rotors, values.shape[1], source, vehicle.ardupilot)
             notes += [found.problem] if found.problem else []
             guessed = active_outputs(values) if signal == "servo" and not found.problem else []

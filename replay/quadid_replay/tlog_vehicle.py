@@ -11,7 +11,7 @@ import numpy as np
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid_replay.clocks import LogClock
 from quadid_replay.mavlink_decode import Messages
-from quadid_replay.motors import MOST_ROTORS, changed_within
+from quadid_replay.motors import ESCS, MOST_ROTORS, changed_within
 from quadid_replay.tlog_messages import READERS, Reading, boot_seconds, unix_seconds
 from quadid_replay.tlog_times import Stamps, place
 
@@ -20,7 +20,7 @@ _BACKWARDS = 0.5
 """Boot time that falls by more than this [s] is counted."""
 _EPOCH_US = 1e14
 """SYSTEM_TIME tells the date where it counts more than this [us]."""
-_WIDTH = {"esc": 12, "servo": 16, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
+_WIDTH = {"esc": ESCS, "servo": ESCS, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
 
 
 class Told(NamedTuple):
@@ -192,7 +192,7 @@ def _signal(signal: str, parts: list[_Part], t: FloatArray) -> Signal:
         position, places, values = position[order], places[order], values[order]
     width = _WIDTH.get(signal, 3)
     t = t[position]
-    if signal == "esc":
+    if signal in ("esc", "servo"):
         t, values = _rounds(t, places, values, width)
     elif values.shape[1] < width:
         values = np.pad(values, ((0, 0), (0, width - values.shape[1])))
@@ -201,8 +201,8 @@ def _signal(signal: str, parts: list[_Part], t: FloatArray) -> Signal:
 
 
 def _rounds(t: FloatArray, places: IntArray, values: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
-    """Joins the messages of one round (four ESCs each, rising index) to one row at the time of the first."""
-    real = places < width  # ESCs that no vehicle has are left out
+    """Joins the messages of one round (four ESCs or sixteen outputs each, rising) to a row at the time of the first."""
+    real = places < width  # what no vehicle has is left out
     t, places, values = t[real], places[real], values[real]
     begins = np.ones(len(t), dtype=np.bool_)
     begins[1:] = places[1:] <= places[:-1]

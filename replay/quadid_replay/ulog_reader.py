@@ -25,7 +25,16 @@ from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.flight_modes import PX4, mode_changes
 from quadid_replay.frames import to_euler
-from quadid_replay.motors import RPM, active_outputs, px4_motor_outputs, px4_rotor_count
+from quadid_replay.motors import (
+    MOST_ROTORS,
+    PX4_BANKS,
+    RPM,
+    active_outputs,
+    esc_columns,
+    motor_columns,
+    px4_motor_outputs,
+    px4_rotor_count,
+)  # fmt: skip
 from quadid_replay.px4_allocation import allocated, allocation
 from quadid_replay.ulog_check import UlogRecords, collect_records, unversioned
 
@@ -57,6 +66,7 @@ def read_ulog(path: Path) -> Recording:
     """
     records = collect_records(path, _TOPICS)
     log = _load(path, records)
+    notes = _notes(records, path.stat().st_size)
     raw = [
         *fastest_first(_gyro(log), 2.0),
         *fastest_first(_accel(log), 2.0),
@@ -66,9 +76,9 @@ def read_ulog(path: Path) -> Recording:
         *_simple(log, "position", "vehicle_local_position", ("x", "y", "z"), "xy_valid"),
         *_battery(log),
         *fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0),
-        *_esc(log),
+        *_esc(log, notes),
     ]
-    recording = assemble(path.name, "ulog", raw, log.clock, _notes(records, path.stat().st_size), log.parameters)
+    recording = assemble(path.name, "ulog", raw, log.clock, notes, log.parameters)
     return replace(recording, modes=_modes(log))
 
 
@@ -255,7 +265,7 @@ def _actuator_outputs(log: _Log) -> list[RawChannel]:
         if not _has(log, key, *columns):
             continue
         values = _stack(log.topics[key], columns)
-        for bank in ("AUX", "MAIN"):
+        for bank in PX4_BANKS:
             motors = px4_motor_outputs(log.parameters, bank)
             if motors and len(active_outputs(values[:, motors])) == len(motors):
                 return [_raw(log, "motor_command", key, values[:, motors], "timestamp", f"us, {bank}")]
@@ -265,20 +275,21 @@ def _actuator_outputs(log: _Log) -> list[RawChannel]:
     return []
 
 
-def _esc(log: _Log) -> list[RawChannel]:
+def _esc(log: _Log, notes: list[str]) -> list[RawChannel]:
     key = ("esc_status", 0)
     count = px4_rotor_count(log.parameters)
     if not _has(log, key, "esc[0].esc_rpm"):
         return []
     data = log.topics[key]
-    present = [i for i in range(8) if f"esc[{i}].esc_rpm" in data and np.any(data[f"esc[{i}].esc_rpm"])]
-    order = {i: i for i in present}
-    for i in present:  # newer logs say which motor an ESC drives
-        functions = data.get(f"esc[{i}].actuator_function")
-        if functions is not None and len(functions) and 101 <= int(functions[-1]) <= 112:
-            order[i] = int(functions[-1]) - 101
-    present.sort(key=lambda i: order[i])
-    if not present or (count and len(present) != count):
+    rpm = [data[name] for k in range(MOST_ROTORS) if (name := f"esc[{k}].esc_rpm") in data]
+    functions = [int(data.get(f"esc[{k}].actuator_function", [0])[-1]) for k in range(len(rpm))]
+    columns, problem = motor_columns(functions), ""
+    if not columns:  # older logs do not say which motor an ESC drives
+        columns, problem, _ = esc_columns(log.parameters, count, [bool(np.any(r)) for r in rpm], "esc_status")
+    if not problem and (not columns or max(columns) >= len(rpm) or (count and len(columns) != count)):
+        problem = f"esc_status: speeds of {len(columns)} motors, but the vehicle has {count}: they are not used"
+    if problem:
+        notes.append(problem)
         return []
-    values = np.abs(_stack(data, tuple(f"esc[{i}].esc_rpm" for i in present))) * RPM
+    values = np.abs(_stack(data, tuple(f"esc[{k}].esc_rpm" for k in columns))) * RPM
     return [_raw(log, "rotor_speed", key, values, "timestamp", "rpm")]

@@ -88,7 +88,7 @@ def test_esc_records_without_a_stamp_are_not_used(tmp_path: Path) -> None:
 def test_parameters_that_are_no_numbers_tell_nothing() -> None:
     damaged = {"SERVO1_FUNCTION": float("nan"), "PWM_MAIN_FUNC1": float("inf"), "MAV_TYPE": float("-inf")}
     assert motor_outputs(damaged, 0, 16, "RCOU") == ([], "", False)
-    assert px4_motor_outputs(damaged, "MAIN") == []
+    assert px4_motor_outputs(damaged, "PWM_MAIN") == []
     assert px4_rotor_count(damaged) == 0
     for count in (-3.0, 0.5, 1e9, 2.0**100, float("nan")):
         assert px4_rotor_count({"CA_ROTOR_COUNT": count, "MAV_TYPE": 13.0}) == 6

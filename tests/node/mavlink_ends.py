@@ -63,6 +63,11 @@ class Sender:
         return out
 
 
+def decoded(message: Any) -> Any:
+    mav = dialect.MAVLink(None, 1, 1)
+    return mav.decode(bytearray(message.pack(mav)))
+
+
 def samples(link: MavlinkLink, seconds: float = 0.3) -> list[Any]:
     out: list[Any] = []
     deadline = time.monotonic() + seconds

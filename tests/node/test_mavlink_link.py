@@ -6,7 +6,6 @@ import os
 import random
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -20,7 +19,7 @@ from quadid_replay.tlog_writer import mavlink_messages
 
 from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding
 from tests.faults.evidence import Happened
-from tests.node.mavlink_ends import KEY, Sender, accepted, free_port, samples
+from tests.node.mavlink_ends import KEY, Sender, accepted, decoded, free_port, samples
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE
 
@@ -418,8 +417,3 @@ def test_a_motor_beyond_the_outputs_that_come_is_said_and_ends_nothing(
     (said,) = link.traffic().problems
     assert "motor 4 on output 17" in said
     happened(15, f"the vehicle says that a motor is on output 17 of 16: '{said[:60]}', all else is heard")
-
-
-def decoded(message: Any) -> Any:
-    mav = dialect.MAVLink(None, 1, 1)
-    return mav.decode(bytearray(message.pack(mav)))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+from quadid_node.mavlink_decode import MavlinkDecoder
 from quadid_node.mavlink_link import MavlinkLink
 from quadid_node.mavlink_wire import dialect
 from quadid_node.motor_order import ASKED, MOST_ROUNDS, PATIENCE, MotorOrder
+from quadid_replay.motors import RPM
 
 from tests.faults.evidence import Happened
-from tests.node.mavlink_ends import Sender, free_port, samples
+from tests.node.mavlink_ends import Sender, decoded, free_port, samples
 
 PULSES = tuple(1000.0 + 10.0 * k for k in range(1, 17))
 
@@ -49,6 +52,30 @@ def test_an_ardupilot_that_never_tells_has_its_motors_on_the_first_outputs_and_t
     assert "has not told which outputs are motors" in order.problem
     tell(order, 33, 34, 35, 36)
     assert take(order, 110.0) == PULSES[:4]
+
+
+@pytest.mark.parametrize(("first", "esc"), [(1, 1), (5, 5), (9, 9), (9, 1), (29, 29)])
+def test_rotor_speeds_go_with_the_outputs_of_their_motors(first: int, esc: int) -> None:
+    """Motors 4 1 2 3 on four outputs; ESCs are counted by output, or up to ArduPilot 4.4 from the first of them."""
+    decoder, motors, got = MavlinkDecoder(4), (4, 1, 2, 3), []
+    decoder.order.ardupilot = True
+    for k, motor in enumerate(motors):
+        decoder.order.tell(f"SERVO{first + k}_FUNCTION", 32.0 + motor)
+    assert f"ESC_TELEMETRY_{esc}_TO_{esc + 3}" in decoder.order.esc_groups()
+    pulses = [1000 + 100 * motors[n - first] if 0 <= n - first < 4 else 0 for n in range(1, 33)]
+    for k in range(80):  # a better source may still come for a second
+        us, none = 2_000_000 + 20_000 * k, [0] * 4
+        sent = [
+            dialect.MAVLink_servo_output_raw_message(us, port, *pulses[16 * port : 16 * port + 16]) for port in range(2)
+        ]
+        for group in (1, 5, 9, 29):
+            made = getattr(dialect, f"MAVLink_esc_telemetry_{group}_to_{group + 3}_message")
+            sent.append(made(none, none, none, none, [1000 * m if group == esc else 0 for m in motors], none))
+        for message in sent:
+            got += list(decoder.samples(decoded(message), us * 1e-6))
+    rows = {s.channel: s.values for s in got}
+    np.testing.assert_allclose(np.array(rows["rotor_speed"]) / RPM, [1000, 2000, 3000, 4000])
+    assert rows["motor_command"] == (1100.0, 1200.0, 1300.0, 1400.0)
 
 
 def test_another_autopilot_is_not_waited_for() -> None:

@@ -27,6 +27,8 @@ def test_what_came_while_nobody_looked_is_of_the_moment_before() -> None:
     link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, clock=lambda: now[0])
     vehicle, got = Sender(port), []
     vehicle.heartbeat(autopilot=3)
+    for k in range(4):
+        vehicle.send(dialect.MAVLink_param_value_message(f"SERVO{k + 1}_FUNCTION".encode(), 33 + k, 4, 4, k))
     list(link.receive())
     for k in range(100):
         vehicle.imu(10.0 + ROUND * k)
@@ -47,6 +49,8 @@ def test_a_flight_whose_bytes_are_read_late_keeps_its_rounds(every: float, data_
     came = frames.received - frames.received[0]
     decoder, coder, times = MavlinkDecoder(4, wall=lambda: 0.0), dialect.MAVLink(None), []
     decoder.order.ardupilot = True
+    for k in range(4):
+        decoder.order.tell(f"SERVO{k + 1}_FUNCTION", 33.0 + k)
     for k in np.flatnonzero((came > 50.0) & (came < 60.0) & (frames.system == 1)).tolist():
         message, read = coder.decode(bytearray(frames.frame(k))), every * np.ceil(came[k] / every)
         times += [s.t for s in decoder.samples(message, read, read - every) if s.channel == "rotor_speed"]

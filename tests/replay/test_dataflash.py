@@ -40,7 +40,9 @@ class Dataflash:
         self.data += b"\xa3\x95" + bytes([kind]) + struct.pack("<" + "".join(CODES[c] for c in form), *values)
 
 
-def flight(seconds: float = 4.0, start: float = 10.0, motors: tuple[int, ...] = (3, 0, 1, 2)) -> Dataflash:
+def flight(
+    seconds: float = 4.0, start: float = 10.0, motors: tuple[int, ...] = (3, 0, 1, 2), escs: int = 0
+) -> Dataflash:  # fmt: skip
     log = Dataflash()
     log.describe(1, "PARM", "QNf", "TimeUS,Name,Value")
     log.describe(2, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
@@ -50,11 +52,11 @@ def flight(seconds: float = 4.0, start: float = 10.0, motors: tuple[int, ...] = 
     log.describe(6, "ESC", "QBf", "TimeUS,Instance,RPM")
     for number, output in enumerate(motors):
         log.add("PARM", 0, f"SERVO{output + 1}_FUNCTION".encode(), 33.0 + number)
-    add_flight(log, seconds, start)
+    add_flight(log, seconds, start, escs)
     return log
 
 
-def add_flight(log: Dataflash, seconds: float, start: float) -> None:
+def add_flight(log: Dataflash, seconds: float, start: float, escs: int = 0) -> None:
     for k in range(round(seconds * 100)):
         us = round((start + k * 0.01) * 1e6)
         log.add("IMU", us, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8)
@@ -63,7 +65,7 @@ def add_flight(log: Dataflash, seconds: float, start: float) -> None:
         if k % 10 == 0:
             log.add("CTUN", us + 150, 0.5)
             log.add("ATT", us + 200, 100, 1000, -100, -500, 9000, 27000)
-        log.add("ESC", us + 300, k % 4, 6000.0 + 100.0 * (k % 4))
+        log.add("ESC", us + 300, escs + k % 4, 6000.0 + 100.0 * (k % 4))
 
 
 def opened(tmp_path: Path, data: bytes) -> Path:
@@ -93,6 +95,50 @@ def test_esc_telemetry_of_one_motor_at_a_time_becomes_rows(tmp_path: Path) -> No
     assert speed.values.shape[1] == 4
     np.testing.assert_allclose(speed.values[3], RPM * np.array([6300.0, 6000.0, 6100.0, 6200.0]))
     assert 1.0 / np.median(np.diff(speed.t)) == pytest.approx(25.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("version", "first", "instances"),
+    [
+        ("V4.4.4", 9, (0, 1, 2, 3)),
+        ("V4.5.7", 9, (8, 9, 10, 11)),
+        ("V4.6.0", 17, (16, 17, 18, 19)),
+        ("", 5, (0, 1, 2, 3)),
+    ],
+)
+def test_escs_go_with_the_outputs_of_their_motors(
+    tmp_path: Path, version: str, first: int, instances: tuple[int, ...]
+) -> None:
+    """Motors 4 1 2 3 on four outputs from `first` on; up to 4.4 ArduPilot counts ESCs from 0 wherever they are."""
+    log = Dataflash()
+    log.describe(1, "PARM", "QNf", "TimeUS,Name,Value")
+    log.describe(2, "MSG", "QZ", "TimeUS,Message")
+    log.describe(3, "ESC", "QBf", "TimeUS,Instance,RPM")
+    log.describe(4, "RCOU", "Q" + 14 * "H", "TimeUS," + ",".join(f"C{k}" for k in range(1, 15)))
+    log.describe(5, "RCO3", "Q" + 14 * "H", "TimeUS," + ",".join(f"C{k}" for k in range(19, 33)))
+    log.describe(6, "RCO2", "QHHHH", "TimeUS,C15,C16,C17,C18")
+    log.add("MSG", 1_000_000, f"ArduCopter {version} (abcd)".encode())
+    motors = (4, 1, 2, 3)
+    for k, motor in enumerate(motors):
+        log.add("PARM", 1_000_000, f"SERVO{first + k}_FUNCTION".encode(), 32.0 + motor)
+    for row in range(40):
+        pulses = {first + k: 1000 + 100 * motor + row for k, motor in enumerate(motors)}
+        us = 2_000_000 + 20_000 * row
+        for name, outputs in (("RCOU", range(1, 15)), ("RCO2", range(15, 19)), ("RCO3", range(19, 33))):
+            log.add(name, us, *(pulses.get(output, 0) for output in outputs))
+        for instance in range(20):
+            on = dict(zip(instances, motors, strict=True)).get(instance)
+            log.add("ESC", us + instance, instance, 1000.0 * on + row if on else 0.0)
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    np.testing.assert_array_equal(recording.channels["motor_command"].values[0], [1100, 1200, 1300, 1400])
+    np.testing.assert_allclose(recording.channels["rotor_speed"].values[0] / RPM, [1000, 2000, 3000, 4000], atol=1.0)
+    assert recording.warnings == ()
+
+
+def test_escs_of_which_none_is_a_motor_are_named(tmp_path: Path) -> None:
+    recording = open_log(opened(tmp_path, bytes(flight(motors=(6, 7, 8, 9), escs=20).data)))
+    assert "rotor_speed" not in recording.channels
+    assert any("ESC 21, 22, 23, 24 report speeds, but the motors are on" in w for w in recording.warnings)
 
 
 def test_values_are_those_of_pymavlink(data_dir: Path) -> None:

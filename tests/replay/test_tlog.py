@@ -194,6 +194,29 @@ def test_eight_rotors_in_two_messages_a_round(tmp_path: Path) -> None:
     np.testing.assert_allclose(speed.values[-1], RPM * np.array([59, 1, 2, 3, 4, 5, 6, 7]))
 
 
+@pytest.mark.parametrize(("first", "esc"), [(1, 1), (5, 5), (9, 9), (9, 1), (29, 29)])
+def test_rotor_speeds_go_with_the_outputs_of_their_motors(tmp_path: Path, first: int, esc: int) -> None:
+    """Motors 4 1 2 3 on four outputs; ESCs are counted by output, or up to ArduPilot 4.4 from the first of them."""
+    log, motors = Tlog(), (4, 1, 2, 3)
+    log.add(0.0, heartbeat())
+    for k, motor in enumerate(motors):
+        name = f"SERVO{first + k}_FUNCTION".encode()
+        log.add(0.0, MAV.MAVLink_param_value_message(name, 32.0 + motor, 9, 900, first + k))
+    pulses = [1000 + 100 * motors[n - first] if 0 <= n - first < 4 else 0 for n in range(1, 33)]
+    for k in range(60):
+        us, none = 1_000_000 + 20000 * k, [0] * 4
+        log.add(0.02 * k, attitude(us * 1e-6))
+        for port in range(2):
+            log.add(0.02 * k, MAV.MAVLink_servo_output_raw_message(us, port, *pulses[16 * port : 16 * port + 16]))
+        for group in (1, 5, 9, 29):
+            made = getattr(MAV, f"MAVLink_esc_telemetry_{group}_to_{group + 3}_message")
+            speeds = [1000 * motor + k for motor in motors] if group == esc else none
+            log.add(0.02 * k + 0.001, made(none, none, none, none, speeds, none))
+    recording = open_log(opened(tmp_path, bytes(log.data)))
+    np.testing.assert_allclose(recording.channels["rotor_speed"].values[-1] / RPM, [1059, 2059, 3059, 4059])
+    np.testing.assert_array_equal(recording.channels["motor_command"].values[-1], [1100, 1200, 1300, 1400])
+
+
 def test_of_several_vehicles_the_one_that_tells_most(tmp_path: Path) -> None:
     one, two = Tlog(1), Tlog(2)
     for k in range(50):
