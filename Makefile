@@ -216,6 +216,10 @@ lint: $(DEV) ## style, format, which room may import which, shell, container
 typecheck: $(DEV) ## mypy --strict
 	$(BIN)/mypy
 
+.PHONY: house
+house: venv ## lines, named numbers and files that data cross; fails where a figure rose (WHY='...' records it with the reason)
+	$(STUDY) studies.house $(if $(WHY),--record '$(WHY)')
+
 format: $(DEV) ## let ruff put files into the common form
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .

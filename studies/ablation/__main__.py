@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from studies.ablation.answers import Answer, read, run
 from studies.ablation.corpus import FLIGHTS, SCALED, flights
-from studies.ablation.house import core_lines, measured
+from studies.ablation.house import measured
 from studies.ablation.variants import Variant, variants
 
 REMOVED = Path(__file__).with_name("removed.md")
@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of the page")
     options = parser.parse_args()
     if options.house:
-        print(core_lines(), measured(), sep="\n")
+        print(measured())
         return
     todo = flights(options.flights.split(","))
     words = [w for w in options.only.split(",") if w]

@@ -1,15 +1,14 @@
-"""How large the core is, by package, and the diagnosis: files, lines, named numbers, layers of imports."""
+"""Size of the diagnosis: files, lines, named numbers, layers of imports."""
 
 from __future__ import annotations
 
 import ast
-from collections import Counter
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import quadid
 import quadid.diagnose
+from studies.house import named_numbers
 
 ROOM = "quadid.diagnose."
 
@@ -44,35 +43,6 @@ def measured() -> House:
     trees = {p.stem: ast.parse(p.read_text(encoding="utf-8")) for p in paths}
     lines = sum(len(p.read_text(encoding="utf-8").splitlines()) for p in paths)
     return House(len(paths), lines, tuple(n for t in trees.values() for n in named_numbers(t)), _layers(trees))
-
-
-def core_lines() -> str:
-    """Lines of Python of the core, by package."""
-    root = Path(quadid.__path__[0])
-    lines: Counter[str] = Counter()
-    for path in root.rglob("*.py"):
-        package = path.relative_to(root).parts[0] if path.parent != root else "modules shared by all"
-        lines[package] += len(path.read_text(encoding="utf-8").splitlines())
-    return f"core {lines.total()}: " + ", ".join(f"{package} {n}" for package, n in sorted(lines.items()))
-
-
-def named_numbers(module: ast.Module) -> list[str]:
-    """Names in capitals, leading underscore or not, that stand for numbers."""
-    out: list[str] = []
-    for node in module.body:
-        if isinstance(node, ast.Assign) and _numeric(node.value):
-            names = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
-            out += [n for n in names if n.isupper()]
-    return out
-
-
-def _numeric(value: ast.expr) -> bool:
-    """Whether an expression holds numbers and other constants only."""
-    leaves = [n for n in ast.walk(value) if isinstance(n, ast.Constant | ast.Call)]
-    return bool(leaves) and all(
-        isinstance(n, ast.Constant) and isinstance(n.value, int | float) and not isinstance(n.value, bool)
-        for n in leaves
-    )
 
 
 def _layers(trees: dict[str, ast.Module]) -> tuple[tuple[str, ...], ...]:
