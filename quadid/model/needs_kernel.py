@@ -24,7 +24,6 @@ class Needs(NamedTuple):
         uneven: speeding up and slowing down lag differently.
         voltage: the supply voltage scales commands.
         growth: drag torque is not quadratic.
-        means: means of each rotor's speed are kept, for `hub` or `growth`.
         factors: thrust or mass change in flight.
         payload: inertia or centre of gravity change with mass.
         imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
@@ -40,7 +39,6 @@ class Needs(NamedTuple):
     uneven: bool
     voltage: bool
     growth: bool
-    means: bool
     factors: bool
     payload: bool
     imu_lag: bool
@@ -83,39 +81,34 @@ def _any_of(theta: FloatArray, entries: IntArray) -> bool:
     return found
 
 
-@nb.njit(**jit)
-def _needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
-    """Returns what a block of parameter vectors (LANES, size) needs of the model."""
-    rare, factors, payload = (
-        _any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD)
-    )  # fmt: skip
-    learned = False
-    for lane in range(len(theta)):
-        for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
-            learned |= theta[lane, i] != 0.0
-    rare |= learned
-    hub = rare or _any_of(theta, _HUB)
-    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
-    growth = _any_of(theta, _GROWTH)
-    varied = growth
-    for lane in range(len(theta)):
-        for i in ROTOR_ENTRIES:
-            varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
-            varied |= theta[lane, i] != theta[0, i]
-        varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
-    return Needs(
-        air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
-        _any_of(theta, _EXPONENT), growth, hub or growth, factors, payload, _any_of(theta, _IMU_LAG),
-        _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
-    )  # fmt: skip
-
-
 def _on_disk(sources: int) -> Any:
     @nb.njit(**cached)
-    def needs_of(*arguments):  # type: ignore[no-untyped-def]
+    def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
+        """Returns what a block of parameter vectors (LANES, size) needs of the model."""
         _ = sources
-        return _needs_of(*arguments)
+        rare, factors, payload = (
+            _any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD)
+        )  # fmt: skip
+        learned = False
+        for lane in range(len(theta)):
+            for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
+                learned |= theta[lane, i] != 0.0
+        rare |= learned
+        hub = rare or _any_of(theta, _HUB)
+        air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
+        growth = _any_of(theta, _GROWTH)
+        varied = growth
+        for lane in range(len(theta)):
+            for i in ROTOR_ENTRIES:
+                varied |= theta[lane, i] != theta[0, i]
+            for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
+                varied |= theta[lane, i] != theta[0, i]
+            varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
+        return Needs(
+            air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
+            _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
+            _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
+        )  # fmt: skip
 
     return needs_of
 

@@ -10,20 +10,7 @@ from typing import Any, NamedTuple
 
 import numba as nb
 
-from quadid.model.lag_kernel import (
-    mean_delayed,
-    mean_held,
-    mean_linear,
-    mean_sloped,
-    mean_uneven,
-    rotor_constants,
-    turn_delayed,
-    turn_held,
-    turn_linear,
-    turn_sloped,
-    turn_uneven,
-    uneven_input,
-)  # fmt: skip
+from quadid.model.lag_kernel import next_input, rotor_constants, turn, turn_held
 from quadid.model.layout import places
 from quadid.model.needs_kernel import Needs
 from quadid.types import FloatArray
@@ -31,12 +18,12 @@ from quadid.types import FloatArray
 # isort: off
 from quadid.model.work_array import (
     A_S2, A_X1, A_XX, A_XY, A_XZ, A_Y1, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS, C_GROWTH, C_HOVER, C_ROW, C_SHIFT,
-    C_VOLT, HALF, N_ROWS, R_DRAG, R_M1, R_M2, R_N1, R_N2, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST,
-    R_PAST_SLOPE, R_SPEED, ROTOR, T_VOLT,
+    C_VOLT, HALF, N_ROWS, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED, ROTOR, T_DRAG, T_M1,
+    T_M2, T_N1, T_N2, T_SPEED, T_VOLT,
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, SOURCES, allocating, cache_aligned, cached, exact, jit, lane_kernel
+from quadid.model.simd import LANES, SOURCES, cache_aligned, cached, exact, jit, lane_kernel
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""
@@ -138,42 +125,28 @@ def turn_rotor(
     """
     inv, keep = 2.0 / dt, 0.0 if r == 0 else 1.0
     x, y, spin, z = geometry[r, 0], geometry[r, 1], geometry[r, 2], geometry[r, 3]
-    if need.uneven:
-        uneven_input(r, held, sloped, inv, rot, s)
-        if need.means:
-            mean_uneven(a, x, y, spin, r, inv, keep, rot, s)
-        else:
-            turn_uneven(a, x, y, spin, r, inv, keep, rot, s)
-    elif need.means:
-        if plain:
-            mean_held(a, x, y, spin, r, inv, keep, rot, s)
-        elif sloped:
-            mean_sloped(a, x, y, spin, r, inv, keep, rot, s)
-        elif held:
-            mean_delayed(a, x, y, spin, r, inv, keep, rot, s)
-        else:
-            mean_linear(a, x, y, spin, r, inv, keep, rot, s)
-    elif plain:
-        turn_held(a, x, y, spin, r, inv, keep, rot, s)
-    elif sloped:
-        turn_sloped(a, x, y, spin, r, inv, keep, rot, s)
-    elif held:
-        turn_delayed(a, x, y, spin, r, inv, keep, rot, s)
+    for i in range(3 * LANES):
+        s[T_SPEED + i] = rot[r, R_SPEED + i]  # and both gains
+    if plain and not need.uneven:
+        turn_held(a, x, y, spin, inv, keep, s)
     else:
-        turn_linear(a, x, y, spin, r, inv, keep, rot, s)
+        next_input(r, held, sloped, inv, rot, s)
+        turn(x, y, spin, inv, keep, s)
+    for lane in range(LANES):
+        rot[r, R_SPEED + lane] = s[T_SPEED + lane]
     if need.hub:
-        _add_hub(r, x, y, z, keep, rot, s)
+        _add_hub(x, y, z, keep, s)
     if need.growth:
-        _add_growth(r, spin, rot, s)
+        _add_growth(spin, len(rot), s)
 
 
 @nb.njit(**jit)
-def _add_hub(r, x, y, z, keep, rot, s):  # type: ignore[no-untyped-def]
-    """Adds rotor r, at (x, y, z), to the moments of speed that the air at each hub needs."""
+def _add_hub(x, y, z, keep, s):  # type: ignore[no-untyped-def]
+    """Adds the rotor at (x, y, z) to the moments of speed that the air at each hub needs."""
     lane_kernel()
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     for lane in range(LANES):
-        m, n = rot[r, R_M1 + lane], rot[r, R_N1 + lane]
+        m, n = s[T_M1 + lane], s[T_N1 + lane]
         s[A_X1 + lane], s[A_X1 + HALF + lane] = keep * s[A_X1 + lane] + x * m, keep * s[A_X1 + HALF + lane] + x * n
         s[A_Y1 + lane], s[A_Y1 + HALF + lane] = keep * s[A_Y1 + lane] + y * m, keep * s[A_Y1 + HALF + lane] + y * n
         s[A_XX + lane], s[A_XX + HALF + lane] = keep * s[A_XX + lane] + xx * m, keep * s[A_XX + HALF + lane] + xx * n
@@ -186,13 +159,12 @@ def _add_hub(r, x, y, z, keep, rot, s):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**jit)
-def _add_growth(r, spin, rot, s):  # type: ignore[no-untyped-def]
-    """Adds to rotor r's drag torque what grows with the cube of its speed, from the means of speed and its square."""
+def _add_growth(spin, count, s):  # type: ignore[no-untyped-def]
+    """Adds to the rotor's drag torque what grows with the cube of its speed, from the means of speed and its square."""
     lane_kernel()
     for lane in range(LANES):
-        gain = spin * rot[r, R_DRAG + lane] * s[C_GROWTH + lane]
-        rotors = float(len(rot))
-        m1, m2, n1, n2 = rot[r, R_M1 + lane], rot[r, R_M2 + lane], rot[r, R_N1 + lane], rot[r, R_N2 + lane]
+        gain, rotors = spin * s[T_DRAG + lane] * s[C_GROWTH + lane], float(count)
+        m1, m2, n1, n2 = s[T_M1 + lane], s[T_M2 + lane], s[T_N1 + lane], s[T_N2 + lane]
         # The mean of a cube without its skewness, which a half step is too short to show.
         m3, n3 = m1 * (3.0 * m2 - 2.0 * m1 * m1), n1 * (3.0 * n2 - 2.0 * n1 * n1)
         s[A_Z2 + lane] += gain * (m3 * rotors * s[C_HOVER + lane] - m2)
@@ -218,31 +190,6 @@ def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArra
         turn_rotor(plain, drive.u[k, r], r, drive.held, sloped, drive.geometry, drive.dt, need, rot, s)
 
 
-@nb.njit(**allocating)
-def _table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
-    """Moments of every step of a window for lanes that share all that acts on rotors.
-
-    Args:
-        drive: input of the window.
-        need: which parts of the model the lanes need.
-        theta: the same parameter vector in every lane, (LANES, size).
-        table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
-    """
-    s = cache_aligned(N_ROWS * LANES)
-    rotors = len(drive.geometry)
-    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
-    rotor_constants(theta, drive.dt, rot, s)
-    input_constants(theta, s)
-    s[A_S2 : A_S2 + 2 * HALF] = 0.0
-    for k in range(len(drive.u)):
-        if k == 0:
-            rotors_start(drive, k, need, rot, s)
-        rotors_step(drive, k, need, rot, s)
-        for row in range(ALL_MOMENTS):
-            table[k, row] = s[A_S2 + row * LANES]
-            table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]
-
-
 @nb.njit(**jit)
 def spread_moments(table: FloatArray, k: int, moments: int, s: FloatArray) -> None:
     """Writes the first so many of the shared moments of step k into all lanes."""
@@ -255,9 +202,29 @@ def spread_moments(table: FloatArray, k: int, moments: int, s: FloatArray) -> No
 
 def _on_disk(sources: int) -> Any:
     @nb.njit(**cached)
-    def rotor_table(*arguments):  # type: ignore[no-untyped-def]
+    def rotor_table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
+        """Moments of every step of a window for lanes that share all that acts on rotors.
+
+        Args:
+            drive: input of the window.
+            need: which parts of the model the lanes need.
+            theta: the same parameter vector in every lane, (LANES, size).
+            table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
+        """
         _ = sources
-        _table(*arguments)
+        s = cache_aligned(N_ROWS * LANES)
+        rotors = len(drive.geometry)
+        rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+        rotor_constants(theta, drive.dt, rot, s)
+        input_constants(theta, s)
+        s[A_S2 : A_S2 + 2 * HALF] = 0.0
+        for k in range(len(drive.u)):
+            if k == 0:
+                rotors_start(drive, k, need, rot, s)
+            rotors_step(drive, k, need, rot, s)
+            for row in range(ALL_MOMENTS):
+                table[k, row] = s[A_S2 + row * LANES]
+                table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]
 
     return rotor_table
 

@@ -15,7 +15,6 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
-from quadid.model.subkernel import SubkernelCompiler
 from quadid.types import FloatArray
 
 LANES = 16
@@ -34,12 +33,8 @@ whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"
 """Options of functions that Python calls."""
 cached: dict[str, Any] = {**whole, "cache": True}
 """Options of the kernels on disk."""
-allocating: dict[str, Any] = {
-    **whole, "no_cfunc_wrapper": True, "no_cpython_wrapper": True, "pipeline_class": SubkernelCompiler
-}  # fmt: skip
-"""Options of the pieces of kernels that make arrays."""
-jit: dict[str, Any] = {**allocating, "_nrt": False}
-"""Options of all other pieces: no reference counts, whose atomic updates cost more than a short lane loop."""
+jit: dict[str, Any] = {**whole, "_nrt": False}
+"""Options of the pieces of kernels: no reference counts, whose atomic updates cost more than a short lane loop."""
 exact: dict[str, Any] = {**jit, "fastmath": False}
 """Options of pieces that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
 inlined: dict[str, Any] = {**jit, "forceinline": True}
@@ -83,18 +78,15 @@ def variant(which: str) -> Callable[[Any], Any]:
 
 
 def _lane_kernel(context: Any) -> Any:
-    """Called first in a kernel whose loops run over lanes; gives the compiler three facts about that kernel.
+    """Called first in a function whose loops run over lanes; sets three attributes of that function.
 
-    Registers may be 512 bits wide where the processor has them: the compiler prefers 256, out of care for code that
-    mixes wide and scalar work, but lane loops are nearly all arithmetic and gain 1.6 times.  No two array arguments
-    overlap, so no loop needs a check (or falls back to scalar code because it would need too many).  The kernel stays
-    a function of its own: merged into its caller it would be vectorised anew, and worse, in every caller.
+    It is not merged into its callers, where its loops would be vectorised anew, and worse.  Registers may be 512 bits
+    wide where the processor has them.  No two array arguments overlap, so no loop needs a check for that.
     """
 
     def generate(codegen_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         function = builder.function
         function.attributes.add("noinline")
-        function.attributes.alignstack = 64
         set.add(function.attributes, '"prefer-vector-width"="512"')  # the builder lacks this attribute; LLVM has it
         for argument in function.args[2:]:  # after the places for result and error
             if argument.type.is_pointer:
@@ -191,7 +183,7 @@ def _tile_product(typing_context: Any, a: Any, a_first: Any, a_k: Any, a_i: Any,
 tile_product: Any = intrinsic(_tile_product)
 
 
-@nb.njit(**allocating)
+@nb.njit(**whole)
 def cache_aligned(size: int) -> FloatArray:
     """Returns an uninitialised array of `size` numbers that starts on a cache line; for use in kernels."""
     room = np.empty(size + CACHE_LINE)
