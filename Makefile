@@ -50,8 +50,8 @@ $(ROS): pyproject.toml $(DEV)
 $(ROS_VERSIONS): $(ROS)
 	@:
 
-$(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg msgs/srv/*.srv)
-	tools/build_messages.sh $(VENV)
+$(MESSAGES): $(ROS_VERSIONS) tools/build_messages.sh tools/wheel_targets.cmake msgs/CMakeLists.txt msgs/package.xml $(wildcard msgs/msg/*.msg msgs/srv/*.srv tests/ros/bond/*/*)
+	tools/build_messages.sh $(VENV) msgs tests/ros/bond
 	@touch $@
 
 .PHONY: venv dev messages node

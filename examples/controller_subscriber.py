@@ -27,7 +27,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-SCHEMA = 2
+SCHEMA = 3
 UNITS = {
     "b": "N s^2/rad^2", "d": "N m s^2/rad^2", "J_xx": "kg m^2", "J_yy": "kg m^2", "J_zz": "kg m^2", "J_r": "kg m^2",
 }  # fmt: skip

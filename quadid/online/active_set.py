@@ -90,11 +90,16 @@ class ActiveSet:
             Event(t, "info", "accepted", f"set {accepted.sequence} in force: {accepted.reason}"),
         ]
 
-    def withdraw(self, why: str) -> list[Action]:
-        """Says of the set in force that it is known to be out of date; it stays what there is until the next one."""
+    def withdraw(self, why: str, code: str) -> list[Action]:
+        """Marks the set in force as out of date; it stays what there is until the next one.
+
+        Args:
+            why: one sentence.
+            code: an effect's name, ``unknown_cause`` or ``disagreement``.
+        """
         if self.in_force is None or self.in_force.outdated:
             return []
-        self.in_force = replace(self.in_force, sequence=self._number(), outdated=why)
+        self.in_force = replace(self.in_force, sequence=self._number(), outdated=why, outdated_code=code)
         return [Publish("parameters", self.in_force)]
 
     def hold(self, item: OnlineSet, stop: float) -> OnlineSet:
@@ -137,6 +142,7 @@ class ActiveSet:
         self.in_force = replace(
             good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by,
             outdated=good.outdated or bad.outdated,
+            outdated_code=good.outdated_code if good.outdated else bad.outdated_code,
         )  # fmt: skip
         self._held.clear()
         self._watch_from = math.inf

@@ -57,6 +57,7 @@ class OnlineSet:
         check: the gate's check that decided.
         mass: of the vehicle that the set rests on [kg]; NaN: not noted.
         outdated: why a set in force is known to be out of date; empty: it is not known to be.
+        outdated_code: the same for programs: an effect's name, ``unknown_cause`` or ``disagreement``.
     """
 
     sequence: int
@@ -73,6 +74,7 @@ class OnlineSet:
     check: str = ""
     mass: float = float("nan")
     outdated: str = ""
+    outdated_code: str = ""
 
 
 @dataclass(frozen=True)

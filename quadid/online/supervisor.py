@@ -62,17 +62,20 @@ class Supervisor:
         """Publishes what a sudden change was."""
         finding = reply.finding
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
-        self._has_changed(request.start, request.stop, finding, "finding", text, request.start + 0.1)
+        self._has_changed(request.start, request.stop, finding, "finding", text, request.start + 0.1, "unknown_cause")
 
     def _has_changed(
-        self, start: float, stop: float, finding: OnlineFinding | None, kind: str, text: str, learn_from: float
-    ) -> None:
+        self, start: float, stop: float, finding: OnlineFinding | None, kind: str, text: str, learn_from: float,
+        unexplained: str,
+    ) -> None:  # fmt: skip
         """Says what happened between `start` and `stop` [s]; the set in force is out of date, learning begins anew."""
         since, until = self._outbox.stamp(start), self._outbox.stamp(stop)
-        verdict = "explained" if finding is not None and finding.confident else "unknown"
+        explained = finding is not None and finding.confident
+        code = finding.effect if finding is not None and explained else unexplained
+        verdict = "explained" if explained else "unknown"
         self._outbox.act(OnlineDiagnosis(until, since, until, (finding,) if finding is not None else (), verdict))
         self._outbox.say(stop, "warning", kind, text)
-        self._outbox.act(*self._active_set.withdraw(text))
+        self._outbox.act(*self._active_set.withdraw(text, code))
         self.relearn(learn_from, "the vehicle has changed")
 
     def fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
@@ -117,7 +120,7 @@ class Supervisor:
         if request.start < self._disagrees_since - _EPS:
             return
         text = "windows disagree with the earlier estimate for the length of a window: learning restarts"
-        self._has_changed(self._disagrees_since, request.stop, None, "change", text, request.start)
+        self._has_changed(self._disagrees_since, request.stop, None, "change", text, request.start, "disagreement")
 
     def _rolled_back(self, estimate: WindowEstimate) -> bool:
         """Watches the set in force; rolls it back when its predecessor predicts new windows better."""

@@ -41,6 +41,7 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
         "approved_by": item.approved_by, "start": number(item.start), "stop": number(item.stop),
         "samples": item.samples, "mse": number(item.mse), "mse_held_out": number(item.mse_held_out),
         "input_hash": item.input_hash, "mass": number(item.mass), "outdated": item.outdated,
+        "outdated_code": item.outdated_code,
         "parameters": parameters_to_dict(item.parameters),
     }  # fmt: skip
     if covariance:
@@ -63,7 +64,7 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
         int(data["sequence"]), SetState(data["state"]), str(data["reason"]), found,
         _float(data["start"]), _float(data["stop"]), int(data["samples"]), _float(data["mse"]),
         _float(data["mse_held_out"]), str(data["input_hash"]), str(data["approved_by"]), str(data["check"]),
-        _float(data.get("mass")), str(data.get("outdated", "")),
+        _float(data.get("mass")), str(data.get("outdated", "")), str(data.get("outdated_code", "")),
     )  # fmt: skip
 
 

@@ -23,7 +23,9 @@ _BY = "ros service"
 class Commands:
     """Carries out what is asked over ROS services."""
 
-    def __init__(self, vehicle: str, active: Callable[[], Service | None], put: Callable[[Output], None]) -> None:
+    def __init__(
+        self, vehicle: str, active: Callable[[], Service | None], put: Callable[[list[Output]], None]
+    ) -> None:  # fmt: skip
         """Commands the service that `active` gives, None while there is none; `put` publishes what follows."""
         self._vehicle, self._active, self._put = vehicle, active, put
 
@@ -44,8 +46,7 @@ class Commands:
                 return response
             answer = do(service, request)
             response.success, response.message = answer.done, answer.text
-            for output in service.step(WORK_SECONDS):
-                self._put(output)
+            self._put(service.step(WORK_SECONDS))
             if hasattr(response, "in_force"):
                 response.in_force = service.session.status().in_force
             return response

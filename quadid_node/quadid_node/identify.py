@@ -4,42 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from typing import TYPE_CHECKING
 
+from quadid.errors import QuadidError
 from quadid_node.stopping import Stop, end_middleware
 from quadid_node.transport import without_shared_memory
 from quadid_node.working_folder import refusal
 
-if TYPE_CHECKING:
-    from quadid_node.node import IdentifyNode
-
 SPIN_SECONDS = 0.2
 """Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
-
-
-class Starter:
-    """Configures and activates a node that has no lifecycle manager."""
-
-    def __init__(self, node: IdentifyNode) -> None:
-        self._node = node
-        self._configured = self._active = self._told = False
-
-    def step(self) -> bool:
-        """Does what can be done now; returns False when the node cannot be configured."""
-        from rclpy.lifecycle import TransitionCallbackReturn
-
-        success = TransitionCallbackReturn.SUCCESS
-        if self._active:
-            return True
-        if not self._configured:
-            self._configured = self._node.trigger_configure() == success
-            return self._configured
-        if self._node.warm:
-            self._active = self._node.trigger_activate() == success
-        elif not self._told:
-            self._told = True
-            self._node.get_logger().info("the fit process is warming up; a first start compiles for a minute or two")
-        return True
 
 
 def main(args: list[str] | None = None) -> int:
@@ -65,14 +37,16 @@ def _run(args: list[str] | None, stop: Stop) -> int:
     stop.opens()
     without_shared_memory()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    node = IdentifyNode(stop)
+    try:
+        node = IdentifyNode(stop)
+    except QuadidError as error:  # quadid_msgs is not installed, or of another version
+        print(f"identify: {error}", file=sys.stderr)  # noqa: T201
+        return 2
     executor = EventsExecutor()
     executor.add_node(node)
-    code, starter = 0, Starter(node) if node.get_parameter("autostart").value else None
     try:
+        code = 0 if node.start() else 2
         while not stop() and code == 0:
-            if starter is not None and not starter.step():
-                code = 2
             # Works off all that arrives until the time is over; `spin_once` would come back after every message.
             executor.spin_until_future_complete(Future(), timeout_sec=SPIN_SECONDS)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -27,11 +27,14 @@ TOPICS = {
     "diagnostics": ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
 }  # fmt: skip
 """Name and type of each topic."""
-SCHEMA_VERSION = 2
+PUBLISHED = ("parameters", "candidate", "status")
+"""Topics whose messages say when they were sent."""
+SCHEMA_VERSION = 3
 BODY_FRAME = "base_link_frd"
 SET_STATES = {
     SetState.REJECTED: 1, SetState.PENDING: 2, SetState.ACCEPTED: 3, SetState.ROLLED_BACK: 4, SetState.STALE: 5,
 }  # fmt: skip
+NO_SET = 6
 STATUSES = {"identified": 0, "ratio_only": 1, "prior_dominated": 2, "unreliable": 4}
 PHASES = {
     Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
@@ -56,6 +59,7 @@ def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
         "reason": item.reason if not item.check else f"{item.check}: {item.reason}",
         "out_of_date": bool(item.outdated),
         "out_of_date_reason": item.outdated,
+        "out_of_date_code": item.outdated and (item.outdated_code or "unknown_cause"),
         "mass": item.mass,
         "names": [p.name for p in parameters],
         "units": [p.unit or "1" for p in parameters],
@@ -71,6 +75,16 @@ def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
         "log_hash": item.input_hash,
         "approved_by": item.approved_by,
     }
+
+
+def no_set(vehicle: str, boot_id: str) -> Message:
+    """quadid_msgs/ParameterSet that says that nothing is in force."""
+    nan = math.nan
+    return {
+        "header": {"frame_id": BODY_FRAME}, "schema_version": SCHEMA_VERSION, "vehicle_id": vehicle,
+        "boot_id": boot_id, "state": NO_SET, "reason": "no set of this vehicle was accepted yet",
+        "mass": nan, "mse": nan, "mse_held_out": nan,
+    }  # fmt: skip
 
 
 def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
@@ -126,6 +140,7 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
     return {
         "header": {"stamp": stamp(status.t), "frame_id": BODY_FRAME},
         "vehicle_id": vehicle,
+        "in_force": status.in_force,
         "state": PHASES[status.phase],
         "reason": f"{status.phase.value}: {status.reason}",
         "names": list(NOMINAL_NAMES),
@@ -140,25 +155,37 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
     }
 
 
+def idle_status(vehicle: str, reason: str) -> Message:
+    """quadid_msgs/FitStatus of a node that is not active, or was not configured."""
+    return {"vehicle_id": vehicle, "reason": reason, "cost": math.nan, "seconds": math.nan}
+
+
 def diagnostics(
-    health: Health, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str]
-) -> Message:
+    health: Health | None, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str],
+    idle: str = "", problem: str = "",
+) -> Message:  # fmt: skip
     """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).
 
     Args:
-        health: of the service.
+        health: of the service; None before the node is configured.
         name: full node name.
         hardware: vehicle.
         now: stamp of the report.
         notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
         hints: what is wrong with the messages of a topic.
+        idle: why the node is not active, and what to do; empty while it is.
+        problem: why it could not be configured, or empty.
     """
+    if health is None:
+        said = f"{idle}; {problem}" if problem else idle
+        entries = [_entry(name, "session", hardware, ERROR if problem else WARN, said, {})]
+        return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
     status = health.status
-    blocked = status.phase in (Phase.BLOCKED, Phase.FAILED)
-    said = f"{status.phase.value}: {status.reason}"
+    warned = bool(idle) or status.phase in (Phase.BLOCKED, Phase.FAILED) or status.backlog > BEHIND
+    said = idle or f"{status.phase.value}: {status.reason}"
     if status.backlog > BEHIND:
         said = f"{status.backlog:.0f} s behind the data, fits get too little of the processor: refit less often; {said}"
-    session = _entry(name, "session", hardware, WARN if blocked or status.backlog > BEHIND else OK, said, {
+    session = _entry(name, "session", hardware, WARN if warned else OK, said, {
         "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
         "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
         "backlog [s]": f"{status.backlog:.2f}",

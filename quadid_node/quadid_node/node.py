@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from quadid.errors import QuadidError
 from quadid.online import Publish
 from quadid_node import messages
+from quadid_node.bond import Bond, bond_of
 from quadid_node.chooser import Chooser
 from quadid_node.commands import Commands
 from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
@@ -27,6 +30,7 @@ from quadid_node.intake import DEPTH, Intake
 from quadid_node.neighbours import Neighbours, Offer
 from quadid_node.node_parameters import (
     PARAMETERS,
+    READ_BACK,
     as_declared,
     check_change,
     descriptor,
@@ -49,10 +53,17 @@ CATCHING_UP, BACKLOG = 10.0, 2.0
 """A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
 REPORT_SECONDS = 1.0
 """Status and health are told this often [s]."""
-WARM_UP_SECONDS = 8.0
-"""How long `configure` waits for warm kernels [s]; a first start after an update compiles for longer."""
+TOLD_SECONDS = 5.0
+"""So often [s] `configure` logs that it waits for the fit process."""
 SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+Return = TransitionCallbackReturn
+IDLE = {
+    "unconfigured": "not configured yet; next: ros2 lifecycle set {name} configure",
+    "configuring": "the fit process warms up; a first start compiles for a minute",
+    "inactive": "takes no samples; next: ros2 lifecycle set {name} activate",
+    "finalized": "shut down for good; next: start the process again",
+}
+"""What a node that is not active says, by its state."""
 
 
 class IdentifyNode(PollingNode, LifecycleNode):
@@ -69,61 +80,89 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for p in PARAMETERS:
             self.declare_parameter(p.name, p.default, descriptor(p))
         self.add_on_set_parameters_callback(self._on_set)
+        self._given: dict[str, Any] = {}
+        self._id, self._problem, self._reads_back = "", "", False
         self._service: Service | None = None
         self._recorder: Recorder | None = None
+        self._neighbours: Neighbours | None = None
         self._intake = Intake()
-        self._speaker: Speaker | None = None
+        self._bond: Bond | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
-        self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
+        self._speaker = Speaker(self)
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self._rounds, self._report_at = Rounds(self._round), 0.0
         self._active = False
+        self.create_timer(STEP_SECONDS, self._step, clock=RosClock(clock_type=ClockType.STEADY_TIME))
 
-    @property
-    def warm(self) -> bool:
-        """Whether fits could begin at once."""
-        return self._service is not None and self._service.ready
+    def start(self) -> bool:
+        """Configures and activates a node that has no lifecycle manager (`autostart`); False: it cannot be."""
+        if not self.get_parameter("autostart").value:
+            return True
+        return all(trigger() == Return.SUCCESS for trigger in (self.trigger_configure, self.trigger_activate))
 
     # --- life cycle
 
+    def _on_change_state(self, request: Any, response: Any) -> Any:
+        """Refuses what cannot be done in this state: rclpy raises there, which would end the process."""
+        wanted, possible = request.transition, {t[0]: t[1] for t in self._state_machine.available_transitions}
+        if wanted.label in possible.values() if wanted.label else wanted.id in possible:
+            return self._change_state(request, response)
+        allowed = ", ".join(f"{label} ({number})" for number, label in possible.items()) or "nothing"
+        self._log("warning", f"transition {wanted.label or wanted.id} cannot be made when {self._state}: {allowed} can")
+        response.success = False
+        return response
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Reads parameters and vehicle, opens the history, starts the fit process, subscribes."""
+        """Reads parameters and vehicle, opens the history, subscribes, waits until fits can begin."""
+        self._problem = ""
         try:
             self._configure()
         except QuadidError as error:
-            self.get_logger().error(str(error))
+            self._problem = str(error)
+        except Exception as error:  # noqa: BLE001 - rclpy would drop it without a word
+            self._problem = f"configure failed: {error!r} ({traceback.extract_tb(error.__traceback__)[-1]})"
+        if self._problem:
+            self._log("error", self._problem)
             self._tear_down()
-            return FAILURE
+            return Return.FAILURE
         gc.collect()
         gc.freeze()  # what there is now need not be looked through in flight, which takes as long as three steps
-        return SUCCESS
+        return Return.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begins to take samples and to publish, once the kernels are warm."""
-        assert self._service is not None
-        if not self._service.ready:
-            self.get_logger().warning("the fit process is warming up (a first start compiles): activate again shortly")
-            return FAILURE
+        """Begins to take samples and to publish, and the bond where a lifecycle manager activates."""
         result = super().on_activate(state)
         self._active = True
-        if self._speaker is not None:
-            self._speaker.step()
-        self.get_logger().info(f"ready: identifies '{self._id}'")
+        self._claim_topic()
+        if not self._given["autostart"]:
+            self._bond = bond_of(self)
+        self._log("info", f"ready: identifies '{self._id}'")
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops taking samples and publishing; what was learned is kept."""
         self._active = False
+        self._break_bond()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Ends fit process and history."""
         self._tear_down()
-        return SUCCESS
+        return Return.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """As `on_cleanup`."""
-        self._tear_down()
-        return SUCCESS
+        return self.on_cleanup(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As `on_cleanup`: the node can be configured again."""
+        return self.on_cleanup(state)
+
+    @property
+    def _state(self) -> str:
+        label: str = self._state_machine.current_state[1]
+        return label
 
     def _configure(self) -> None:
         values = {p.name: as_declared(p, self.get_parameter(p.name).value) for p in PARAMETERS}
@@ -134,6 +173,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
         self._neighbours = Neighbours(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
         self._subscribe(preset, len(vehicle.rotors))
+        self._given = values
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
         worker = ProcessWorker(vehicle, values["worker_memory"])
@@ -142,11 +182,41 @@ class IdentifyNode(PollingNode, LifecycleNode):
             beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
         self._hint = preset.motor_hint
-        self._offer()
-        deadline = time.monotonic() + WARM_UP_SECONDS
-        while not self._service.ready and time.monotonic() < deadline and not self._stopping():
-            worker.poll_ready()
+        self._speaker.open(self._observer)
+        commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
+        for name, kind, answer in commands.offered():
+            self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
+        self._warm_up(worker, values["warm_up"])
+        history = str(store.path) if store is not None else "none"
+        self._read_back({**values, "vehicle_id": self._id, "history": history, "approval": self._service.approval})
+
+    def _warm_up(self, worker: ProcessWorker, seconds: float) -> None:
+        """Waits until a fit could begin at once; raises QuadidError after so many seconds."""
+        begin = time.monotonic()
+        told = begin
+        while not worker.poll_ready() and not self._stopping():
+            now = time.monotonic()
+            if now - begin > seconds:
+                fix = "run 'quadid warmup' once, which compiles for every later start, or set warm_up higher"
+                raise QuadidError(f"the fit process is not warm after {seconds:g} s ({worker.state})", fix=fix)
+            if now - told >= TOLD_SECONDS:
+                told = now
+                self._log("info", f"{IDLE['configuring']}: {now - begin:.0f} s of {seconds:g} s")
+            self._report_if_due()
             time.sleep(0.02)
+        self._log("info", f"the fit process is warm after {time.monotonic() - begin:.1f} s")
+
+    def _read_back(self, values: dict[str, Any]) -> None:
+        """Lets parameters say what is in force."""
+        self._reads_back = True
+        now = {name: self.get_parameter(name).value for name in values}
+        self.set_parameters(
+            [Parameter(n, value=v) for n, v in values.items() if v != now[n] or type(v) is not type(now[n])]
+        )
+        self._reads_back = False
+
+    def _reads(self, name: str) -> str:
+        return repr(self.get_parameter(name).value)
 
     def _subscribe(self, preset: Source, rotors: int) -> None:
         chooser = Chooser(best_ranks(preset.inputs))
@@ -161,28 +231,26 @@ class IdentifyNode(PollingNode, LifecycleNode):
         fits = [qos_check_compatible(info.qos_profile, SENSOR_QOS)[0] != QoSCompatibility.ERROR for info in found]
         return [Offer(info.topic_type, heard) for info, heard in zip(found, fits, strict=True)]
 
-    def _offer(self) -> None:
-        self._speaker = Speaker(self, self._observer)
-        commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
-        for name, kind, answer in commands.offered():
-            self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
-        self._open.append((self.destroy_timer, self.create_timer(STEP_SECONDS, self._step, clock=self._steady)))
+    def _break_bond(self) -> None:
+        if self._bond is not None:
+            self._bond.close()
+            self._bond = None
 
     def _tear_down(self) -> None:
         self._active = False
         gc.unfreeze()
+        self._break_bond()
         self._rounds.drop()
         self._intake.clear()
         self.destroy_polled()
         for destroy, item in reversed(self._open):
             destroy(item)
         self._open.clear()
-        if self._speaker is not None:
-            self._speaker.close()
-            self._speaker = None
+        self._speaker.close()
         if self._service is not None:
             self._service.close()
             self._service = None
+            self._read_back({name: self._given[name] for name in READ_BACK})
         if self._recorder is not None:
             self._recorder.close()
             self._recorder = None
@@ -191,30 +259,29 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _step(self) -> None:
         """Goes on with the round, for longer when the session is far behind its data."""
-        if self._service is not None:
-            behind = self._service.session.backlog / BACKLOG
-            self._rounds.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
+        behind = self._service.session.backlog / BACKLOG if self._service is not None else 1.0
+        self._rounds.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
 
     def _round(self) -> Iterator[None]:
         """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
-        assert self._service is not None
-        assert self._speaker is not None
-        yield from self._take_in(self._service)
+        if self._service is not None:
+            yield from self._take_in(self._service)
         while self._recorder is not None and self._recorder.write(WRITTEN):
             yield
-        now = time.monotonic()
-        if now >= self._report_at:
-            self._report_at = max(self._report_at, now - ROUND_SECONDS) + REPORT_SECONDS
-            yield from self._report(self._service, self._speaker)
-        yield from self._work(self._service)
+        self._report_if_due()
+        yield
+        if self._service is not None:
+            yield from self._work(self._service)
 
     def _take_in(self, service: Service) -> Iterator[None]:
         """Gives the service what has arrived since the last round, topic by topic."""
-        waiting = self._intake.take()
+        waiting, neighbours = self._intake.take(), self._neighbours
+        if neighbours is None:
+            return
         for topic, publishers in self.publisher_counts().items():
-            self._neighbours.count(topic, publishers)
+            neighbours.count(topic, publishers)
         yield
-        if not self._active or self._neighbours.paused:
+        if not self._active or neighbours.paused:
             return
         for items in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
             service.push_all(items)
@@ -225,20 +292,38 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _work(self, service: Service) -> Iterator[None]:
         """Works on what was taken in, until that is done or the round lasts too long."""
         for outputs in service.pieces() if self._active else [service.idle()]:
-            for output in outputs:
-                self._put(output)
+            self._put(outputs)
             yield
             if self._rounds.overdue or not self._active:
                 return
 
-    def _put(self, output: Output) -> None:
-        if output.topic == "event":
-            self._log(output.level, output.text)
-        elif self._service is None or self._speaker is None or self._speaker.silent:
+    def _put(self, outputs: list[Output]) -> None:
+        """Publishes what the service hands out, and tells its events."""
+        for output in outputs:
+            if output.topic == "event":
+                self._log(output.level, output.text)
+            elif self._service is not None and not self._speaker.silent and output.topic in messages.RESULTS:
+                self._send(output.topic, messages.RESULTS[output.topic](output, self._id, self._service.boot_id))
+        if self._service is not None and self._service.approval != self.get_parameter("approval").value:
+            self._read_back({"approval": self._service.approval})
+
+    def _send(self, topic: str, fields: messages.Message) -> None:
+        """Publishes a message, with the time by the node's clock where it has a field for it."""
+        published = {"published": self._now()} if topic in messages.PUBLISHED else {}
+        self._speaker.publish(topic, {**fields, **published})
+
+    def _now(self) -> messages.Message:
+        stamp = self.get_clock().now().to_msg()
+        return {"sec": stamp.sec, "nanosec": stamp.nanosec}
+
+    def _claim_topic(self) -> None:
+        """Looks after the topic of parameter sets; once it is ours, says what is in force."""
+        if not self._speaker.step(self._active) or self._service is None:
             return
-        elif output.topic in messages.RESULTS:
-            fields = messages.RESULTS[output.topic](output, self._id, self._service.boot_id)
-            self._speaker.publish(output.topic, fields)
+        if self._service.published is not None:
+            self._put([Publish("parameters", self._service.published)])
+        elif self._service.session.active_set.in_force is None:
+            self._send("parameters", messages.no_set(self._id, self._service.boot_id))
 
     def _log(self, level: str, text: str) -> None:
         """One call a level: rclpy remembers the level of each line of code and refuses another."""
@@ -250,30 +335,33 @@ class IdentifyNode(PollingNode, LifecycleNode):
         else:
             log.error(text)
 
-    def _report(self, service: Service, speaker: Speaker) -> Iterator[None]:
-        """Once a second: status, health, and who else publishes inputs or the parameter sets of our vehicle."""
-        deaf = speaker.deaf()
-        yield
-        self._neighbours.look(deaf)
-        yield
-        if speaker.step(self._active) and service.published is not None:
-            self._put(Publish("parameters", service.published))
-        self._neighbours.note(speaker.ours, speaker.problem)
-        yield
-        health = service.health()
-        fields = messages.fit_status(health.status, self._id, health.fit_seconds)
-        if "no rotor speeds" in fields["reason"]:
-            fields["reason"] += f"; here: {self._hint}"
-        speaker.publish("status", fields)
-        yield
-        notes, hints = dict(self._neighbours.notes), self._intake.troubles()
-        stamp = self.get_clock().now().to_msg()
-        now = {"sec": stamp.sec, "nanosec": stamp.nanosec}
-        report = messages.diagnostics(health, self.get_fully_qualified_name(), self._id, now, notes, hints)
-        speaker.publish("diagnostics", report)
+    def _report_if_due(self) -> None:
+        """Once a second, in every state: status, health, who else publishes inputs or parameter sets of our vehicle."""
+        now = time.monotonic()
+        if now < self._report_at:
+            return
+        self._report_at = max(self._report_at, now - ROUND_SECONDS) + REPORT_SECONDS
+        name, idle = self.get_fully_qualified_name(), ""
+        if not self._active:
+            idle = f"{self._state}: {IDLE.get(self._state, 'changes its state').format(name=name)}"
+        status, health, notes = messages.idle_status(self._id, idle), None, dict[str, str]()
+        if self._service is not None and self._neighbours is not None:
+            self._neighbours.look(self._speaker.deaf())
+            self._claim_topic()
+            self._neighbours.note(self._speaker.ours, self._speaker.problem)
+            notes, health = dict(self._neighbours.notes), self._service.health()
+            if self._active:
+                status = messages.fit_status(health.status, self._id, health.fit_seconds)
+            if "no rotor speeds" in status["reason"]:
+                status["reason"] += f"; here: {self._hint}"
+            status["in_force"] = health.status.in_force
+        self._send("status", status)
+        hints = self._intake.troubles()
+        report = messages.diagnostics(health, name, self._id, self._now(), notes, hints, idle, self._problem)
+        self._send("diagnostics", report)
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:
-        if self._service is None:
+        if self._service is None or self._reads_back:
             return SetParametersResult(successful=True)
         problem = next(filter(None, (check_change(change.name, change.value) for change in changes)), "")
         decided = [change.value for change in changes if change.name == "approval" and not problem]

@@ -53,10 +53,18 @@ PARAMETERS: tuple[NodeParameter, ...] = (
     P("record", "", "MCAP file to record what arrives to; 'quadid replay --as-recorded' repeats the run bit for bit."),
     P("observer", False, "Keep no history and publish nothing: for a second node on one vehicle."),
     P("autostart", True, "Configure and activate without a lifecycle manager."),
+    P(
+        "warm_up",
+        300.0,
+        "[s] until fits can begin, else configure fails; a first start compiles.",
+        (0.0, 3600.0),
+    ),
     P("ground_worker", "", "Zenoh locator or configuration file where a 'quadid worker' fits for this node; '': none."),
     P("worker_memory", 1000, "[MiB] most memory of the fit process; 0: no limit.", (0, 65536)),
 )
 """Every parameter of the node."""
+READ_BACK = ("vehicle_id", "history", "approval")
+"""Parameters that read, while the node is configured, what is in force in place of what was given."""
 
 
 def as_declared(parameter: NodeParameter, value: Any) -> Any:

@@ -111,6 +111,11 @@ class Service:
         return self._publication.in_force
 
     @property
+    def approval(self) -> str:
+        """Approval in force: ``auto`` or ``manual``; a rollback, or a decision of an earlier run, changes it."""
+        return self.session.active_set.approval
+
+    @property
     def history(self) -> Path | None:
         """File of the history; None: none is kept."""
         return self._store.path if self._store is not None else None

@@ -1,10 +1,11 @@
-"""The node's publishers: candidates, findings, status, health; and parameter sets while the topic is ours."""
+"""The node's publishers: status and diagnostics always; results; parameter sets while the topic is ours."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-from rclpy.duration import Infinite
+from rclpy.duration import Duration, Infinite
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import (
     DurabilityPolicy,
@@ -28,6 +29,14 @@ USUAL_QOS = QoSProfile(
 LATCHED_QOS = QoSProfile(
     depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
 )  # fmt: skip
+LEASE = 5.0
+"""A service that asserts its liveliness on the parameter topic for longer than this [s] no more is dead or hangs."""
+PARAMETERS_QOS = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, deadline=Infinite,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC, liveliness_lease_duration=Duration(seconds=LEASE),
+)  # fmt: skip
+ALWAYS = ("status", "diagnostics")
+"""Topics that speak in every state of the life cycle."""
 LATCHED = ("diagnosis", "vehicle_health")
 """Topics whose last message is for late joiners too, as is that of the parameters."""
 
@@ -39,25 +48,23 @@ class Speaker:
         ours: full name of the topic of parameter sets.
     """
 
-    def __init__(self, node: LifecycleNode, observer: bool) -> None:
-        """Makes the publishers.
-
-        Args:
-            node: whose they are.
-            observer: publish status and health only.
-        """
+    def __init__(self, node: LifecycleNode) -> None:
+        """Publishes status and diagnostics of `node`."""
         self._node = node
         self.ours = node.resolve_topic_name(TOPICS["parameters"][0])
-        self._publishers = {
-            topic: self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS)
-            for topic in TOPICS
-            if topic != "parameters"
-        }
+        self._publishers = {topic: self._create(topic, USUAL_QOS, node.create_publisher) for topic in ALWAYS}
         self._claim: Claim | None = None
+
+    def open(self, observer: bool) -> None:
+        """Offers the results too; an observer none of them."""
+        managed = self._node.create_lifecycle_publisher
+        for topic in TOPICS.keys() - {"parameters", *ALWAYS}:
+            self._publishers[topic] = self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS, managed)
         if not observer:
             self._claim = Claim(
-                lambda: node.count_publishers(self.ours), self._kin, self._claimed, node.destroy_lifecycle_publisher
-            )
+                lambda: self._node.count_publishers(self.ours), self._kin, self._claimed,
+                self._node.destroy_lifecycle_publisher,
+            )  # fmt: skip
 
     @property
     def silent(self) -> bool:
@@ -71,7 +78,11 @@ class Speaker:
 
     def step(self, wanted: bool = True) -> bool:
         """Looks who else publishes parameter sets; True when the topic has just become ours, if it is `wanted`."""
-        return self._claim is not None and self._claim.step(wanted)
+        if self._claim is None:
+            return False
+        if self._claim.publisher is not None:
+            self._claim.publisher.assert_liveliness()
+        return self._claim.step(wanted)
 
     def publish(self, topic: str, fields: Message) -> None:
         """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
@@ -94,18 +105,16 @@ class Speaker:
         return any(qos_check_compatible(offered, wish)[0] == QoSCompatibility.ERROR for wish in asked)
 
     def close(self) -> None:
-        """Takes all publishers away."""
+        """Takes the publishers of results away."""
         if self._claim is not None:
             self._claim.let_go()
-        for publisher in self._publishers.values():
-            self._node.destroy_lifecycle_publisher(publisher)
-        self._publishers.clear()
+            self._claim = None
+        for topic in self._publishers.keys() - {*ALWAYS}:
+            self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
 
-    def _create(self, topic: str, qos: Any) -> Any:
+    def _create(self, topic: str, qos: Any, create: Callable[..., Any]) -> Any:
         name, kind = TOPICS[topic]
-        return self._node.create_lifecycle_publisher(
-            message_class(kind), name, qos, event_callbacks=NO_PUBLISHER_EVENTS
-        )
+        return create(message_class(kind), name, qos, event_callbacks=NO_PUBLISHER_EVENTS)
 
     def _kin(self) -> int:
         """Publishers of parameter sets that belong to a node of our name: services of this vehicle, this one too."""
@@ -113,6 +122,6 @@ class Speaker:
         return sum(info.node_name == self._node.get_name() for info in found)
 
     def _claimed(self) -> Any:
-        publisher = self._create("parameters", LATCHED_QOS)
+        publisher = self._create("parameters", PARAMETERS_QOS, self._node.create_lifecycle_publisher)
         publisher.on_activate(None)  # made after the node's own activation
         return publisher

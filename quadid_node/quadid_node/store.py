@@ -142,7 +142,8 @@ class Store:
         last = newest("state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
         if last is not None:
             told = newest("state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC")
-            last = replace(last, outdated=told.outdated if told is not None else last.outdated)
+            told = told or last
+            last = replace(last, outdated=told.outdated, outdated_code=told.outdated_code)
         approved = newest("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
         first = newest("state = 'accepted' ORDER BY rowid")
         for item in (first, approved, last):

@@ -121,6 +121,20 @@ class Ear:
         """Subscribes; what comes is in the returned list."""
         return self.on(topic, kind, self.heard.setdefault(topic, []).append, qos, raw)
 
+    def sets(self, topic: str = "quadid/parameters") -> list[Any]:
+        """Subscribes to parameter sets, latched; that nothing is in force yet is left out."""
+        from quadid_msgs.msg import ParameterSet
+        from quadid_node.speaker import LATCHED_QOS
+
+        heard: list[Any] = []
+
+        def take(message: Any) -> None:
+            if message.state != ParameterSet.STATE_NONE:
+                heard.append(message)
+
+        self.on(topic, ParameterSet, take, LATCHED_QOS)
+        return heard
+
     def on(self, topic: str, kind: Any, callback: Callable[[Any], Any], qos: Any = 10, raw: bool = False) -> list[Any]:
         """Subscribes with a callback."""
         self.node.create_subscription(kind, topic, callback, qos, raw=raw)

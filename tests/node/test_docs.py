@@ -21,8 +21,10 @@ PAGES = ("online", "using-with-ros", "using-with-px4", "using-with-ardupilot")
 
 def commands(page: str) -> list[list[str]]:
     """Lines of the code blocks, as a shell would split them."""
-    blocks = re.findall(r"```\n(.*?)```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.S)
-    lines = [line for block in blocks for line in block.splitlines() if not line.startswith(" ")]
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.S | re.M)
+    lines = [
+        line for language, block in blocks if not language for line in block.splitlines() if not line.startswith(" ")
+    ]
     return [shlex.split(line, comments=True) for line in lines]
 
 

@@ -41,7 +41,7 @@ def test_silence_rivals_and_strangers_on_the_topics(log: Path, tmp_path: Path, e
     with node(tmp_path / "h.sqlite") as identify:
         health = ear.listen("/diagnostics", DiagnosticArray)
         status = ear.listen("quadid/status", FitStatus)
-        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        sets = ear.sets()
         identify.wait_for("ready", 120.0)
         with player(log, 1.0) as vehicle:
             assert ear.until(lambda: sets, 60.0), identify.text
@@ -61,7 +61,7 @@ def test_silence_rivals_and_strangers_on_the_topics(log: Path, tmp_path: Path, e
         levels = [next(s.level for s in h.status if s.name.endswith("inputs")) for h in health[first:]]
         assert WARN in levels[: levels.index(ERROR)], "first a warning, then an error"
         with Ear() as late:
-            again = late.listen("quadid/parameters", ParameterSet, latched())
+            again = late.sets()
             assert late.until(lambda: again, 20.0)
             assert list(again[0].values) == list(held.values)
         with player(log, 2.0) as vehicle:
@@ -99,7 +99,7 @@ def test_a_power_cut_in_flight_and_signals_while_it_starts(
     from quadid_msgs.msg import ParameterSet
 
     history = tmp_path / "h.sqlite"
-    sets = ear.listen("quadid/parameters", ParameterSet, latched())
+    sets = ear.sets()
     with node(history) as identify:
         identify.wait_for("ready", 120.0)
         with player(log, 2.0) as vehicle:

@@ -141,6 +141,9 @@ def test_a_set_carries_its_mass_whether_it_is_out_of_date_and_what_is_unreliable
     item = replace(online_set(TRUE), mass=1.3, outdated="mass +15 % since", start=1.7e9, stop=1.7e9 + 30.25)
     told = messages.parameter_set(item, "quad1", "ab" * 16)
     assert (told["mass"], told["out_of_date"], told["out_of_date_reason"]) == (1.3, True, "mass +15 % since")
+    assert told["out_of_date_code"] == "unknown_cause", "a set of a version that noted no code"
+    assert messages.parameter_set(replace(item, outdated_code="mass_change"), "q")["out_of_date_code"] == "mass_change"
+    assert messages.parameter_set(replace(item, outdated=""), "q")["out_of_date_code"] == ""
     assert told["boot_id"] == "ab" * 16
     assert told["window_end"] == {"sec": 1_700_000_030, "nanosec": 250_000_000}
     assert set(messages.STATUSES) >= {s.value for s in Status}

@@ -51,7 +51,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
         status = ear.listen("quadid/status", FitStatus)
         health = ear.listen("/diagnostics", DiagnosticArray)
-        assert ear.until(lambda: status, 90.0), identify.text
+        identify.wait_for("ready", 120.0)
         with player(log, SPEED) as vehicle:
             assert ear.until(lambda: any(c.state == ParameterSet.STATE_ACCEPTED for c in candidates), 60.0), (
                 identify.text
@@ -86,7 +86,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     assert len(replayed) - len(live) <= 1, "the run was stopped while its last fit ran, if at all"
 
     with node(history) as restarted:
-        stale = ear.listen("quadid/parameters", ParameterSet, latched())
+        stale = ear.sets()
         assert ear.until(lambda: stale, 90.0), restarted.text
         assert stale[-1].state == ParameterSet.STATE_STALE
         assert list(stale[-1].values) == list(accepted.values)
@@ -113,7 +113,7 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
         return ear.call("quadid/set_parameters", SetParameters, request).results[0]
 
     with node(tmp_path / "h.sqlite", approval="manual") as identify:
-        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        sets = ear.sets()
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
         answer = ear.call("quadid/approve", Approve, seconds=90.0)
         assert not answer.success
@@ -150,18 +150,21 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
 
 def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: Ear) -> None:
     from quadid_msgs.msg import ParameterSet
+    from rcl_interfaces.srv import GetParameters
     from std_srvs.srv import Trigger
 
     path = tmp_path / "long.mcap"
     write_mcap(path, flight(60.0, 6).recording)
     with node(tmp_path / "h.sqlite") as identify:
-        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        sets = ear.sets()
         identify.wait_for("ready", 120.0)
         with player(path, SPEED):
             assert ear.until(lambda: len(sets) >= 2, 60.0), identify.text
             before = sets[-2]
             assert ear.call("quadid/rollback", Trigger).success
             assert ear.until(lambda: sets[-1].state == ParameterSet.STATE_ROLLED_BACK, 10.0)
+            reads = ear.call("quadid/get_parameters", GetParameters, GetParameters.Request(names=["approval"]))
+            assert reads.values[0].string_value == "manual", "as the rollback made it"
         assert list(sets[-1].values) == list(before.values)
         assert sets[-1].sequence > sets[-2].sequence
         assert sets[-1].approved_by == "ros service"
@@ -171,7 +174,6 @@ def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: E
 
 
 def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
-    from quadid_msgs.msg import ParameterSet
 
     heavy = (("mass_change", "time", 0.0), ("mass_change", "fraction", 0.2))
     logs = {}
@@ -180,7 +182,7 @@ def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
         write_mcap(logs[name], flight(14.0, 6, "excited", effects).recording)
     history = tmp_path / "h.sqlite"
     with Ear() as ear, node(history, "quad1") as first, node(history, "quad2") as second:
-        sets = {n: ear.listen(f"/{n}/quadid/parameters", ParameterSet, latched()) for n in logs}
+        sets = {n: ear.sets(f"/{n}/quadid/parameters") for n in logs}
         for started in (first, second):
             started.wait_for("ready", 120.0)
         with player(logs["quad1"], 1.0, "quad1"), player(logs["quad2"], 1.0, "quad2"):
@@ -277,7 +279,7 @@ def test_a_killed_fit_process_is_replaced_and_the_set_comes(
     from quadid_msgs.msg import ParameterSet
 
     with node(tmp_path / "h.sqlite") as identify:
-        sets = ear.listen("quadid/parameters", ParameterSet, latched())
+        sets = ear.sets()
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
         health = ear.listen("/diagnostics", DiagnosticArray)
         identify.wait_for("ready", 120.0)

@@ -24,7 +24,7 @@ def test_a_set_comes_from_references_through_the_stabiliser(tmp_path: Path, ear:
     with node(tmp_path / "h.sqlite", vehicle=vehicle) as identify:
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
         status = ear.listen("quadid/status", FitStatus)
-        assert ear.until(lambda: status, 90.0), identify.text
+        identify.wait_for("ready", 120.0)
         with player(log, 2.0):
             accepted = ear.until(lambda: any(c.state == ParameterSet.STATE_ACCEPTED for c in candidates), 90.0)
         assert accepted, [c.reason for c in candidates] or status[-1].reason

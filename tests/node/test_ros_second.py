@@ -14,7 +14,6 @@ from quadid_node.store import Store
 
 from tests.faults.evidence import Happened
 from tests.node.peers import Ear, node
-from tests.node.test_ros_node import latched
 from tests.online.test_gate import TRUE, online_set
 
 pytestmark = pytest.mark.usefixtures("ros")
@@ -42,10 +41,9 @@ def speakers(ear: Ear) -> set[tuple[int, ...]]:
 def test_a_second_service_with_a_history_of_its_own_observes_and_takes_over(
     tmp_path: Path, ear: Ear, happened: Happened
 ) -> None:
-    from quadid_msgs.msg import ParameterSet
 
     paths = [history_with(tmp_path / f"{k}.sqlite", b, 10 * k) for k, b in ((1, 2.3e-5), (2, 2.4e-5))]
-    sets = ear.listen("quadid/parameters", ParameterSet, latched())
+    sets = ear.sets()
     with node(paths[0]) as first:
         first.wait_for("ready", 240.0)
         assert ear.until(lambda: sets, 20.0), first.text

@@ -76,7 +76,7 @@ def test_a_set_known_to_be_out_of_date_is_still_so_after_two_restarts(tmp_path: 
         assert sets.in_force is not None
         assert bool(sets.in_force.outdated) == (run > 0)
         store.numbered(sets.in_force)
-        for action in sets.withdraw("mass +15 %"):
+        for action in sets.withdraw("mass +15 %", "mass_change"):
             assert isinstance(action, Publish)
             store.numbered(action.item)
         store.close()

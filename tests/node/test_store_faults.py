@@ -195,7 +195,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     stale = service.session.active_set.in_force
     assert stale is not None
     confirmed = replace(stale, state=SetState.ACCEPTED, approved_by="auto", sequence=stale.sequence + 1)
-    withdrawn = replace(confirmed, sequence=stale.sequence + 2, outdated="thrust stepped")
+    withdrawn = replace(confirmed, sequence=stale.sequence + 2, outdated="thrust stepped", outdated_code="thrust_drop")
     store.numbered(confirmed)
     store.numbered(withdrawn)
     assert store.flush(10.0)
@@ -215,6 +215,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     assert (restored.baseline.sequence, restored.baseline.approved_by) == (1000, "ann")
     assert restored.item is not None
     assert (restored.item.sequence, restored.item.outdated) == (withdrawn.sequence, "thrust stepped")
+    assert restored.item.outdated_code == "thrust_drop"
     assert [flight.name for flight in restored.healthy] == [TRIM.name]
     happened(24, "history damaged in service: mode, approved set, withdrawal and healthy flights are in the new one")
 

@@ -45,7 +45,7 @@ def test_a_rollback_after_a_change_brings_no_set_from_before_it_back_as_good(by:
     sets = ActiveSet("auto")
     sets.accept(online_set(TRUE), "auto", 1.0, 1.0)
     sets.accept(online_set({**TRUE, "b": 2.34e-5}), "auto", 2.0, 2.0)
-    sets.withdraw("mass +15 %")
+    sets.withdraw("mass +15 %", "mass_change")
     action = sets.roll_back(3.0, by).actions[0]
     assert isinstance(action, Publish)
     assert (action.item.parameters["b"].value, action.item.outdated) == (TRUE["b"], "mass +15 %")
@@ -227,15 +227,16 @@ TestMachine = Machine.TestCase
 
 def test_a_set_known_to_be_out_of_date_says_so_once_under_a_number_of_its_own() -> None:
     sets = ActiveSet("manual")
-    assert sets.withdraw("mass changed") == [], "there is nothing to withdraw"
+    assert sets.withdraw("mass changed", "mass_change") == [], "there is nothing to withdraw"
     sets.accept(online_set(TRUE), "ann", 1.0, 1.0)
     before = sets.in_force
     assert before is not None
-    (action,) = sets.withdraw("mass changed")
+    (action,) = sets.withdraw("mass changed", "mass_change")
     assert isinstance(action, Publish)
     assert (action.item.outdated, action.item.state) == ("mass changed", SetState.ACCEPTED)
+    assert action.item.outdated_code == "mass_change"
     assert action.item.sequence > before.sequence
-    assert sets.withdraw("again") == []
+    assert sets.withdraw("again", "mass_change") == []
     sets.accept(online_set(TRUE), "ann", 2.0, 2.0)
     assert sets.in_force is not None
     assert not sets.in_force.outdated
