@@ -43,13 +43,12 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
 ) -> None:
     """Vehicle, node, recorder; a controller that comes late; the recording replayed; a restart."""
     from diagnostic_msgs.msg import DiagnosticArray
-    from quadid_msgs.msg import FitStatus, ParameterSet
+    from quadid_msgs.msg import ParameterSet
     from quadid_msgs.srv import GetHistory
 
     history, recorded = tmp_path / "h.sqlite", tmp_path / "recorded.mcap"
     with node(history, record=recorded) as identify:
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
-        status = ear.listen("quadid/status", FitStatus)
         health = ear.listen("/diagnostics", DiagnosticArray)
         identify.wait_for("ready", 120.0)
         with player(log, SPEED) as vehicle:
