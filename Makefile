@@ -80,9 +80,12 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: autopilot peers health health-hours truth cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
+
+filter-error: venv ## the filter-error estimator beside today's fit: coverage, recorded vehicles, a fast loop, speed (an hour)
+	$(STUDY) studies.filter_error --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
 	$(STUDY) studies.cases

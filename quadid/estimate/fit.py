@@ -1,0 +1,173 @@
+"""Filter-error estimation: swarm on innovations, Fisher scoring with frozen gains, noise numbers by the full filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.estimate import kalman as k
+from quadid.estimate.kalman import Gains
+from quadid.estimate.problem import Problem
+from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
+
+BOLD = 1.5
+"""Longest step of a logarithm: less than a factor of five."""
+NEAR, MOST = 4, 40
+"""Steps with random forces held large, and most steps after that."""
+ENOUGH = 0.1
+"""Gain in -2 ln L that no step is worth taking for."""
+CHANCE = 4.0
+"""Standard errors of the kurtosis beyond which innovations have outliers."""
+PATIENCE = 8
+"""Times a step is shortened before the search ends."""
+STALE = 0.2
+"""Change of a noise number's logarithm after which the information is taken anew."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Where the likelihood is largest.
+
+    Attributes:
+        problem: what was estimated.
+        z: scaled parameters, shape (P,).
+        psi: noise numbers, shape (N_NOISE,).
+        covariance: of the scaled parameters, (P, P).
+        objective: -2 ln of likelihood and prior.
+        whitened: innovations over their standard deviations, a (n, M) array a flight; 0 where not measured.
+    """
+
+    problem: Problem
+    z: FloatArray
+    psi: FloatArray
+    covariance: FloatArray
+    objective: float
+    whitened: tuple[FloatArray, ...]
+
+    def value(self, name: str, flight: int = -1) -> tuple[float, float]:
+        """Value of a parameter and its standard deviation: relative for the nominal six, else in its unit."""
+        for i, (entry, place, where) in enumerate(self.problem.entries):
+            if entry == name and where in (-1, flight):
+                sigma = float(np.sqrt(self.covariance[i, i]))
+                if place < k.TRIM:
+                    return float(np.exp(self.z[i])), sigma
+                return float(self.z[i] * self.problem.size[i]), sigma * float(self.problem.size[i])
+        raise KeyError(name)
+
+
+def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: int = 30) -> Estimate:
+    """Parameters, noise and random forces of the flights of a problem.
+
+    Args:
+        problem: the flights and what is free.
+        seed: of the swarm.
+        particles: its size.
+        iterations: of it; without any the search starts from the guess.
+    """
+    z, psi = problem.start(), problem.first_noise()
+    # 1. Search with random forces held large, so that no flight diverges from a bad guess.
+    if iterations > 0:
+        z = swarm_search(problem, z, psi, particles, iterations, seed)
+    z, _, _, _ = scoring(problem, z, psi, NEAR, noise=False)
+    problem, z = problem.based_on(z)
+    # 2. Let them shrink: noise and physics together, until the likelihood stays.
+    z, psi, value, gains = scoring(problem, z, psi, MOST)
+    information, _, left = problem.normal_equations(z, psi, gains)
+    # 3. Where innovations have outliers, their density has tails.
+    tail = tails(left)
+    if np.any(tail > 0.0):
+        problem = replace(problem, tail=tail)
+        z, psi, value, gains = scoring(problem, z, psi, MOST)
+        information, _, left = problem.normal_equations(z, psi, gains)
+    # 4. Intervals from the information of this likelihood.
+    return Estimate(problem, z, psi, np.asarray(np.linalg.inv(information)), value, tuple(left))
+
+
+def tails(whitened: Sequence[FloatArray]) -> FloatArray:
+    """1 / degrees of freedom of the Student-t density of each group of innovations, shape (4,), by their kurtosis.
+
+    A Student-t density has kurtosis 3 + 6 / (k - 4); what chance alone makes of a Gaussian's counts as none.
+    """
+    out = np.zeros(4)
+    for group in range(4):
+        z = np.concatenate([w[:, 3 * group : 3 * group + 3] for w in whitened])
+        z = z[z[:, 0] != 0.0]
+        if len(z):
+            excess = float(np.mean(np.mean(z**4, axis=0) / np.mean(z**2, axis=0) ** 2)) - 3.0
+            if excess > CHANCE * np.sqrt(24.0 / z.size):
+                out[group] = 1.0 / (4.0 + 6.0 / excess)
+    return out
+
+
+def swarm_search(
+    problem: Problem, z: FloatArray, psi: FloatArray, particles: int, iterations: int, seed: int
+) -> FloatArray:
+    """Particle swarm over the nominal six; gains are renewed at the best particle, innovations under them compared."""
+    low, high = np.log(problem.vehicle.bounds).T
+    six = [i for i, (name, _, _) in enumerate(problem.entries) if name in NOMINAL_NAMES]
+    rounds = 2
+    for turn in range(rounds):
+        _, gains = problem.passes(z, psi)
+        guess = np.clip(z[six], low, high)[None]
+        options = SwarmOptions(iterations=iterations // rounds, initial_points=guess)
+        swarm = Swarm(low, high, particles, seed + turn, options)
+        while swarm.stop is Stop.RUNNING:
+            points = swarm.ask()
+            many = np.repeat(z[None], len(points), axis=0)
+            many[:, six] = points
+            swarm.tell(problem.replayed(many, psi, gains))
+        z = z.copy()
+        z[six] = swarm.best
+    return z
+
+
+def scoring(
+    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: bool = True
+) -> tuple[FloatArray, FloatArray, float, list[Gains]]:
+    """Fisher scoring of physics and noise, whose information has no common part.
+
+    Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms by the exact
+    score of the full filter.  Gains are renewed after every step; one that does not help is damped
+    (Levenberg-Marquardt).
+
+    Returns:
+        Scaled parameters, noise numbers, objective, gains there.
+    """
+    low, high = np.log(problem.noise_bounds.T)
+    value, gains = problem.passes(z, psi)
+    curvature, at, damping = np.eye(len(psi)), np.full(len(psi), np.inf), 0.0
+    for _ in range(turns):
+        information, gradient, _ = problem.normal_equations(z, psi, gains)
+        log, slope, free = np.log(psi), np.zeros(len(psi)), np.zeros(len(psi), dtype=np.bool_)
+        if noise:
+            slope = problem.score(z, psi, gains) * psi
+            if np.max(np.abs(log - at)) > STALE:
+                curvature, at = 2.0 * problem.noise_information(z, psi) + np.diag(problem.noise_curvature(psi)), log
+            # What rests on a bound and would go beyond stays there.
+            free = ~(((log <= low) & (slope > 0.0)) | ((log >= high) & (slope < 0.0)))
+        for _ in range(PATIENCE):
+            step, bold = _damped(information, gradient, damping), np.zeros(len(psi))
+            bold[free] = _damped(curvature[np.ix_(free, free)], slope[free], damping)
+            expected = -float(gradient @ step) - 0.5 * float(slope @ bold)
+            moved, changed = z + step, np.exp(np.clip(log + bold, low, high))
+            better, renewed = problem.passes(moved, changed)
+            if better < value or expected < ENOUGH:
+                break
+            damping = max(4.0 * damping, 0.1)
+        if not better < value:
+            break
+        damping = 0.25 * damping if damping > 0.02 else 0.0
+        z, psi, value, gains = moved, changed, better, renewed
+        if expected < ENOUGH:
+            break
+    return z, psi, value, gains
+
+
+def _damped(curvature: FloatArray, slope: FloatArray, damping: float) -> FloatArray:
+    """Levenberg-Marquardt step, no longer than `BOLD` in any direction."""
+    step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), slope)
+    return np.asarray(step * min(1.0, BOLD / float(np.max(np.abs(step), initial=BOLD))))

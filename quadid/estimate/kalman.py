@@ -1,0 +1,784 @@
+"""Extended Kalman filter of a multirotor with random forces: likelihood, frozen-gain innovations, smoother and score.
+
+The random specific force f and angular acceleration alpha, and the attitude estimator's error e, are first-order
+Gauss-Markov processes.  With x = (q, omega, v, f, alpha, e), body axes but for v, nu the innovations and S their
+covariance, the likelihood of physics p and noise psi is
+
+    -2 ln L = sum ln S + nu^2 / S                                                                             (1)
+
+over scalar measurements, each after those before it.  Where outliers are expected, nu^2 / S becomes the normalised
+Student-t density, and the same weight w = (k + 1) / (k + z^2) lowers the gain.
+
+One step:
+    q' = q (0, omega) / 2,  omega' = J^-1 (tau - omega x J omega) + tau_0 - damping omega + alpha             (2)
+    v' = R (F / m + f) + g                                                                                    (3)
+    a(t + h) = exp(-h / T) a(t) + w,  w ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
+    P <- F P F' + G Q G'                                                                                      (5)
+and for every scalar measurement y = h(x) + N(0, r):
+    S = H P H' + r,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
+backwards (Bryson & Frazier; de Jong 1989; no inverse of P, which random forces of size zero leave singular):
+    u = nu / S - K' l,  l <- l + H u,  D = 1 / S + K' N K,  N <- (I - K H)' N (I - K H) + H H' / S            (7)
+    l <- F' l,  N <- F' N F;   smoothed x = x + P l with covariance P - P N P                                 (8)
+and the score (Koopman & Shephard 1992, doi:10.1093/biomet/79.4.823):
+    d ln L / d r = (u^2 - D) / 2,  d ln L / d Q = G' (l l' - N) G / 2,  d ln L / d F = l x' - N F P           (9)
+
+Sources: Jategaonkar, *Flight Vehicle System Identification*, 2nd ed., ch. 5 (filter error); Maine & Iliff, NASA
+RP-1077 and RP-1138; Kristensen, Madsen & Jorgensen 2004, doi:10.1016/j.automatica.2003.10.001.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numba as nb
+import numpy as np
+
+from quadid.types import BoolArray, FloatArray
+
+# Error state: rotation vector, rate, velocity, random force, random angular acceleration, attitude error.
+TH, OM, VE, FO, AL, AE, N = 0, 3, 6, 9, 12, 15, 18
+# Mean: quaternion first, so everything after it lies one further.
+N_MEAN = N + 1
+# Scalar measurements: gyro, attitude (rotation vector), accelerometer, velocity.
+GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
+# Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], damping [1/s], centre of gravity
+# [m], how late rotor speeds act [s].
+B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, N_PHYSICS = (
+    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 20, 22, 23,
+)  # fmt: skip
+# Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
+# yaw), e (tilt, heading); correlation times of f, f, alpha, alpha, e [s].
+SIGMA, TIME, N_NOISE = M, M + 6, M + 11
+_GROUP = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5])
+"""Which standard deviation belongs to each Gauss-Markov state from FO on …"""
+_CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
+"""… and which correlation time."""
+# Rotor moments over all rotors: squares, squares times x, y, spin, speeds times spin, speeds.
+MOMENTS = 6
+GRAVITY = 9.80665
+STILL_TIME = 1.0
+"""Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
+_FAST: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+
+
+class Track(NamedTuple):
+    """One stretch of flight: what was measured when, and what the rotors did meanwhile.
+
+    Attributes:
+        t: times of measurements [s], shape (n,), rising.
+        y: gyro [rad/s], quaternion, accelerometer [m/s^2], velocity [m/s], shape (n, 13).
+        seen: whether each of the four was measured then, shape (n, 4).
+        half: half the time over which the accelerometer averages, centred on t [s].
+        piece_t: where the pieces begin on which rotor speeds are straight lines, shape (pieces,).
+        piece: integral up to there of each moment, and its polynomial from there, shape (pieces, MOMENTS, 4).
+        mass: [kg].
+        rotors: number of rotors.
+        still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
+    """
+
+    t: FloatArray
+    y: FloatArray
+    seen: BoolArray
+    half: float
+    piece_t: FloatArray
+    piece: FloatArray
+    mass: float
+    rotors: int
+    still: float
+
+
+class Gains(NamedTuple):
+    """What a filter pass leaves for innovations under its gains, for the smoother and for the score.
+
+    Attributes:
+        gain: K of each scalar measurement, shape (n, M, N).
+        nu, S, w: innovation, its variance (0: not measured), its weight, shapes (n, M).
+        slope: derivative of the accelerometer by rotation vector and velocity, shape (n, 3, 6).
+        mean: after the updates, shape (n, N_MEAN).
+        P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
+        table: rotor moments, see `moments`.
+    """
+
+    gain: FloatArray
+    nu: FloatArray
+    S: FloatArray
+    w: FloatArray
+    slope: FloatArray
+    mean: FloatArray
+    P: FloatArray
+    table: FloatArray
+
+
+@nb.njit(**_FAST)
+def _integrals(piece_t: FloatArray, piece: FloatArray, t: float, at: int, out: FloatArray) -> int:
+    """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on."""
+    while at > 0 and piece_t[at] > t:
+        at -= 1
+    while at + 1 < len(piece_t) and piece_t[at + 1] <= t:
+        at += 1
+    s = t - piece_t[at]
+    for m in range(MOMENTS):
+        out[m] = piece[at, m, 0] + s * (piece[at, m, 1] + s * (piece[at, m, 2] + s * piece[at, m, 3]))
+    return at
+
+
+@nb.njit(**_FAST)
+def moments(track: Track, delay: float) -> FloatArray:
+    """Mean rotor moments, shape (n, 3 MOMENTS): both halves of the step from each time; while the accelerometer reads.
+
+    Args:
+        track: the flight.
+        delay: by which rotor speeds act later than the log has them [s].
+    """
+    n = len(track.t)
+    out = np.zeros((n, 3 * MOMENTS))
+    a, b, c = np.empty(MOMENTS), np.empty(MOMENTS), np.empty(MOMENTS)
+    d, e = np.empty(MOMENTS), np.empty(MOMENTS)
+    at = _integrals(track.piece_t, track.piece, track.t[0] - delay, 0, a)
+    for k in range(n):
+        t = track.t[k] - delay
+        _integrals(track.piece_t, track.piece, t - track.half, at, d)
+        _integrals(track.piece_t, track.piece, t + track.half, at, e)
+        for m in range(MOMENTS):
+            out[k, 2 * MOMENTS + m] = (e[m] - d[m]) / (2.0 * track.half)
+        if k + 1 < n:
+            h = 0.5 * (track.t[k + 1] - track.t[k])
+            at = _integrals(track.piece_t, track.piece, t + h, at, b)
+            at = _integrals(track.piece_t, track.piece, t + 2.0 * h, at, c)
+            for m in range(MOMENTS):
+                out[k, m], out[k, MOMENTS + m] = (b[m] - a[m]) / h, (c[m] - b[m]) / h
+                a[m] = c[m]
+    return out
+
+
+@nb.njit(**_FAST)
+def _constants(p: FloatArray, track: Track) -> FloatArray:
+    """What Eqs. 2 and 3 need of the physics."""
+    c = np.empty(20)
+    hover = math.sqrt(track.mass * GRAVITY / track.rotors / p[B])
+    c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
+    c[4], c[5] = p[JR] / p[JX], p[JR] / p[JY]
+    c[6], c[7], c[8] = (p[JY] - p[JZ]) / p[JX], (p[JZ] - p[JX]) / p[JY], (p[JX] - p[JY]) / p[JZ]
+    c[9], c[10], c[11] = p[TRIM], p[TRIM + 1], p[TRIM + 2]
+    c[12], c[13] = p[DRAG] / (track.rotors * hover), p[DRAG + 1] / (track.rotors * hover)
+    c[14], c[15], c[16] = p[DAMP], p[DAMP + 1], p[DAMP + 2]
+    c[17], c[18] = p[CG], p[CG + 1]
+    return c
+
+
+@nb.njit(**_FAST)
+def _turning(c, s2, x2, y2, z2, o1, p, q, r):  # type: ignore[no-untyped-def]
+    """Eq. 2 without alpha: angular acceleration for these rotor moments and rates."""
+    return (
+        c[6] * q * r + c[1] * (c[18] * s2 - y2) + c[4] * o1 * q - c[14] * p + c[9],
+        c[7] * p * r + c[2] * (x2 - c[17] * s2) - c[5] * o1 * p - c[15] * q + c[10],
+        c[8] * p * q + c[3] * z2 - c[16] * r + c[11],
+    )
+
+
+@nb.njit(**_FAST)
+def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
+    """Body to world, row by row."""
+    return (
+        w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z,
+    )  # fmt: skip
+
+
+@nb.njit(**_FAST)
+def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
+    """Specific force of rotors and drag in body axes, and velocity there."""
+    r = _rotation(w, x, y, z)
+    u, v = r[0] * vn + r[3] * ve + r[6] * vd, r[1] * vn + r[4] * ve + r[7] * vd
+    return -c[12] * s1 * u, -c[13] * s1 * v, -c[0] * s2, u, v, r[2] * vn + r[5] * ve + r[8] * vd
+
+
+@nb.njit(**_FAST)
+def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """Eq. 3."""
+    r = _rotation(w, x, y, z)
+    ax, ay, az, _, _, _ = _force(c, s2, s1, w, x, y, z, vn, ve, vd)
+    ax, ay, az = ax + fx, ay + fy, az + fz
+    return (
+        r[0] * ax + r[1] * ay + r[2] * az, r[3] * ax + r[4] * ay + r[5] * az,
+        r[6] * ax + r[7] * ay + r[8] * az + GRAVITY,
+    )  # fmt: skip
+
+
+@nb.njit(**_FAST)
+def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
+    """Eq. 2: rate of the quaternion."""
+    return (
+        0.5 * (-x * p - y * q - z * r), 0.5 * (w * p + y * r - z * q), 0.5 * (w * q + z * p - x * r),
+        0.5 * (w * r + x * q - y * p),
+    )  # fmt: skip
+
+
+@nb.njit(**_FAST)
+def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bool, x: FloatArray) -> None:
+    """Eqs. 2 to 4 over one step: classical Runge-Kutta, rotor moments linear through their means over both halves.
+
+    Args:
+        c: see `_constants`.
+        row: of the table of moments.
+        h: step [s].
+        keep: exp(-h / T) of every Gauss-Markov state.
+        air: whether velocity plays a part.
+        x: mean, advanced in place.
+    """
+    half = 0.5 * h
+    s2, x2, y2 = 0.5 * (row[0] + row[MOMENTS]), 0.5 * (row[1] + row[MOMENTS + 1]), 0.5 * (row[2] + row[MOMENTS + 2])
+    z2, o1 = 0.5 * (row[3] + row[MOMENTS + 3]), 0.5 * (row[4] + row[MOMENTS + 4])
+    ds, dx, dy = row[0] - row[MOMENTS], row[1] - row[MOMENTS + 1], row[2] - row[MOMENTS + 2]
+    dz, do = row[3] - row[MOMENTS + 3], row[4] - row[MOMENTS + 4]
+    # Mean over the step of a Gauss-Markov process without its noise.
+    gx = 0.5 * (1.0 + keep[3]) * x[AL + 1]
+    gy = 0.5 * (1.0 + keep[4]) * x[AL + 2]
+    gz = 0.5 * (1.0 + keep[5]) * x[AL + 3]
+    qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
+    a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, p, q, r)
+    a1, b1, c1 = a1 + gx, b1 + gy, c1 + gz
+    k1 = _spin(qw, qx, qy, qz, p, q, r)
+    p2, q2, r2 = p + half * a1, q + half * b1, r + half * c1
+    a2, b2, c2 = _turning(c, s2, x2, y2, z2, o1, p2, q2, r2)
+    a2, b2, c2 = a2 + gx, b2 + gy, c2 + gz
+    w2, x2_, y2_, z2_ = qw + half * k1[0], qx + half * k1[1], qy + half * k1[2], qz + half * k1[3]
+    k2 = _spin(w2, x2_, y2_, z2_, p2, q2, r2)
+    p3, q3, r3 = p + half * a2, q + half * b2, r + half * c2
+    a3, b3, c3 = _turning(c, s2, x2, y2, z2, o1, p3, q3, r3)
+    a3, b3, c3 = a3 + gx, b3 + gy, c3 + gz
+    w3, x3, y3, z3 = qw + half * k2[0], qx + half * k2[1], qy + half * k2[2], qz + half * k2[3]
+    k3 = _spin(w3, x3, y3, z3, p3, q3, r3)
+    p4, q4, r4 = p + h * a3, q + h * b3, r + h * c3
+    a4, b4, c4 = _turning(c, s2 - ds, x2 - dx, y2 - dy, z2 - dz, o1 - do, p4, q4, r4)
+    a4, b4, c4 = a4 + gx, b4 + gy, c4 + gz
+    w4, x4, y4, z4 = qw + h * k3[0], qx + h * k3[1], qy + h * k3[2], qz + h * k3[3]
+    k4 = _spin(w4, x4, y4, z4, p4, q4, r4)
+    sixth = h / 6.0
+    if air:
+        s1 = 0.5 * (row[5] + row[MOMENTS + 5])
+        d1 = row[5] - row[MOMENTS + 5]
+        fx = 0.5 * (1.0 + keep[0]) * x[FO + 1]
+        fy = 0.5 * (1.0 + keep[1]) * x[FO + 2]
+        fz = 0.5 * (1.0 + keep[2]) * x[FO + 3]
+        n, e, d = x[VE + 1], x[VE + 2], x[VE + 3]
+        n1, e1, f1 = _falling(c, s2 + ds, s1 + d1, qw, qx, qy, qz, n, e, d, fx, fy, fz)
+        n2, e2, f2 = _falling(c, s2, s1, w2, x2_, y2_, z2_, n + half * n1, e + half * e1, d + half * f1, fx, fy, fz)
+        n3, e3, f3 = _falling(c, s2, s1, w3, x3, y3, z3, n + half * n2, e + half * e2, d + half * f2, fx, fy, fz)
+        n4, e4, f4 = _falling(c, s2 - ds, s1 - d1, w4, x4, y4, z4, n + h * n3, e + h * e3, d + h * f3, fx, fy, fz)
+        x[VE + 1] = n + sixth * (n1 + 2.0 * (n2 + n3) + n4)
+        x[VE + 2] = e + sixth * (e1 + 2.0 * (e2 + e3) + e4)
+        x[VE + 3] = d + sixth * (f1 + 2.0 * (f2 + f3) + f4)
+    qw += sixth * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0])
+    qx += sixth * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1])
+    qy += sixth * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2])
+    qz += sixth * (k1[3] + 2.0 * (k2[3] + k3[3]) + k4[3])
+    scale = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    x[0], x[1], x[2], x[3] = qw * scale, qx * scale, qy * scale, qz * scale
+    x[4] = p + sixth * (a1 + 2.0 * (a2 + a3) + a4)
+    x[5] = q + sixth * (b1 + 2.0 * (b2 + b3) + b4)
+    x[6] = r + sixth * (c1 + 2.0 * (c2 + c3) + c4)
+    for i in range(9):
+        x[FO + 1 + i] *= keep[i]
+
+
+@nb.njit(**_FAST)
+def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
+    """Writes y - h(x) of what was measured, shape (M,), a rotation vector of the attitude."""
+    for i in range(3):
+        out[GYRO + i] = y[i] - x[4 + i] - p[GYRO_BIAS + i]
+    if seen[1]:
+        w = x[0] * y[3] + x[1] * y[4] + x[2] * y[5] + x[3] * y[6]
+        a = x[0] * y[4] - x[1] * y[3] - x[2] * y[6] + x[3] * y[5]
+        b = x[0] * y[5] + x[1] * y[6] - x[2] * y[3] - x[3] * y[4]
+        e = x[0] * y[6] - x[1] * y[5] + x[2] * y[4] - x[3] * y[3]
+        sine = math.sqrt(a * a + b * b + e * e)
+        scale = (
+            (2.0 if w >= 0.0 else -2.0)
+            if sine < 1e-9
+            else 2.0 * math.atan2(sine, abs(w)) / sine * (1.0 if w >= 0.0 else -1.0)
+        )
+        out[ATTITUDE] = scale * a - x[AE + 1]
+        out[ATTITUDE + 1] = scale * b - x[AE + 2]
+        out[ATTITUDE + 2] = scale * e - x[AE + 3]
+    fx, fy, fz = 0.0, 0.0, -c[0] * row[2 * MOMENTS]
+    if air:
+        fx, fy, fz, _, _, _ = _force(
+            c, row[2 * MOMENTS], row[2 * MOMENTS + 5], x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3]
+        )
+    out[ACCEL] = y[7] - fx - x[FO + 1] - p[ACCEL_BIAS]
+    out[ACCEL + 1] = y[8] - fy - x[FO + 2] - p[ACCEL_BIAS + 1]
+    out[ACCEL + 2] = y[9] - fz - x[FO + 3] - p[ACCEL_BIAS + 2]
+    for i in range(3):
+        out[VELOCITY + i] = (y[10 + i] if seen[3] else 0.0) - x[VE + 1 + i]
+
+
+@nb.njit(**_FAST)
+def _correct(dx: FloatArray, x: FloatArray) -> None:
+    """X <- x + dx, the attitude by its rotation vector."""
+    a, b, e = 0.5 * dx[0], 0.5 * dx[1], 0.5 * dx[2]
+    square = a * a + b * b + e * e
+    sinc, cosine = 1.0 - square / 6.0 * (1.0 - square / 20.0), 1.0 - square / 2.0 * (1.0 - square / 12.0)
+    a, b, e = sinc * a, sinc * b, sinc * e
+    qw, qx, qy, qz = x[0], x[1], x[2], x[3]
+    w = qw * cosine - qx * a - qy * b - qz * e
+    i = qw * a + qx * cosine + qy * e - qz * b
+    j = qw * b - qx * e + qy * cosine + qz * a
+    k = qw * e + qx * b - qy * a + qz * cosine
+    scale = 1.0 / math.sqrt(w * w + i * i + j * j + k * k)
+    x[0], x[1], x[2], x[3] = scale * w, scale * i, scale * j, scale * k
+    for m in range(3, N):
+        x[m + 1] += dx[m]
+
+
+@nb.njit(**_FAST)
+def _start(track: Track, p: FloatArray) -> FloatArray:
+    """First mean: as first measured, level and at rest where nothing was; its covariance is wide."""
+    x = np.zeros(N_MEAN)
+    x[0] = 1.0
+    for group in range(4):
+        for k in range(len(track.t)):
+            if track.seen[k, group]:
+                if group == 0:
+                    x[4:7] = track.y[k, :3] - p[GYRO_BIAS : GYRO_BIAS + 3]
+                elif group == 1:
+                    x[:4] = track.y[k, 3:7]
+                elif group == 3:
+                    x[VE + 1 : VE + 4] = track.y[k, 10:13]
+                break
+    return x
+
+
+@nb.njit(**_FAST)
+def _keep(psi: FloatArray, h: float, keep: FloatArray) -> None:
+    for i in range(9):
+        keep[i] = math.exp(-h / psi[TIME + _CLOCK[i]])
+
+
+@nb.njit(**_FAST)
+def _cross(a, b, e, scale, row, col, F):  # type: ignore[no-untyped-def]
+    """Adds scale [(a, b, e)]x to a block of F."""
+    F[row, col + 1] -= scale * e
+    F[row, col + 2] += scale * b
+    F[row + 1, col] += scale * e
+    F[row + 1, col + 2] -= scale * a
+    F[row + 2, col] -= scale * b
+    F[row + 2, col + 1] += scale * a
+
+
+@nb.njit(**_FAST)
+def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-untyped-def]
+    """Writes F of Eq. 5, from a step's begin and end, and the rotation in its middle (3, 3)."""
+    F[:] = 0.0
+    p, q, r = 0.5 * (x[4] + after[4]), 0.5 * (x[5] + after[5]), 0.5 * (x[6] + after[6])
+    o1 = 0.5 * (row[4] + row[MOMENTS + 4])
+    A = (
+        (-c[14], c[6] * r + c[4] * o1, c[6] * q), (c[7] * r - c[5] * o1, -c[15], c[7] * p), (c[8] * q, c[8] * p, -c[16])
+    )  # fmt: skip
+    turned = (h * p, h * q, h * r)
+    square = turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2
+    for i in range(3):
+        F[TH + i, TH + i] = 1.0 - 0.5 * square
+        for j in range(3):
+            F[TH + i, TH + j] += 0.5 * turned[i] * turned[j]
+            F[TH + i, OM + j] = 0.5 * h * h * A[i][j]
+            F[OM + i, OM + j] = h * A[i][j]
+            F[OM + i, AL + j] = 0.25 * h * h * (1.0 + keep[3 + j]) * A[i][j]
+            for m in range(3):
+                F[OM + i, OM + j] += 0.5 * h * h * A[i][m] * A[m][j]
+        F[TH + i, OM + i] += h
+        F[OM + i, OM + i] += 1.0
+        F[OM + i, AL + i] += 0.5 * h * (1.0 + keep[3 + i])
+        F[TH + i, AL + i] = 0.25 * h * h * (1.0 + keep[3 + i])
+    _cross(turned[0], turned[1], turned[2], -1.0, TH, TH, F)
+    _cross(turned[0], turned[1], turned[2], -0.5 * h, TH, OM, F)
+    for i in range(9):
+        F[FO + i, FO + i] = keep[i]
+    if air:
+        w, a, b, e = x[0] + after[0], x[1] + after[1], x[2] + after[2], x[3] + after[3]
+        sign = 1.0 if w * x[0] + a * x[1] + b * x[2] + e * x[3] > 0.0 else -1.0
+        if sign < 0.0:
+            w, a, b, e = x[0] - after[0], x[1] - after[1], x[2] - after[2], x[3] - after[3]
+        scale = 1.0 / math.sqrt(w * w + a * a + b * b + e * e)
+        R = _rotation(scale * w, scale * a, scale * b, scale * e)
+        s2, s1 = 0.5 * (row[0] + row[MOMENTS]), 0.5 * (row[5] + row[MOMENTS + 5])
+        fx, fy, fz, u, v, down = _force(
+            c, s2, s1, scale * w, scale * a, scale * b, scale * e, 0.5 * (x[VE + 1] + after[VE + 1]),
+            0.5 * (x[VE + 2] + after[VE + 2]), 0.5 * (x[VE + 3] + after[VE + 3]),
+        )  # fmt: skip
+        fx, fy, fz = fx + x[FO + 1], fy + x[FO + 2], fz + x[FO + 3]
+        kx, ky = c[12] * s1, c[13] * s1
+        # d force / d rotation vector = -[force]x - k [velocity]x, in body axes.
+        B = ((0.0, fz + kx * down, -fy - kx * v), (-fz - ky * down, 0.0, fx + ky * u), (fy, -fx, 0.0))
+        for i in range(3):
+            for j in range(3):
+                turn[i, j] = R[3 * i + j]
+                F[VE + i, FO + j] = 0.5 * h * (1.0 + keep[j]) * R[3 * i + j]
+                F[VE + i, VE + j] = -h * (kx * R[3 * i] * R[3 * j] + ky * R[3 * i + 1] * R[3 * j + 1])
+                for m in range(3):
+                    F[VE + i, TH + j] += h * R[3 * i + m] * B[m][j]
+            F[VE + i, VE + i] += 1.0
+        for i in range(3):
+            for j in range(3):
+                F[VE + i, OM + j] = 0.5 * h * F[VE + i, TH + j]
+    else:
+        for i in range(3):
+            F[VE + i, VE + i] = 1.0
+
+
+@nb.njit(**_FAST)
+def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
+    """Writes the column of G in Eq. 5 of Gauss-Markov state i: its noise acts by half within the step."""
+    G[:] = 0.0
+    G[FO + i] = 1.0
+    if i < 3:
+        if air:
+            for j in range(3):
+                G[VE + j] = 0.5 * h * turn[j, i]
+    elif i < 6:
+        G[TH + i - 3] = h * h / 6.0
+        G[OM + i - 3] = 0.5 * h
+
+
+@nb.njit(**_FAST)
+def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
+    """Writes the non-zero places and values of H of one scalar measurement; returns how many there are."""
+    axis = channel % 3
+    what[0], what[1] = 1.0, 1.0
+    if channel < ATTITUDE:
+        where[0] = OM + axis
+        return 1
+    if channel < ACCEL:
+        where[0], where[1] = TH + axis, AE + axis
+        return 2
+    if channel < VELOCITY:
+        where[0] = FO + axis
+        if axis == 2 or slope[axis, 3] == 0.0 and slope[axis, 4] == 0.0 and slope[axis, 5] == 0.0:
+            return 1
+        for j in range(6):
+            where[1 + j] = TH + j if j < 3 else VE + j - 3
+            what[1 + j] = slope[axis, j]
+        return 7
+    where[0] = VE + axis
+    return 1
+
+
+@nb.njit(**_FAST)
+def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
+    """Writes the derivative of the accelerometer by rotation vector and velocity, (3, 6)."""
+    slope[:] = 0.0
+    if air:
+        r = _rotation(x[0], x[1], x[2], x[3])
+        _, _, _, u, v, w = _force(c, 0.0, 0.0, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
+        kx, ky = c[12] * row[2 * MOMENTS + 5], c[13] * row[2 * MOMENTS + 5]
+        slope[0, 1], slope[0, 2], slope[1, 0], slope[1, 2] = kx * w, -kx * v, -ky * w, ky * u
+        for j in range(3):
+            slope[0, 3 + j], slope[1, 3 + j] = -kx * r[3 * j], -ky * r[3 * j + 1]
+
+
+@nb.njit(**_FAST)
+def _is_measured(track: Track, k: int, channel: int, air: bool) -> bool:
+    """Whether there is such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
+    return track.seen[k, channel // 3] or (channel >= VELOCITY and track.still > 0.0)
+
+
+@nb.njit(**_FAST)
+def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
+    """Variance r of a scalar measurement."""
+    if channel >= VELOCITY and not track.seen[k, 3]:
+        h = track.t[k] - track.t[k - 1] if k > 0 else STILL_TIME
+        return float(track.still * track.still * 2.0 * STILL_TIME / h)
+    return float(psi[channel] * psi[channel])
+
+
+@nb.njit(**_FAST)
+def _normaliser(degrees: float) -> float:
+    """-2 ln of the Student-t density at 0 against the Gaussian's."""
+    return 2.0 * (math.lgamma(0.5 * degrees) - math.lgamma(0.5 * (degrees + 1.0))) + math.log(0.5 * degrees)
+
+
+@nb.njit(**_FAST)
+def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool) -> tuple[float, Gains]:
+    """Filter pass over a flight.
+
+    Args:
+        track: the flight.
+        p: physics, shape (N_PHYSICS,).
+        psi: noise, shape (N_NOISE,).
+        tail: 1 / degrees of freedom of the Student-t density of gyro, attitude, accelerometer, velocity, shape (4,);
+            0: Gaussian.
+        store: keep what `replay` and `backward` need; else their arrays are empty.
+
+    Returns:
+        -2 ln L, and the gains.
+    """
+    n = len(track.t)
+    air = track.still > 0.0 or track.seen[:, 3].any()
+    rows = n if store else 1
+    g = Gains(
+        np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
+        np.zeros((rows, 3, 6)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
+        moments(track, p[DELAY]),
+    )  # fmt: skip
+    c, keep = _constants(p, track), np.empty(9)
+    x, after = _start(track, p), np.empty(N_MEAN)
+    P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
+    dx, PH, G, nu = np.empty(N), np.empty(N), np.empty(N), np.zeros(M)
+    where, what = np.zeros(7, dtype=np.int64), np.zeros(7)
+    for i in range(3):
+        P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
+        P[VE + i, VE + i] = max(track.still, 1.0) ** 2 if air else 0.0
+    for i in range(9):
+        P[FO + i, FO + i] = psi[SIGMA + _GROUP[i]] ** 2
+    total, before = 0.0, -1.0
+    for k in range(n):
+        at = k if store else 0
+        slope = g.slope[at]
+        # Update by all that was measured now, Eq. 6.
+        _accel_slope(c, g.table[k], air, x, slope)
+        _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
+        dx[:] = 0.0
+        for m in range(M):
+            if not _is_measured(track, k, m, air):
+                continue
+            count = _places(m, slope, where, what)
+            v, S = nu[m], _white(track, psi, k, m)
+            PH[:] = 0.0
+            for j in range(count):
+                v -= what[j] * dx[where[j]]
+                for i in range(N):
+                    PH[i] += what[j] * P[where[j], i]
+            for j in range(count):
+                S += what[j] * PH[where[j]]
+            square, light = v * v / S, 1.0
+            if m < VELOCITY or track.seen[k, 3]:
+                k_inv = tail[m // 3]
+                if k_inv > 0.0:
+                    light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
+                    total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
+                else:
+                    total += square
+                total += math.log(S)
+            gain = light / S
+            for i in range(N):
+                dx[i] += gain * PH[i] * v
+            for i in range(N):
+                f = gain * PH[i]
+                for j in range(N):
+                    P[i, j] -= f * PH[j]
+            if store:
+                g.nu[k, m], g.S[k, m], g.w[k, m] = v, S, light
+                for i in range(N):
+                    g.gain[k, m, i] = gain * PH[i]
+        _correct(dx, x)
+        if store:
+            g.mean[k] = x
+            for i in range(N):
+                for j in range(9):
+                    g.P[k, i, j] = P[i, FO + j]
+        if k + 1 == n:
+            break
+        # Predict up to the next measurement, Eqs. 2 to 5.
+        h = track.t[k + 1] - track.t[k]
+        if abs(h - before) > 1e-12:
+            _keep(psi, h, keep)
+            before = h
+        after[:] = x
+        _advance(c, g.table[k], h, keep, air, after)
+        _transition(c, g.table[k], h, keep, air, x, after, F, turn)
+        x[:] = after
+        _sandwich(F, P, FP, False)
+        for i in range(9):
+            _kick(h, air, i, turn, G)
+            q = psi[SIGMA + _GROUP[i]] ** 2 * (1.0 - keep[i] ** 2)
+            for a in range(N):
+                if G[a] != 0.0:
+                    for b in range(N):
+                        P[a, b] += q * G[a] * G[b]
+    return total, g
+
+
+@nb.njit(**_FAST)
+def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> None:
+    """Writes F P, or F' P, of the sparse F of `_transition`."""
+    for i in range(N):
+        for j in range(N):
+            out[i, j] = 0.0
+    for i in range(N):
+        for m in range(i if i >= FO else 0, i + 1 if i >= FO else AE):  # rows of noise states have one entry
+            f = F[i, m]
+            if f != 0.0:
+                a, b = (m, i) if turned else (i, m)
+                for j in range(N):
+                    out[a, j] += f * P[b, j]
+
+
+@nb.njit(**_FAST)
+def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> None:
+    """P <- F P F' of a symmetric P, or F' P F; FP is room, and holds (F P)' afterwards."""
+    _product(F, P, turned, FP)
+    for i in range(N):
+        for j in range(i):
+            FP[i, j], FP[j, i] = FP[j, i], FP[i, j]
+    _product(F, FP, turned, P)
+    for i in range(N):  # or rounding, which is not symmetric, grows
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@nb.njit(**_FAST)
+def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray) -> float:
+    """Innovations of other physics under the gains of a filter pass, whitened, and the sum of their squares.
+
+    Args:
+        track: the flight.
+        p: physics, shape (N_PHYSICS,).
+        psi: noise of the pass.
+        g: of the pass.
+        table: moments of the rotors at these physics; see `moments`.
+        out: shape (n, M), written; shape (0, M): only the sum is wanted.
+    """
+    n = len(track.t)
+    air = track.still > 0.0 or track.seen[:, 3].any()
+    c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
+    dx, nu = np.empty(N), np.zeros(M)
+    where, what = np.zeros(7, dtype=np.int64), np.zeros(7)
+    total, before = 0.0, -1.0
+    for k in range(n):
+        _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
+        dx[:] = 0.0
+        for m in range(M):
+            if g.S[k, m] == 0.0:
+                continue
+            v = nu[m]
+            count = _places(m, g.slope[k], where, what)
+            for j in range(count):
+                v -= what[j] * dx[where[j]]
+            for i in range(N):
+                dx[i] += g.gain[k, m, i] * v
+            z = v * math.sqrt(g.w[k, m] / g.S[k, m])
+            total += z * z
+            if len(out) > 0:
+                out[k, m] = z
+        _correct(dx, x)
+        if k + 1 < n:
+            h = track.t[k + 1] - track.t[k]
+            if abs(h - before) > 1e-12:
+                _keep(psi, h, keep)
+                before = h
+            _advance(c, table[k], h, keep, air, x)
+    return total
+
+
+@nb.njit(**_FAST)
+def backward(
+    track: Track, p: FloatArray, psi: FloatArray, g: Gains, smooth: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Smoother and score, Eqs. 7 to 9.
+
+    Args:
+        track: the flight.
+        p: physics of the pass.
+        psi: its noise.
+        g: of the pass, stored.
+        smooth: whether the smoothed states are wanted; else they are zero.
+
+    Returns:
+        Derivative of -2 ln L by the noise numbers, shape (N_NOISE,); smoothed f, alpha, e, shape (n, 9), and their
+        variances, shape (n, 9).
+    """
+    n = len(track.t)
+    air = track.still > 0.0 or track.seen[:, 3].any()
+    score, mean, variance = np.zeros(N_NOISE), np.zeros((n, 9)), np.zeros((n, 9))
+    l, fl, L, FL = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
+    NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
+    c, after, before = _constants(p, track), np.empty(N_MEAN), -1.0
+    where, what, keep = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(9)
+    for k in range(n - 1, -1, -1):
+        if k + 1 < n:
+            h = track.t[k + 1] - track.t[k]
+            if abs(h - before) > 1e-12:
+                _keep(psi, h, keep)
+                before = h
+            after[:] = g.mean[k]
+            _advance(c, g.table[k], h, keep, air, after)
+            _transition(c, g.table[k], h, keep, air, g.mean[k], after, F, turn)
+            for i in range(9):
+                # d / d sigma^2 through Q, d / d T through Q and F, Eq. 9.
+                _kick(h, air, i, turn, G)
+                by_q = 0.0
+                along = 0.0
+                for a in range(N):
+                    if G[a] != 0.0:
+                        along += G[a] * l[a]
+                        for b in range(N):
+                            if G[b] != 0.0:
+                                by_q -= G[a] * L[a, b] * G[b]
+                by_q += along * along
+                s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
+                score[SIGMA + _GROUP[i]] -= by_q * 2.0 * s * (1.0 - keep[i] ** 2)
+                fade = keep[i] * h / (T * T)
+                score[TIME + _CLOCK[i]] -= by_q * s * s * (-2.0 * keep[i] * fade)
+            # F' l, F' N F; then what the smoother adds to the mean after the updates, Eq. 8.
+            for i in range(N):
+                fl[i] = 0.0
+            for m in range(N):
+                for i in range(N):
+                    fl[i] += F[m, i] * l[m]
+            _sandwich(F, L, FL, True)  # FL holds N F
+            # d / d F for the decay of each Gauss-Markov state and its mean over the step.
+            for i in range(9):
+                s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
+                _kick(h, air, i, turn, G)  # F's column is (what acts in the step) (1 + keep) / 2, and keep itself
+                smooth = g.mean[k, FO + 1 + i]
+                for j in range(N):
+                    smooth += g.P[k, j, i] * fl[j]
+                by_keep = 0.0
+                for a in range(N):
+                    part = G[a]
+                    if i >= 3 and i < 6 and a < OM:
+                        part *= 1.5
+                    if part != 0.0:
+                        inner = 0.0
+                        for j in range(N):
+                            inner += FL[a, j] * g.P[k, j, i]
+                        by_keep += part * (l[a] * smooth - inner)
+                score[TIME + _CLOCK[i]] -= 2.0 * by_keep * keep[i] * h / (T * T)
+            for i in range(N):
+                l[i] = fl[i]
+        for i in range(9 if smooth else 0):
+            mean[k, i], variance[k, i] = g.mean[k, FO + 1 + i], g.P[k, FO + i, i]
+            for j in range(N):
+                mean[k, i] += g.P[k, j, i] * l[j]
+                for m in range(N):
+                    variance[k, i] -= g.P[k, j, i] * L[j, m] * g.P[k, m, i]
+        for m in range(M - 1, -1, -1):
+            if g.S[k, m] == 0.0:
+                continue
+            count = _places(m, g.slope[k], where, what)
+            S, K = g.S[k, m] / g.w[k, m], g.gain[k, m]
+            u, D = g.nu[k, m] / S, 1.0 / S
+            for i in range(N):
+                u -= K[i] * l[i]
+                NK[i] = 0.0
+            for j in range(N):
+                for i in range(N):
+                    NK[i] += L[j, i] * K[j]
+            for i in range(N):
+                D += K[i] * NK[i]
+            if m < VELOCITY or track.seen[k, 3]:
+                score[m] -= (u * u - D) / g.w[k, m] * 2.0 * psi[m]
+            for a in range(count):
+                l[where[a]] += what[a] * u
+                for b in range(N):
+                    L[where[a], b] -= what[a] * NK[b]
+                    L[b, where[a]] -= what[a] * NK[b]
+                for b in range(count):
+                    L[where[a], where[b]] += what[a] * what[b] * D
+    # The first covariance of the Gauss-Markov states is sigma^2.
+    for i in range(9):
+        s = psi[SIGMA + _GROUP[i]]
+        score[SIGMA + _GROUP[i]] -= (l[FO + i] ** 2 - L[FO + i, FO + i]) * 2.0 * s
+    return score, mean, variance

@@ -1,0 +1,314 @@
+"""The likelihood over several flights as a function of two vectors: physics in scaled parameters, and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from quadid.estimate import kalman as k
+from quadid.estimate.kalman import Gains, Track
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+T = TypeVar("T")
+AXES = ("x", "y", "z")
+PLACES: dict[str, int] = {
+    **{name: i for i, name in enumerate(NOMINAL_NAMES)},
+    **{f"trim_moment.{a}": k.TRIM + i for i, a in enumerate(AXES)},
+    **{f"gyro_bias.{a}": k.GYRO_BIAS + i for i, a in enumerate(AXES)},
+    **{f"accel_bias.{a}": k.ACCEL_BIAS + i for i, a in enumerate(AXES)},
+    **{f"rotor_drag.k_{a}": k.DRAG + i for i, a in enumerate("xy")},
+    **{f"rate_damping.{a}": k.DAMP + i for i, a in enumerate(("l_p", "m_q", "n_r"))},
+    **{f"cg_offset.{a}": k.CG + i for i, a in enumerate("xy")},
+    "command_delay.delay": k.DELAY,
+}
+"""Entries of the physics vector by name."""
+PER_FLIGHT = ("trim_moment", "gyro_bias", "accel_bias")
+"""Values that belong to a flight and not to the vehicle."""
+UPRIGHT = "accel_bias.z"
+"""Told from thrust only where velocity is measured; without, it stays zero."""
+TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
+"""What every model frees beside its own parameters: a constant moment and the sensors' biases."""
+_SIZE = {"gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag": 0.5, "rate_damping": 2.0, "command_delay": 0.01}
+"""Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
+OFF_CENTRE = 0.05
+"""The same of the centre of gravity, as a share of the arm; that of a trim moment is the control moment."""
+FORCE = (0.1, 0.05)
+"""Prior of the random specific force, horizontal and vertical, as a share of gravity …"""
+MOMENT = 0.1
+"""… and of the random angular acceleration, as a share of the control moment: more is large."""
+TILT = 0.02
+"""Prior of the attitude estimator's error [rad]."""
+MEMORY, MEMORY_SPREAD = 0.3, 1.5
+"""Prior of a correlation time [s] and the spread of its logarithm."""
+SHORTEST, LONGEST = 3.0, 0.1
+"""Correlation times that can be identified: from so many samples to such a share of the flight."""
+WHITE = np.repeat([0.02, 0.003, 0.2, 0.05], 3)
+"""Where the search for the sensors' white noise begins."""
+STRETCH, SETTLED, NUDGE = 400, 30, 1e-3
+"""Rows that stand for a flight where only variances matter, those until they are stationary, and a small change."""
+LEAST = 1e-2
+"""A random force this small against its prior is none."""
+
+
+def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
+    """Standard deviation of the angular acceleration that the rotors ask for at physics p, shape (3,) [rad/s^2]."""
+    moment = np.concatenate([k.moments(track, 0.0)[:-1, :4] for track in tracks])
+    arms = np.column_stack([-p[k.B] * moment[:, 2], p[k.B] * moment[:, 1], p[k.D] * moment[:, 3]])
+    return np.asarray(np.std(arms / p[k.JX : k.JX + 3], axis=0) + 1e-3)
+
+
+def floor_of(tracks: Sequence[Track]) -> FloatArray:
+    """Least white noise of every scalar measurement, shape (M,): the step of its numbers / sqrt 12."""
+    out = np.full(k.M, 1e-5)
+    columns = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12]
+    for channel, column in enumerate(columns):
+        for track in tracks:
+            values = np.unique(track.y[track.seen[:, channel // 3], column])
+            if len(values) > 1:
+                steps = np.diff(values)
+                out[channel] = max(out[channel], float(np.min(steps[steps > 1e-9], initial=np.inf)) / np.sqrt(12.0))
+    return np.where(np.isfinite(out), out, 1e-5)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Flights of one vehicle, and what of it is free.
+
+    Attributes:
+        tracks: the flights.
+        vehicle: geometry, mass, guesses and bounds.
+        names: free entries of `PLACES`; those of `PER_FLIGHT` once for every flight.
+        base: physics vector of what is not free, shape (N_PHYSICS,).
+        tail: see `kalman.kalman`.
+    """
+
+    tracks: tuple[Track, ...]
+    vehicle: Vehicle
+    names: tuple[str, ...]
+    base: FloatArray
+    tail: FloatArray
+
+    @classmethod
+    def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), tail: float = 0.0) -> Problem:
+        """The six, trim moment, biases and `names` free, from the vehicle file's guess."""
+        base = np.zeros(k.N_PHYSICS)
+        base[:6] = vehicle.initial
+        upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
+        return cls(tuple(tracks), vehicle, (*NOMINAL_NAMES, *TRIMMED, *upright, *names), base, np.full(4, tail))
+
+    def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
+        """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
+        new = replace(self, base=self.physics(z, 0))
+        return new, np.asarray(z * self.size / new.size)
+
+    @cached_property
+    def control(self) -> FloatArray:
+        """See `control_moment`."""
+        return control_moment(self.tracks, self.base)
+
+    @cached_property
+    def entries(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, place in the physics vector, flight (-1: all) of every scaled parameter."""
+        common = [(n, PLACES[n], -1) for n in self.names if n.split(".")[0] not in PER_FLIGHT]
+        own = [(n, PLACES[n], j) for j in range(len(self.tracks)) for n in self.names if n.split(".")[0] in PER_FLIGHT]
+        return tuple(common + own)
+
+    @cached_property
+    def size(self) -> FloatArray:
+        """Unit of every scaled parameter and standard deviation of its prior; the six are logarithms, of unit 1."""
+        out = np.ones(len(self.entries))
+        for i, (name, place, _) in enumerate(self.entries):
+            effect = name.split(".")[0]
+            if place >= k.TRIM:
+                own = {"cg_offset": OFF_CENTRE * self.vehicle.arm}
+                own |= {"trim_moment": float(self.control[place % 3])} if effect == "trim_moment" else {}
+                out[i] = (_SIZE | own)[effect]
+        return out
+
+    @cached_property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation of the scaled parameters."""
+        mean, sigma = np.zeros(len(self.entries)), np.ones(len(self.entries))
+        stand = self.vehicle.stand_thrust
+        for i, (name, place, _) in enumerate(self.entries):
+            if place < k.TRIM:
+                known = self.vehicle.parameters[name]
+                mean[i], sigma[i] = np.log(known.initial), known.log_sigma
+                if name == "b" and stand is not None:
+                    mean[i], sigma[i] = np.log(stand[0]), stand[1]
+        return mean, sigma
+
+    def physics(self, z: FloatArray, flight: int) -> FloatArray:
+        """Physics vector of one flight at scaled parameters z."""
+        p = self.base.copy()
+        for (_, place, where), value, size in zip(self.entries, z, self.size, strict=True):
+            if where in (-1, flight):
+                p[place] = np.exp(value) if place < k.TRIM else value * size
+        return p
+
+    def start(self) -> FloatArray:
+        """Scaled parameters of the guess."""
+        return self.prior[0].copy()
+
+    def penalty(self, z: FloatArray) -> float:
+        """-2 ln of the prior of the physics."""
+        mean, sigma = self.prior
+        return float(np.sum(((z - mean) / sigma) ** 2))
+
+    @cached_property
+    def noise_scale(self) -> FloatArray:
+        """Prior size of f, alpha, e, shape (6,)."""
+        tilt = float(np.sqrt(np.mean(self.control[:2] ** 2)))
+        return np.array([
+            FORCE[0] * GRAVITY, FORCE[1] * GRAVITY, MOMENT * tilt, MOMENT * self.control[2], TILT, TILT
+        ])  # fmt: skip
+
+    @cached_property
+    def noise_bounds(self) -> FloatArray:
+        """Bounds of the noise numbers, shape (N_NOISE, 2)."""
+        out = np.empty((k.N_NOISE, 2))
+        out[: k.M, 0], out[: k.M, 1] = floor_of(self.tracks), 100.0 * WHITE
+        out[k.SIGMA : k.TIME, 0], out[k.SIGMA : k.TIME, 1] = LEAST * self.noise_scale, 100.0 * self.noise_scale
+        step = max(float(np.median(np.diff(t.t))) for t in self.tracks)
+        long = max(float(t.t[-1] - t.t[0]) for t in self.tracks)
+        out[k.TIME :] = SHORTEST * step, max(LONGEST * long, 4.0 * SHORTEST * step)
+        return out
+
+    def first_noise(self, share: float = 2.0) -> FloatArray:
+        """Noise numbers where the search begins: random forces large, `share` times their prior."""
+        out = np.concatenate([WHITE, share * self.noise_scale, np.full(5, MEMORY)])
+        out[k.SIGMA + 4 : k.TIME] = 0.25 * TILT
+        return np.asarray(np.clip(out, *self.noise_bounds.T))
+
+    def noise_penalty(self, psi: FloatArray) -> tuple[float, FloatArray]:
+        """-2 ln of the prior of the noise numbers, and its derivative by psi.
+
+        Standard deviations have a squared Cauchy density, flat at zero and with a long tail.
+        """
+        slope = np.zeros(k.N_NOISE)
+        share = psi[k.SIGMA : k.TIME] / self.noise_scale
+        log = np.log(psi[k.TIME :] / MEMORY) / MEMORY_SPREAD
+        slope[k.SIGMA : k.TIME] = 4.0 * share / (1.0 + share**2) / self.noise_scale
+        slope[k.TIME :] = 2.0 * log / MEMORY_SPREAD / psi[k.TIME :]
+        return float(2.0 * np.sum(np.log1p(share**2)) + np.sum(log**2)), slope
+
+    def noise_curvature(self, psi: FloatArray) -> FloatArray:
+        """Second derivative of that prior by the logarithms, without what is negative, shape (N_NOISE,)."""
+        out = np.full(k.N_NOISE, 1e-6)
+        square = (psi[k.SIGMA : k.TIME] / self.noise_scale) ** 2
+        out[k.SIGMA : k.TIME] += 8.0 * square / (1.0 + square) ** 2
+        out[k.TIME :] += 2.0 / MEMORY_SPREAD**2
+        return out
+
+    def objective(self, z: FloatArray, psi: FloatArray) -> float:
+        """-2 ln of likelihood and prior; infinite where the filter has no finite step."""
+        total = self.penalty(z) + self.noise_penalty(psi)[0]
+        total += sum(_each(lambda j: self._pass(z, psi, j, False)[0], len(self.tracks)))
+        return total if np.isfinite(total) else float(np.inf)
+
+    def passes(self, z: FloatArray, psi: FloatArray) -> tuple[float, list[Gains]]:
+        """The same, and the gains of every flight."""
+        found = _each(lambda j: self._pass(z, psi, j, True), len(self.tracks))
+        total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
+        return (total if np.isfinite(total) else np.inf), [g for _, g in found]
+
+    def _pass(self, z: FloatArray, psi: FloatArray, j: int, store: bool) -> tuple[float, Gains]:
+        value, gains = k.kalman(self.tracks[j], self.physics(z, j), psi, self.tail, store)
+        return float(value), gains
+
+    def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
+        """Derivative of the objective by the noise numbers."""
+        parts = _each(
+            lambda j: k.backward(self.tracks[j], self.physics(z, j), psi, gains[j], False)[0], len(self.tracks)
+        )
+        return np.asarray(np.sum(parts, axis=0) + self.noise_penalty(psi)[1])
+
+    def noise_information(self, z: FloatArray, psi: FloatArray) -> FloatArray:
+        """Half the expected curvature of the objective by the logarithms of the noise numbers, (N_NOISE, N_NOISE).
+
+        Information of Gaussian innovations, sum of (d ln S)(d ln S)' / 2 + (d nu)(d nu)' / S, by differences over a
+        stretch from the middle of every flight, which stands for all of it.
+        """
+        out = np.zeros((k.N_NOISE, k.N_NOISE))
+        for j, track in enumerate(self.tracks):
+            n = len(track.t)
+            first = max((n - STRETCH) // 2, 0)
+            part = track._replace(**{a: getattr(track, a)[first : first + STRETCH] for a in ("t", "y", "seen")})
+            p = self.physics(z, j)
+
+            def innovations(i: int, part: Track = part, p: FloatArray = p) -> tuple[FloatArray, FloatArray]:
+                moved = psi.copy()
+                if i < k.N_NOISE:
+                    moved[i] *= np.exp(NUDGE)
+                g = k.kalman(part, p, moved, self.tail, True)[1]
+                S = np.where(g.S > 0.0, g.S, 1.0)
+                return np.log(S)[SETTLED:].ravel(), (g.nu * np.sqrt(g.w))[SETTLED:].ravel()
+
+            *moved, (log_s, nu) = _each(innovations, k.N_NOISE + 1)
+            by_s = np.array([(a - log_s) / NUDGE for a, _ in moved])
+            by_nu = np.array([(b - nu) / NUDGE for _, b in moved]) * np.exp(-0.5 * log_s)
+            share = n / max(len(part.t) - SETTLED, 1)
+            out += share * (0.5 * by_s @ by_s.T + by_nu @ by_nu.T)
+        return out
+
+    def replayed(self, points: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
+        """Sum of squared whitened innovations of many z (m, n) under the gains of one, with their prior, shape (m,)."""
+        none = np.empty((0, k.M))
+
+        def one(i: int) -> float:
+            total = self.penalty(points[i])
+            for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
+                p = self.physics(points[i], j)
+                total += float(k.replay(track, p, psi, g, self._table(track, g, p), none))
+            return total
+
+        return np.array(_each(one, len(points)))
+
+    def _table(self, track: Track, g: Gains, p: FloatArray) -> FloatArray:
+        return k.moments(track, p[k.DELAY]) if "command_delay.delay" in self.names else g.table
+
+    def normal_equations(
+        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float = 1e-5
+    ) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+        """Information (P, P) and gradient (P,) of the likelihood in scaled parameters, gains frozen, prior included.
+
+        Sensitivities are differences of innovations, one replay a parameter.  Also whitened innovations by flight.
+        """
+        mean, sigma = self.prior
+        # Expected information of a Student-t density against that of a Gaussian as wide.
+        expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
+        information, gradient = np.diag(1.0 / sigma**2), (z - mean) / sigma**2
+        left = []
+        for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
+            mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
+            plain = self._whitened(track, g, z, psi, j)
+            points = [z + nudge * (np.arange(len(z)) == i) for i in mine]
+            J = np.array([(w - plain) / nudge for w in self._several(j, points, psi, g)])
+            gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
+            J *= expected
+            information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
+            left.append(plain)
+        return information, gradient, left
+
+    def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
+        return _each(lambda i: self._whitened(self.tracks[j], g, points[i], psi, j), len(points))
+
+    def _whitened(self, track: Track, g: Gains, z: FloatArray, psi: FloatArray, j: int) -> FloatArray:
+        out, p = np.zeros((len(track.t), k.M)), self.physics(z, j)
+        k.replay(track, p, psi, g, self._table(track, g, p), out)
+        return out
+
+
+_THREADS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="filter")
+
+
+def _each(function: Callable[[int], T], count: int) -> list[T]:
+    """Calls a function of 0 to `count` - 1, several at a time."""
+    return list(_THREADS.map(function, range(count))) if count > 1 else [function(0)]

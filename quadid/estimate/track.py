@@ -1,0 +1,115 @@
+"""Flights as the filter reads them: every channel at its own times, rotor speeds as they acted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quadid.estimate.kalman import MOMENTS, Track
+from quadid.mounting import in_body_axes
+from quadid.resample import copied, sample_period
+from quadid.rotor_signal import rotor_signal
+from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import Vehicle
+from quadid.window import Recording, Window
+
+STILL = 3.0
+"""Standard deviation of a velocity that nobody measures [m/s], where air matters."""
+TOGETHER = 1e-4
+"""Measurements closer than this are taken at one time [s]."""
+_COLUMNS = (("gyro", 0, 3), ("attitude", 3, 7), ("accel", 7, 10), ("velocity", 10, 13))
+
+
+def from_window(window: Window, vehicle: Vehicle, air: bool = False) -> Track:
+    """A window on a uniform grid; NaN rows are no measurements.
+
+    Args:
+        window: the data.
+        vehicle: where its rotors are.
+        air: velocity matters though it is not measured.
+    """
+    channels = {}
+    for name, _, _ in _COLUMNS:
+        values = getattr(window, name)
+        if values is not None:
+            good = np.isfinite(values).all(axis=1)
+            channels[name] = window.t[good], values[good]
+    return _track(
+        channels, window.t, window.rotor_speed, window.rotor_slope, window.sampling == "held", window.dt, vehicle, air
+    )
+
+
+def from_recording(
+    recording: Recording, vehicle: Vehicle, start: float = -np.inf, stop: float = np.inf, air: bool = False,
+    every: int = 1,
+) -> Track:  # fmt: skip
+    """A log, channels at their own rates: an update where a new value was measured; a repeated one is none.
+
+    Args:
+        recording: the log.
+        vehicle: what its rotor columns mean.
+        start: first time to use [s].
+        stop: last one.
+        air: velocity matters though it is not measured.
+        every: use one of so many measurements; rotor signals keep all theirs.
+
+    Raises:
+        LogError, NotIdentifiableError: see `rotor_signal`.
+    """
+    recording = in_body_axes(recording, vehicle)
+    rotor = rotor_signal(recording, vehicle)
+    channels = {}
+    for name, _, _ in _COLUMNS:
+        channel = recording.channels.get(name)
+        if channel is not None:
+            rows = (channel.t >= max(start, rotor.t[0])) & (channel.t <= min(stop, rotor.t[-1])) & _new(channel.values)
+            rows[np.flatnonzero(np.arange(len(rows)) % every != 0)] = False
+            channels[name] = channel.t[rows], channel.values[rows]
+    period = sample_period(recording.channels["accel"].t) if "accel" in recording.channels else 0.02
+    return _track(channels, rotor.t, rotor.values, None, rotor.sampling == "held", period, vehicle, air)
+
+
+def _new(values: FloatArray) -> BoolArray:
+    """Rows that differ from the one before."""
+    return np.concatenate([[True], ~copied(values)])
+
+
+def _track(
+    channels: dict[str, tuple[FloatArray, FloatArray]], rotor_t: FloatArray, speed: FloatArray,
+    slope: FloatArray | None, held: bool, period: float, vehicle: Vehicle, air: bool,
+) -> Track:  # fmt: skip
+    """Merges channels onto one rising axis of times."""
+    every = np.unique(np.concatenate([t for t, _ in channels.values()]))
+    t = every[np.concatenate([[True], np.diff(every) > TOGETHER])]
+    y, seen = np.zeros((len(t), 13)), np.zeros((len(t), 4), dtype=np.bool_)
+    for group, (name, first, last) in enumerate(_COLUMNS):
+        if name in channels:
+            times, values = channels[name]
+            at = np.searchsorted(t, times + 0.5 * TOGETHER, side="right") - 1
+            y[at, first:last], seen[at, group] = values, True
+    piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
+    still = STILL if air and not seen[:, 3].any() else 0.0
+    return Track(t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still)
+
+
+def _pieces(
+    t: FloatArray, speed: FloatArray, slope: FloatArray | None, held: bool, vehicle: Vehicle
+) -> tuple[FloatArray, FloatArray]:
+    """Integrals of the rotor moments, exact for speeds that are straight lines between samples, or held."""
+    step = np.append(np.diff(t), np.median(np.diff(t)))
+    if held:
+        rise = np.zeros_like(speed) if slope is None else slope
+        begin = speed - 0.5 * rise * step[:, None]
+    else:
+        begin = speed
+        rise = np.vstack([np.diff(speed, axis=0), np.zeros((1, speed.shape[1]))]) / step[:, None]
+    x, y = vehicle.rotor_positions[:, :2].T
+    one = np.ones_like(x)
+    squares, speeds = np.stack([one, x, y, vehicle.spins]), np.stack([vehicle.spins, one])
+    piece = np.zeros((len(t), MOMENTS, 4))
+    piece[:, :4, 1], piece[:, 4:, 1] = begin**2 @ squares.T, begin @ speeds.T
+    piece[:, :4, 2], piece[:, 4:, 2] = (begin * rise) @ squares.T, 0.5 * rise @ speeds.T
+    piece[:, :4, 3] = rise**2 @ squares.T / 3.0
+    h = step[:, None]
+    whole = h * (piece[:, :, 1] + h * (piece[:, :, 2] + h * piece[:, :, 3]))
+    piece[1:, :, 0] = np.cumsum(whole, axis=0)[:-1]
+    return np.ascontiguousarray(t), piece

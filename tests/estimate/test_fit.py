@@ -1,0 +1,69 @@
+"""The whole estimate on simulated flights: truth inside its intervals, no random forces where none act."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from quadid.estimate import kalman as k
+from quadid.estimate.fit import Estimate, estimate, tails
+from quadid.estimate.missing import missing
+from quadid.estimate.problem import Problem
+from quadid.estimate.track import from_window
+from quadid.flight import draw_truth, fly
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid.vehicle_parts import ParameterPrior
+
+PELICAN = Vehicle.shipped("pelican")
+SECONDS = 30.0
+GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
+
+
+def guessed(truth: dict[str, float], factor: float, seed: int) -> Vehicle:
+    """Every guess off by up to `factor`, bounds around the guess."""
+    rng = np.random.default_rng(seed)
+    off = np.exp(rng.uniform(-1.0, 1.0, len(NOMINAL_NAMES)) * np.log(factor))
+    priors = {n: ParameterPrior(initial=truth[n] * float(o)) for n, o in zip(NOMINAL_NAMES, off, strict=True)}
+    return PELICAN.model_copy(update={"parameters": priors})
+
+
+@lru_cache
+def estimated(seed: int, factor: float = 1.4, guess: int = 0, gusty: bool = False) -> tuple[Estimate, dict[str, float]]:
+    truth = draw_truth(PELICAN, seed)
+    flight = fly(PELICAN, truth, SECONDS, seed, outside=GUSTS if gusty else {})
+    vehicle = guessed(truth.as_dict(), factor, guess)
+    problem = Problem.of([from_window(flight.window, vehicle)], vehicle)
+    return estimate(problem, seed=guess, particles=24, iterations=16), truth.as_dict()
+
+
+def test_truth_lies_inside_the_intervals_and_no_random_force_is_found() -> None:
+    found, truth = estimated(1)
+    for name in NOMINAL_NAMES:
+        value, sigma = found.value(name)
+        assert abs(np.log(value / truth[name])) < 3.0 * sigma, name
+    # At their least, but for what chance makes of 30 s: a hundredth of gravity, of the control moment.
+    share = found.psi[k.SIGMA : k.SIGMA + 4] / found.problem.noise_scale[:4]
+    assert np.all(share < 0.1), share
+    white = np.mean(found.whitened[0][:, :9] ** 2, axis=0)
+    assert np.all(np.abs(white - 1.0) < 0.05), white
+    assert not tails(found.whitened).any()
+
+
+def test_guesses_off_by_up_to_four_end_at_the_same_optimum() -> None:
+    ends = [estimated(2, 4.0, guess)[0] for guess in range(3)]
+    for other in ends[1:]:
+        for name in NOMINAL_NAMES:
+            (value, sigma), (same, _) = ends[0].value(name), other.value(name)
+            assert abs(np.log(value / same)) < 0.2 * sigma, name
+
+
+def test_gusts_are_found_in_newtons() -> None:
+    found, _ = estimated(3, gusty=True)
+    (one,) = missing(found)
+    # 0.6 m/s^2 along north and east, half of it down; 1 rad/s^2 about x and y.
+    assert one.force_rms[:2] == pytest.approx(PELICAN.mass * np.array([0.6, 0.6]), rel=0.3)
+    inertia = [found.value(n)[0] for n in NOMINAL_NAMES[2:4]]
+    assert one.moment_rms[:2] == pytest.approx(inertia, rel=0.3)
