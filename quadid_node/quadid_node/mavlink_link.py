@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from quadid_node.mavlink_decode import MavlinkDecoder
 from quadid_node.mavlink_parameters import parameters_of
 from quadid_node.mavlink_peers import Source
 from quadid_node.mavlink_requests import Requests
-from quadid_node.mavlink_wire import LinkError, Wire, dialect, sender
+from quadid_node.mavlink_wire import LinkError, Wire, dialect, message_id, sender
 from quadid_node.publication import Output
 
 COMPONENT = 191
@@ -31,8 +32,10 @@ REQUESTED = {
     "LOCAL_POSITION_NED": 20.0, "BATTERY_STATUS": 1.0,
 }  # fmt: skip
 """Messages asked for, with their rates [Hz]."""
-FRAMES_A_SECOND = 4000
-"""More frames than this are a flood: the rest is dropped unread."""
+FRAMES_A_SECOND, OTHERS_A_SECOND = 4000, 1000
+"""More frames of the vehicle, or of all others together, are a flood: the rest is dropped unread."""
+FLOODED = 10.0
+"""A flood is a problem for so long after its last frame [s]."""
 LIST_EVERY = 1.0
 """All our parameters are told so often at most [s]: one short request asks for seventeen frames."""
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
@@ -40,8 +43,9 @@ _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERRO
 _REAL32 = 9
 _TEXT = 50
 _IDS = {m.msgname: n for n, m in dialect.mavlink_map.items()}
-_ANSWERED = ("HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET", "COMMAND_ACK", "PARAM_VALUE")
-_WANTED = frozenset(_IDS[n] for n in (*READERS, *_ANSWERED) if n in _IDS)
+_ANSWERED = ("HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
+_OF_OTHERS = frozenset(_IDS[n] for n in _ANSWERED)
+_WANTED = _OF_OTHERS | {_IDS[n] for n in (*READERS, "COMMAND_ACK", "PARAM_VALUE") if n in _IDS}
 
 
 @dataclass(frozen=True)
@@ -101,36 +105,52 @@ class MavlinkLink:
         self._requests = Requests()
         self._set: OnlineSet | None = None
         self._text = 0
-        self._budget, self._budget_second = FRAMES_A_SECOND, 0
+        self._left, self._second = {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}, 0
+        self._flooded = {True: -math.inf, False: -math.inf}
 
     # --- in
 
     def receive(self) -> Iterator[Sample]:
         """Yields the samples that have arrived; answers what was asked of us."""
         now = last = self._clock()
-        if int(now) != self._budget_second:
-            self._budget_second, self._budget = int(now), FRAMES_A_SECOND
-        for message in self._wire.receive(_WANTED, self._budget, None if self._key else self._count):
-            self._budget -= 1
+        if int(now) != self._second:
+            self._second, self._left = int(now), {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}
+        for message in self._wire.receive(_WANTED, self._admits, now, None if self._key else self._count):
             last, kind = self._clock(), message.get_type()
-            if self._is_vehicle(message) and not self._source.take(self._wire.source, now):
-                continue
+            if kind == "HEARTBEAT":
+                self._find(message)
+            if self._is_vehicle(message):
+                if not self._source.take(self._wire.source, self._wire.listened):
+                    continue
+                self._wire.follow(self._wire.source)
             if kind == "HEARTBEAT":
                 self._on_heartbeat(message)
-            elif kind == "COMMAND_ACK":
-                self._on_ack(message)
             elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"):
                 self._on_parameter(kind, message)
+            elif kind == "COMMAND_ACK" and self._is_vehicle(message):
+                self._on_ack(message)
             elif self._is_vehicle(message):
                 yield from self._decoder.samples(message, last, self._empty)
         if self._wire.drained:
             self._empty = last
 
+    def _admits(self, frame: bytes) -> bool:
+        """Whether a frame is worth its decoding: the vehicle's have a budget of their own, others' floods leave it."""
+        _, *who = sender(frame)
+        is_named = (*who,) == (self.vehicle_system, self._target)
+        own = is_named and self._source.is_from(self._wire.source)
+        if self.vehicle_system and not is_named and message_id(frame) not in _OF_OTHERS:
+            return False
+        self._left[own] -= 1
+        if self._left[own] < 0:
+            self._flooded[own] = self._clock()
+        return self._left[own] >= 0
+
     def _count(self, frame: bytes) -> None:
         """Without a key every frame of the vehicle's ids is looked at: two senders have two rows of numbers."""
         number, system, component = sender(frame)
         if (system, component) == (self.vehicle_system, self._target):
-            self._source.count(self._wire.source, number, self._clock(), frame)
+            self._source.count(self._wire.source, number, self._wire.listened, frame)
 
     def _is_vehicle(self, message: Any) -> bool:
         return bool(
@@ -139,20 +159,22 @@ class MavlinkLink:
             and message.get_srcComponent() == self._target
         )
 
-    def _on_heartbeat(self, message: Any) -> None:
-        """The first autopilot heard is our vehicle; we speak under its system id, to who is heard again and again."""
-        found = not self.vehicle_system and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
-        found &= self._only in (0, message.get_srcSystem())
-        if found:
+    def _find(self, message: Any) -> None:
+        """The first autopilot heard is our vehicle; we speak under its system id."""
+        if self.vehicle_system or message.autopilot == dialect.MAV_AUTOPILOT_INVALID:
+            return
+        if self._only in (0, message.get_srcSystem()):
             self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
-        self._wire.peers.hello(self._wire.source, time.monotonic(), self._is_vehicle(message))
-        if found:
             self._wire.mav.srcSystem = self.vehicle_system
             self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+
+    def _on_heartbeat(self, message: Any) -> None:
+        """Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack."""
+        self._wire.peers.hello(self._wire.source, self._wire.listened, self._is_vehicle(message))
         if self._is_vehicle(message):
             for name in self._decoder.order.lacking():
                 wanted = self.vehicle_system, self._target, name.encode(), -1
-                self._wire.send(dialect.MAVLink_param_request_read_message(*wanted))
+                self._send(dialect.MAVLink_param_request_read_message(*wanted))
 
     def _on_ack(self, message: Any) -> None:
         """Notes a refused request for a message."""
@@ -178,18 +200,20 @@ class MavlinkLink:
         wanted = str(message.param_id)
         index = getattr(message, "param_index", -1)
         if kind == "PARAM_REQUEST_READ" and 0 <= index < len(names):
-            self._send_parameter(index)
+            self._send_parameter(index, answer=True)
         elif wanted in names and kind == "PARAM_REQUEST_READ":
-            self._send_parameter(names.index(wanted))
+            self._send_parameter(names.index(wanted), answer=True)
         elif wanted in names or message.target_component == COMPONENT:
             self._refuse(message, wanted, _READ_ONLY if wanted in names else _UNKNOWN)
             if wanted in names:
-                self._send_parameter(names.index(wanted))  # for ground stations that do not know PARAM_ERROR
+                self._send_parameter(
+                    names.index(wanted), self._wire.source
+                )  # for ground stations that do not know PARAM_ERROR
 
     def _refuse(self, message: Any, name: str, error: int) -> None:
         index = getattr(message, "param_index", -1)
         who = message.get_srcSystem(), message.get_srcComponent()
-        self._wire.send(dialect.MAVLink_param_error_message(*who, name.encode()[:16], index, error))
+        self._send(dialect.MAVLink_param_error_message(*who, name.encode()[:16], index, error), answer=True)
 
     # --- out
 
@@ -198,7 +222,7 @@ class MavlinkLink:
         now = self._clock()
         if now - self._beat >= 1.0:
             self._beat = now
-            self._wire.send(dialect.MAVLink_heartbeat_message(
+            self._send(dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
             ))  # fmt: skip
         if now - self._measured >= 2.0:
@@ -235,6 +259,11 @@ class MavlinkLink:
         """What comes over the link."""
         wire = self._wire
         problems = [self._source.problem, self._decoder.order.problem, wire.memory_problem]
+        for own, most, whose in ((True, FRAMES_A_SECOND, "the vehicle"), (False, OTHERS_A_SECOND, "others")):
+            if self._clock() - self._flooded[own] < FLOODED:
+                problems.append(f"a flood: more than {most} frames of {whose} in a second, the rest is dropped unread")
+        if self._clock() - wire.held_back < FLOODED:
+            problems.append("more is asked for than may be sent: answers are held back")
         if not self._key and wire.signed:
             problems.append("the frames are signed, but there is no key to check them: use --key")
         if self._key and wire.refused and not self.vehicle_system and not wire.signed:
@@ -251,7 +280,7 @@ class MavlinkLink:
         wanted = REQUESTED | dict.fromkeys(self._decoder.order.esc_groups(), MOTORS)
         lacking = [n for n, rate in wanted.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
         for name in self._requests.due(lacking, now):
-            self._wire.send(dialect.MAVLink_command_long_message(
+            self._send(dialect.MAVLink_command_long_message(
                 self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
                 float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0,
             ))  # fmt: skip
@@ -262,10 +291,13 @@ class MavlinkLink:
         self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
         self._before, self._measured = dict(counts), now
 
-    def _send_parameter(self, index: int) -> None:
+    def _send(self, message: Any, answer: bool = False) -> None:
+        self._wire.send(message, self._clock(), answer)
+
+    def _send_parameter(self, index: int, answer: bool = False) -> None:
         entries = parameters_of(self._set)
         name, value = entries[index]
-        self._wire.send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, len(entries), index))
+        self._send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, len(entries), index), answer)
 
     def _send_values(self) -> None:
         self._send_named([(name, value) for name, value in parameters_of(self._set) if len(name) <= 10])
@@ -280,14 +312,14 @@ class MavlinkLink:
     def _send_named(self, values: Sequence[tuple[str, float]]) -> None:
         ms = int((self._clock() - self._begin) * 1e3) % 2**32
         for name, value in values:
-            self._wire.send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+            self._send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
 
     def _say(self, severity: int, text: str) -> None:
         plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text).encode()
         if len(plain) <= _TEXT:
-            self._wire.send(dialect.MAVLink_statustext_message(severity, plain))
+            self._send(dialect.MAVLink_statustext_message(severity, plain))
             return
         self._text = self._text % 65535 + 1
         for k in range(min(len(plain) // _TEXT + 1, 256)):  # the last one is short, be it empty
             piece = plain[k * _TEXT : (k + 1) * _TEXT]
-            self._wire.send(dialect.MAVLink_statustext_message(severity, piece, self._text, k))
+            self._send(dialect.MAVLink_statustext_message(severity, piece, self._text, k))

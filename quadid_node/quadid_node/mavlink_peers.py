@@ -10,7 +10,9 @@ from quadid_replay.frame_numbers import two_rows
 
 Address = Hashable
 SILENT = 3.0
-"""A source that is silent for so long [s] may be replaced by another: the vehicle came back from elsewhere."""
+"""A source that is silent for so long [s] may be replaced by another: the vehicle came back from elsewhere.
+
+Time counts only while we listened (`Wire.listened`): who sent during a stall of ours was not silent."""
 JUDGED, ROWS = 40, 160
 """Whether frame numbers come in two rows is judged after so many frames, of the last so many."""
 CALM = 2.0
@@ -44,6 +46,10 @@ class Source:
         self._contents: dict[int, int] = {}
         self._newest, self._counted = 0, -1e9
         self._repeated: deque[float] = deque(maxlen=REPEATS)
+
+    def is_from(self, address: Address | None) -> bool:
+        """Whether this is the address of the vehicle."""
+        return address == self._address
 
     def take(self, address: Address | None, now: float) -> bool:
         """Whether a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import hmac
+import math
 import socket
 import time
 from collections.abc import Callable, Container, Iterator
@@ -31,6 +32,10 @@ _HEAD = {0xFE: 8, 0xFD: 12}
 _SIGNED, _SIGNATURE = 1, 13
 READS_AT_ONCE = 500
 """Datagrams or pieces of a stream after which whoever receives gets to do other things, as heeding a signal."""
+STALL = 0.25
+"""A pause between two looks is so much time of listening [s] at most: in a longer one we slept, not the others."""
+SENT_A_SECOND, SENT_AT_ONCE = 100.0, 300.0
+"""Messages that are sent on average and in a burst; answers leave half of the burst to what we say by ourselves."""
 _LONGEST = 12 + 255 + _SIGNATURE
 _DATAGRAM = 65535
 
@@ -163,6 +168,8 @@ class Wire:
         source: of the frame yielded last: UDP address, None on other links.
         signed: whether a signed frame came, believed or not.
         drained: whether nothing was left unread when messages were looked for last.
+        listened: for how long somebody has listened to everything that came [s].
+        held_back: when a message was last not sent because too much is asked for [s].
     """
 
     def __init__(
@@ -192,6 +199,7 @@ class Wire:
                 "for example udpin:0.0.0.0:14540 or /dev/ttyACM0,921600",
             ) from error
         self._datagrams = isinstance(self._conn, mavutil.mavudp)
+        self._serves = self._datagrams and bool(self._conn.udp_server)
         self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
         self._memory: SigningMemory | None = None
         if key is not None:
@@ -200,7 +208,12 @@ class Wire:
             self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * 100_000)
             self._memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
         self._buffer = bytearray()
+        self._own: socket.socket | None = None
+        self._own_address: Any = None
+        self._looked, self._filled, self._tokens = -math.inf, -math.inf, SENT_AT_ONCE
+        self.listened = 0.0
         self.refused = self.dropped = 0
+        self.held_back = -math.inf
         self.source: Any = None
         self.peers = Peers()
         self.signed = False
@@ -212,47 +225,90 @@ class Wire:
         return self._memory.problem if self._memory is not None else ""
 
     def receive(
-        self, wanted: Container[int], most: int, count: Callable[[bytes], None] | None = None,
+        self, wanted: Container[int], admits: Callable[[bytes], bool], now: float,
+        count: Callable[[bytes], None] | None = None,
     ) -> Iterator[Any]:  # fmt: skip
         """Yields the wanted messages that have arrived; never waits, and ends however fast more of them come.
 
         Args:
             wanted: message numbers; others are not even decoded.
-            most: frames to decode at most; what comes beyond is read and dropped.
+            admits: whether a wanted frame is worth its decoding; what is not is dropped.
+            now: any clock that runs on [s].
             count: gets every frame, whether wanted and believable or not.
         """
-        decoded, self.drained = 0, False
-        for _ in range(READS_AT_ONCE):
-            data = self._read()
-            if not data:
-                self.drained = True
-                break
-            if decoded >= most:
-                self.dropped += len(data)
-                continue
-            self._buffer = bytearray(data) if self._datagrams else self._buffer + data
-            for frame in frames(self._buffer, self._datagrams):
-                if count is not None:
-                    count(frame)
-                if message_id(frame) not in wanted:
-                    continue
-                decoded += 1
-                self.signed |= _is_signed(frame)
-                try:
-                    message = self.mav.decode(bytearray(frame))
-                except dialect.MAVError:
-                    self.refused += 1
-                    continue
-                yield message
+        pause, self._looked = now - self._looked, now
+        ports = [self._own, None] if self._own is not None else [None]
+        for port in ports:
+            self.drained = False
+            for _ in range(READS_AT_ONCE):
+                data = self._read(port)
+                if not data:
+                    self.drained = True
+                    break
+                self._buffer = bytearray(data) if self._datagrams else self._buffer + data
+                for frame in frames(self._buffer, self._datagrams):
+                    if count is not None:
+                        count(frame)
+                    if message_id(frame) not in wanted:
+                        continue
+                    if not admits(frame):
+                        self.dropped += len(frame)
+                        continue
+                    self.signed |= _is_signed(frame)
+                    try:
+                        message = self.mav.decode(bytearray(frame))
+                    except dialect.MAVError:
+                        self.refused += 1
+                        continue
+                    yield message
+            if port is ports[0] and self.drained:
+                self.listened += min(pause, STALL)
         if self._memory is not None:
             self._memory.keep()
 
-    def send(self, message: Any) -> None:
-        """Sends a message; a link that is down loses it."""
+    def follow(self, address: Any) -> None:
+        """Gives what comes from one address a buffer of its own, so that the others' floods leave it alone.
+
+        A socket that is bound to the same port and connected gets what comes from there (Linux and BSD).
+        """
+        if address == self._own_address or not self._serves:
+            return
+        self._own_address = address
+        if self._own is not None:
+            self._own.close()
+        self._own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._own.setblocking(False)
+            self._own.bind(self._conn.port.getsockname())
+            self._own.connect(address)
+        except OSError:
+            self._own.close()
+            self._own = None
+
+    def send(self, message: Any, now: float, answer: bool = False) -> None:
+        """Sends a message, as far as the budget allows; a link that is down loses it.
+
+        Args:
+            message: to be sent.
+            now: clock of `receive` [s].
+            answer: to what the frame yielded last asked for: only its sender gets it, if it is a peer, else all do.
+        """
+        self._tokens = min(self._tokens + (now - self._filled) * SENT_A_SECOND, SENT_AT_ONCE)
+        self._filled = now
+        peers = self.peers.answered(self.listened) if self._datagrams else set()
+        if answer and self._serves:
+            peers &= {self.source}
+            if not peers:
+                return
+        if self._tokens < (0.5 * SENT_AT_ONCE if answer else 1.0):
+            self.held_back = now
+            return
+        self._tokens -= 1.0
         frame = message.pack(self.mav)
         self.mav.seq = (self.mav.seq + 1) % 256
         if self._datagrams:
-            self._conn.clients = self.peers.answered(time.monotonic())
+            self._conn.clients = peers
         try:
             self._conn.write(frame)
         except OSError:
@@ -262,13 +318,15 @@ class Wire:
         """Closes the link."""
         if self._memory is not None:
             self._memory.keep(at_once=True)
+        if self._own is not None:
+            self._own.close()
         self._conn.close()
 
-    def _read(self) -> bytes:
+    def _read(self, port: socket.socket | None) -> bytes:
         """Bytes that have arrived, or none; notes where they came from."""
         try:
             if self._datagrams:
-                data, self.source = self._conn.port.recvfrom(_DATAGRAM)
+                data, self.source = (port or self._conn.port).recvfrom(_DATAGRAM)
                 return bytes(data)
             return bytes(self._conn.recv(4096) or b"")
         except (OSError, TypeError):

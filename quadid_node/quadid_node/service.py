@@ -37,7 +37,7 @@ class Feed:
 
     Attributes:
         rate: samples a second over the last two seconds [Hz].
-        silence: since its last sample [s].
+        silence: since its last sample, up to when the service looked for samples last [s].
     """
 
     rate: float
@@ -99,6 +99,7 @@ class Service:
         self._noted = 0
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
+        self._looked = clock()
 
         if restored.approval not in ("", self._configured):
             self.session.active_set.approval = self._approval = restored.approval
@@ -163,7 +164,7 @@ class Service:
 
     def pieces(self) -> Iterator[list[Output]]:
         """As `step`, and gives control back, with what is to be published and told, after each piece of the work."""
-        outputs = self._tidy()
+        outputs, self._looked = self._tidy(), self._clock()
         while True:
             outputs += self._carried_out(self.session.poll(1))
             yield self._journalled(outputs)
@@ -189,6 +190,7 @@ class Service:
 
     def idle(self) -> list[Output]:
         """Looks after worker and history only, while nobody could hear what the session says."""
+        self._looked = self._clock()
         return self._journalled(self._tidy())
 
     def _tidy(self) -> list[Output]:
@@ -245,7 +247,7 @@ class Service:
     def health(self) -> Health:
         """What a monitor wants to know."""
         now = self._clock()
-        feeds = {name: Feed(self._rate(name, now), now - at) for name, at in self._arrived.items()}
+        feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else "none kept"
         return Health(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)

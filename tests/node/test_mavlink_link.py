@@ -207,6 +207,115 @@ def test_a_second_source_under_the_same_id_is_refused_and_said(
     happened(27, "60 frames of a second UDP source under the vehicle's ids: none taken, said")
 
 
+@pytest.mark.parametrize("stall", [3.5, 60.0])
+def test_a_stall_of_the_service_hands_the_vehicle_to_nobody(port: int, stall: float, happened: Happened) -> None:
+    """By the link's own clock: all that was sent meanwhile waits in the sockets, the second sender's first."""
+    now = [1000.0]
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, clock=lambda: now[0])
+    vehicle, other = Sender(port), Sender(port)
+    vehicle.heartbeat()
+    samples(link, 0.1)
+
+    def taken(frames: int) -> set[float]:
+        """Rates of the samples taken of 5 frames of the other and one of the vehicle, ten times."""
+        for k in range(frames):
+            other.imu(500.0 + 0.01 * k, rate=50.0)
+            if k % 5 == 4:
+                vehicle.imu(1.0 + 0.01 * k)
+        return {s.values[0] for s in link.receive() if s.channel == "gyro"}
+
+    for _ in range(10):
+        now[0] += 0.02
+        assert len(taken(10)) == 1
+    for _ in range(3):
+        now[0] += stall
+        assert max(taken(20)) < 1.0
+    assert "second source" in link.traffic().problems[0]
+    for _ in range(40):  # the vehicle falls silent, and comes from elsewhere
+        now[0] += 0.1
+        assert not list(link.receive())
+    other.imu(500.0, rate=50.0)
+    got = [s.values[0] for s in link.receive() if s.channel == "gyro"]
+    assert got == pytest.approx([50.0])
+    link.close()
+    happened(14, f"the service stalls for {stall:g} s while two send under the vehicle's ids: the vehicle stays")
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_flood_of_other_systems_costs_the_vehicle_no_frame(port: int, known: bool, happened: Happened) -> None:
+    """More than the socket's buffer holds between two looks, by the link's own clock."""
+    now = [1000.0]
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, clock=lambda: now[0])
+    vehicle, others = Sender(port), [Sender(port, system=77 + k) for k in range(3)]
+    vehicle.heartbeat()
+    samples(link, 0.1)
+    if known:
+        for sender in others:
+            sender.heartbeat(autopilot=8)
+        samples(link, 0.7)
+    sent = got = flood = 0
+    for _ in range(50):
+        now[0] += 0.02
+        for k in range(600):
+            others[k % 3].heartbeat(autopilot=8)
+        flood += 600
+        for _ in range(10):
+            vehicle.imu(1.0 + 0.002 * sent)
+            sent += 1
+        got += sum(s.channel == "gyro" for s in link.receive())
+    for _ in range(10):
+        got += sum(s.channel == "gyro" for s in link.receive())
+    assert got == sent
+    assert any("flood" in problem for problem in link.traffic().problems)
+    link.close()
+    happened(
+        14, f"{flood} valid heartbeats a second of other systems: {got} of the vehicle's {sent} frames taken, said"
+    )
+
+
+def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
+    now = [1000.0]
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, clock=lambda: now[0])
+    vehicle, stations, stranger = Sender(port), [Sender(port, 200 + k, 190) for k in range(7)], Sender(port, 250)
+    for _ in range(3):
+        vehicle.heartbeat()
+        for station in stations:
+            station.heartbeat(autopilot=8)
+        for _ in range(2):
+            now[0] += 0.3
+            list(link.receive())
+            now[0] += 0.3
+            list(link.receive())
+    link.publish(accepted())
+    for sender in (vehicle, *stations):
+        sender.heard(0.05)
+    asked, seconds = 0, 4
+    kinds = (
+        dialect.MAVLink_param_set_message(1, 191, b"QI_SEQ", 1.0, 9),
+        dialect.MAVLink_param_request_read_message(1, 191, b"QI_SEQ", -1),
+        dialect.MAVLink_param_set_message(1, 191, b"WHAT", 1.0, 9),
+    )
+    answers = 0
+    for _ in range(20 * seconds):
+        now[0] += 0.05
+        for message in kinds * 10:
+            stations[0].send(message)
+            stranger.send(message)
+            asked += 2
+        list(link.receive())
+        link.step()
+        answers += len([m for m in stations[0].heard(0.002) if m.get_type().startswith("PARAM")])
+    others = [m for s in stations[1:] for m in s.heard(0.05) if m.get_type().startswith("PARAM")]
+    assert 0 < answers <= 100 * seconds + 150
+    assert others == [], "an answer goes to who asked"
+    assert not stranger.heard(0.05)
+    assert any("held back" in problem for problem in link.traffic().problems)
+    link.publish(accepted())
+    assert any(m.get_type() == "STATUSTEXT" for m in vehicle.heard()), "what we say by ourselves has room"
+    link.close()
+    happened(14, f"{asked} requests in {seconds} s: {answers} answers, all to who asked")
+
+
 def test_two_senders_mixed_into_one_stream_are_told_by_their_frame_numbers(happened: Happened) -> None:
     """As a router that merges links does: one address, or a serial line, which has none."""
     lossy, mixed, rng = Source(), Source(), random.Random(1)
