@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from quadid_workflow.score import score as score
     from quadid_workflow.simulate import simulate as simulate
 
+    from quadid.model.step import Simulator as Simulator
     from quadid.parameters import ParameterSet as ParameterSet
     from quadid.vehicle import Vehicle as Vehicle
 
@@ -39,6 +40,7 @@ _PUBLIC = {
     "score": "quadid_workflow.score",
     "simulate": "quadid_workflow.simulate",
     "export": "quadid_workflow.export",
+    "Simulator": "quadid.model.step",
     "Vehicle": "quadid.vehicle",
     "ParameterSet": "quadid.parameters",
 }

@@ -66,7 +66,7 @@ def _rotors(
             rot[r, R_NOW + lane] = sent[(step - shift) % HISTORY, r, lane]
             rot[r, R_PAST + lane] = sent[(step - shift - 1) % HISTORY, r, lane]
             rot[r, R_NEXT + lane] = rot[r, R_NOW + lane]
-        turn_rotor(False, 0.0, r, True, False, geometry, dt, need, rot, s)
+        turn_rotor(False, r, True, False, geometry, dt, need, rot, s)
 
 
 @nb.njit(**jit)

@@ -128,11 +128,10 @@ def _add_rotor(m1, m2, n1, n2, dw, dv, x, y, spin, keep, lane, s):  # type: igno
 
 
 @nb.njit(**jit)
-def turn_held(a: float, x: float, y: float, spin: float, inv: float, keep: float, s: FloatArray) -> None:
-    """Turns one rotor through a step of constant input `a` [rad/s] in every lane: two pieces, the half steps.
+def turn_held(x: float, y: float, spin: float, inv: float, keep: float, s: FloatArray) -> None:
+    """Turns one rotor through a step of constant input, row T_A1 [rad/s]: two pieces, the half steps.
 
     Args:
-        a: input.
         x: place of its hub [m].
         y: place of its hub [m].
         spin: its sense.
@@ -142,7 +141,7 @@ def turn_held(a: float, x: float, y: float, spin: float, inv: float, keep: float
     """
     lane_kernel()
     for lane in range(LANES):
-        w0 = s[T_SPEED + lane]
+        w0, a = s[T_SPEED + lane], s[T_A1 + lane]
         m1, m2, wm = _held_piece(w0, a, B + lane, s)
         n1, n2, w1 = _held_piece(wm, a, D + lane, s)
         s[T_SPEED + lane] = w1

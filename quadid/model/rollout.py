@@ -51,6 +51,20 @@ _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
 
 
+def hub_geometry(vehicle: Vehicle) -> tuple[FloatArray, float, tuple[float, float, float, float, float], float]:
+    """Geometry that the kernel needs.
+
+    Returns:
+        Hubs (rotors, 4), see `quadid.model.rotor_kernel.Drive`; mean z of the hubs [m]; means of x, y, x^2, y^2, x y of
+        the hubs; half the smallest distance between two of them [m].
+    """
+    positions = vehicle.rotor_positions
+    rotors, hub, (x, y) = len(positions), float(positions[:, 2].mean()), positions[:, :2].T
+    plan = (float(x.mean()), float(y.mean()), float(x @ x) / rotors, float(y @ y) / rotors, float(x @ y) / rotors)
+    gaps = [float(np.linalg.norm(a - b)) for i, a in enumerate(positions) for b in positions[:i]]
+    return np.column_stack([positions[:, :2], vehicle.spins, positions[:, 2] - hub]), hub, plan, 0.5 * min(gaps)
+
+
 class _Lanes(NamedTuple):
     """One block: parameter vectors (LANES, size), tangent offsets (12, LANES), needs, shared rotor moments.
 
@@ -84,12 +98,7 @@ class Rollout:
             )
         self.window, self.vehicle = window, vehicle
         self.mass = vehicle.mass
-        positions = vehicle.rotor_positions
-        hub, (x, y) = float(positions[:, 2].mean()), positions[:, :2].T
-        plan = (float(x.mean()), float(y.mean()), float(x @ x) / rotors, float(y @ y) / rotors, float(x @ y) / rotors)
-        self.geometry = np.column_stack([positions[:, :2], vehicle.spins, positions[:, 2] - hub])
-        gaps = [float(np.linalg.norm(a - b)) for i, a in enumerate(positions) for b in positions[:i]]
-        self.reach = 0.5 * min(gaps)
+        self.geometry, hub, plan, self.reach = hub_geometry(vehicle)
         self.channels = channels_of(window)
         self.measured, self.valid = measurements(window, self.channels)
         self._terms = residual_terms(vehicle)

@@ -18,8 +18,8 @@ from quadid.types import FloatArray
 # isort: off
 from quadid.model.work_array import (
     A_S2, A_X1, A_XX, A_XY, A_XZ, A_Y1, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, ALL_MOMENTS, C_GROWTH, C_HOVER, C_ROW, C_SHIFT,
-    C_VOLT, HALF, N_ROWS, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED, ROTOR, T_DRAG, T_M1,
-    T_M2, T_N1, T_N2, T_SPEED, T_VOLT,
+    C_VOLT, HALF, N_ROWS, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST, R_PAST_SLOPE, R_SPEED, ROTOR, T_A1,
+    T_DRAG, T_M1, T_M2, T_N1, T_N2, T_SPEED, T_VOLT,
 )  # fmt: skip
 
 # isort: on
@@ -106,14 +106,13 @@ def _scale_inputs(drive: Drive, rot: FloatArray, s: FloatArray) -> None:
 
 @nb.njit(**jit)
 def turn_rotor(
-    plain: bool, a: float, r: int, held: bool, sloped: bool, geometry: FloatArray, dt: float, need: Needs,
+    plain: bool, r: int, held: bool, sloped: bool, geometry: FloatArray, dt: float, need: Needs,
     rot: FloatArray, s: FloatArray,
 ) -> None:  # fmt: skip
     """Advances rotor r over one step and adds it to the moments of both half steps.
 
     Args:
-        plain: the input is `a` in every lane over the whole step; else it is in the rows of the rotor.
-        a: that input [rad/s].
+        plain: the input stays at row T_A1 [rad/s] over the whole step; else it is in the rows of the rotor.
         r: rotor; the first one begins the sums.
         held: the input acts held, else linear between samples.
         sloped: a held input runs on within its samples.
@@ -128,7 +127,7 @@ def turn_rotor(
     for i in range(3 * LANES):
         s[T_SPEED + i] = rot[r, R_SPEED + i]  # and both gains
     if plain and not need.uneven:
-        turn_held(a, x, y, spin, inv, keep, s)
+        turn_held(x, y, spin, inv, keep, s)
     else:
         next_input(r, held, sloped, inv, rot, s)
         turn(x, y, spin, inv, keep, s)
@@ -187,7 +186,10 @@ def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArra
     if not plain:
         _read_inputs(drive, k, need, rot, s)
     for r in range(len(rot)):
-        turn_rotor(plain, drive.u[k, r], r, drive.held, sloped, drive.geometry, drive.dt, need, rot, s)
+        if plain:
+            for lane in range(LANES):
+                s[T_A1 + lane] = drive.u[k, r]
+        turn_rotor(plain, r, drive.held, sloped, drive.geometry, drive.dt, need, rot, s)
 
 
 @nb.njit(**jit)

@@ -1,0 +1,160 @@
+"""Steps of the simulation: the same as the rollout, for one vehicle or many, from a state that holds everything."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quadid
+from quadid.errors import ParameterError, WindowError
+from quadid.model.layout import Layout
+from quadid.model.step import RandomInputs, Simulator
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+from tests.model.independent import Input
+from tests.model.simulate import simulate, state
+
+PELICAN = Vehicle.shipped("pelican")
+EFFECTS: list[dict[str, dict[str, float]]] = [
+    {},
+    {"motor_lag": {"tau": 0.05}},
+    {"motor_lag": {"tau": 0.03, "tau_down": 0.06}, "parasitic_drag": {"c": 0.03}},
+    {"command_delay": {"delay": 0.033}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "wind": {"north": 2.0, "east": -1.0}},
+    {"cg_offset": {"x": 0.005, "y": -0.002}, "gyro_bias": {"x": 0.01, "y": 0.0, "z": -0.02}},
+    {"weak_rotor": {"rotor": 2, "loss": 0.1}, "thrust_curve": {"dead_speed": 30.0}, "rate_damping": {"l_p": 0.5}},
+    {"mass_change": {"time": 0.5, "fraction": 0.2, "J_xx": 0.1}, "thrust_drop": {"time": 0.8, "fraction": 0.05}},
+]
+
+
+def craft(effects: dict[str, dict[str, float]]) -> Vehicle:
+    return PELICAN.model_copy(update={"effects": effects})
+
+
+def speeds(vehicle: Vehicle, n: int = 60) -> FloatArray:
+    return np.asarray(vehicle.hover_speed() * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((n, 4))))
+
+
+@pytest.mark.parametrize("effects", EFFECTS, ids=lambda e: "+".join(e) or "nominal")
+def test_steps_are_those_of_the_rollout(effects: dict[str, dict[str, float]]) -> None:
+    vehicle = craft(effects)
+    rows = speeds(vehicle)
+    rolled = simulate(craft({}), effects_of(vehicle), Input(rows, 0.02, 0.0, "held"), state())
+    simulator = Simulator(vehicle)
+    now = simulator.start(rotor_speed=rows[0], dt=0.02)
+    for row, quaternion, rate, velocity, position in zip(
+        rows, rolled.quaternion, rolled.rate, rolled.velocity, rolled.position, strict=False
+    ):
+        now = simulator.step(now, row, 0.02)
+        sign = np.sign(now.reported_attitude[0, 0])
+        np.testing.assert_allclose(sign * now.reported_attitude[0], quaternion, atol=1e-9)
+        np.testing.assert_allclose(now.gyro[0], rate, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(now.velocity[0], velocity, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(now.position[0], position, rtol=1e-9, atol=1e-12)
+
+
+def effects_of(vehicle: Vehicle) -> dict[str, float]:
+    """Entries of the parameter vector of a file that are not neutral."""
+    layout = Layout(vehicle)
+    theta, neutral = layout.initial(vehicle), layout.neutral()
+    return {n: float(theta[e.index]) for n, e in layout.entries.items() if theta[e.index] != neutral[e.index]}
+
+
+@pytest.mark.parametrize("effects", [*EFFECTS, {"imu_lag": {"cutoff": 8.0}, "attitude_delay": {"delay": 0.03}}])
+def test_a_loop_of_steps_is_a_run_and_old_states_stay(effects: dict[str, dict[str, float]]) -> None:
+    vehicle = craft(effects)
+    rows = speeds(vehicle)
+    simulator = Simulator(vehicle)
+    begin = simulator.start(rotor_speed=rows[0], dt=0.02)
+    kept = begin.copy()
+    now = begin
+    for row in rows:
+        now = simulator.step(now, row, 0.02)
+    whole = simulator.run(kept, rows, 0.02)[-1, 0]
+    seen = np.concatenate([now.attitude, now.rate, now.velocity, now.position, now.reported_attitude, now.gyro], axis=1)
+    np.testing.assert_allclose(seen[0], whole[:20], rtol=1e-12, atol=1e-15)  # times are summed, or multiplied
+    np.testing.assert_array_equal(begin.position, 0.0)
+    assert (now.steps, now.time) == (len(rows), pytest.approx(1.2))
+
+
+def test_the_motor_lag_is_not_lost_between_steps() -> None:
+    """A stepwise call once began each step with rotors at the command: 0.318 instead of 0.058 rad/s after two."""
+    vehicle = craft({"motor_lag": {"tau": 0.05}})
+    hover = np.full(4, vehicle.hover_speed())
+    push = hover + np.array([0.0, -20.0, 0.0, 20.0])
+    simulator = Simulator(vehicle)
+    slow = simulator.start(dt=0.02)
+    for _ in range(2):
+        slow = simulator.step(slow, push, 0.02)
+    direct = Simulator(craft({}))
+    fast = direct.start(dt=0.02)
+    for _ in range(2):
+        fast = direct.step(fast, push, 0.02)
+    assert 0.0 < slow.rate[0, 0] < 0.4 * fast.rate[0, 0]
+    expected = hover + (push - hover) * (1.0 - np.exp(-0.04 / 0.05))
+    np.testing.assert_allclose(slow.rotor_speed[0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 16, 21])
+def test_a_batch_flies_as_each_vehicle_alone(count: int) -> None:
+    vehicle = craft({"motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}})
+    rng = np.random.default_rng(2)
+    thetas = np.tile(Layout(vehicle).initial(vehicle), (count, 1))
+    thetas[:, :6] *= np.exp(0.1 * rng.standard_normal((count, 6)))
+    rows = vehicle.hover_speed() * (1.0 + 0.02 * rng.standard_normal((30, count, 4)))
+    batch = Simulator(vehicle, thetas)
+    together = batch.run(batch.start(rotor_speed=rows[0], dt=0.01), rows, 0.01)
+    for i in range(count):
+        alone = Simulator(vehicle, thetas[i])
+        one = alone.run(alone.start(rotor_speed=rows[0, i], dt=0.01), rows[:, i], 0.01)
+        np.testing.assert_allclose(together[:, i], one[:, 0], rtol=1e-12, atol=1e-14)
+
+
+def test_random_inputs_repeat_and_have_their_size() -> None:
+    random = RandomInputs(force=(0.5, 0.5, 0.2), force_time=0.4, turn=(3.0, 2.0, 1.0), turn_time=0.1)
+    thetas = np.tile(Layout(PELICAN).initial(PELICAN), (400, 1))
+    rows = np.full((200, 4), PELICAN.hover_speed())
+    runs = []
+    for seed in (1, 1, 2):
+        simulator = Simulator(PELICAN, thetas, random=random, seed=seed)
+        runs.append(simulator.run(simulator.start(dt=0.01), np.repeat(rows[:, None], 400, axis=1), 0.01))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+    # Variance of an integrated Gauss-Markov process that begins at zero, t much longer than T.
+    t, big = 2.0, 0.1
+    grown = 2.0 * big * (t - 1.5 * big)
+    np.testing.assert_allclose(runs[0][-1, :, 4:7].std(axis=0), np.array([3.0, 2.0, 1.0]) * np.sqrt(grown), rtol=0.12)
+    again = Simulator(PELICAN, thetas, random=random, seed=1)
+    state = again.start(dt=0.01)
+    branch = again.step(state, rows[0], 0.01)
+    np.testing.assert_array_equal(branch.rate, again.step(state, rows[0], 0.01).rate)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda s, x: s.step(x, np.zeros(3), 0.01), "commands of shape"),
+        (lambda s, x: s.step(x, np.zeros((2, 4)), 0.01), "commands of shape"),
+        (lambda s, x: s.step(x, np.zeros(4), 0.0), "dt 0.0 s"),
+        (lambda s, x: s.start(attitude=np.zeros(3)), "shapes"),
+        (lambda s, x: s.start(dt=float("nan")), "dt nan s"),
+    ],
+)
+def test_what_does_not_fit_is_refused(call: Any, said: str) -> None:
+    simulator = Simulator(PELICAN)
+    with pytest.raises(WindowError, match=said):
+        call(simulator, simulator.start(dt=0.01))
+
+
+def test_files_that_need_more_say_so() -> None:
+    with pytest.raises(ParameterError, match="battery_sag without a length"):
+        Simulator(craft({"battery_sag": {"fraction": 0.1}}))
+    with pytest.raises(ParameterError, match="parameter vectors of shape"):
+        Simulator(PELICAN, np.zeros((2, 3)))
+    with pytest.raises(ParameterError, match="not negative"):
+        RandomInputs(force=(-1.0, 0.0, 0.0))
+    delayed = Simulator(craft({"command_delay": {"delay": 0.02}}))
+    with pytest.raises(WindowError, match="one step size"):
+        delayed.step(delayed.start(dt=0.01), np.full(4, 400.0), 0.005)
+    assert quadid.Simulator is Simulator
