@@ -7,6 +7,7 @@ Times are the best of many short runs, since other programs only add to them.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 
@@ -62,7 +63,7 @@ def main() -> None:
     print(f"one vehicle, a new state:      {1e6 * best(lambda: one.step(state, hover, DT), 5000):8.1f} us a step")
     rows = np.tile(hover, (1000, 1))
     print(f"one vehicle, 1000 steps a run: {1e3 * best(lambda: one.run(state, rows, DT), 20):8.2f} us a step")
-    nominal = np.tile(Layout(pelican).initial(pelican), (BATCH, 1))
+    nominal, commands = np.tile(Layout(pelican).initial(pelican), (BATCH, 1)), np.tile(hover, (BATCH, 1))
     random = RandomInputs((0.1, 0.1, 0.1), 1.0, (1.0, 1.0, 1.0), 0.5)
     for name, thetas, extra in (
         ("nominal", nominal, None),
@@ -70,8 +71,7 @@ def main() -> None:
     ):
         batch = Simulator(pelican, thetas, random=extra, span=60.0)
         flying = batch.start(dt=DT)
-        commands = np.tile(hover, (BATCH, 1))
-        each = best(lambda batch=batch, flying=flying: batch.advance(flying, commands, DT), 5) / BATCH  # type: ignore[misc]
+        each = best(functools.partial(batch.advance, flying, commands, DT), 5) / BATCH
         print(f"{BATCH} vehicles, {name}: {1e9 * each:.0f} ns a vehicle and step")
     if (peer := rotorpy_step()) is not None:
         print(f"RotorPy, one vehicle:          {1e6 * peer:8.1f} us a step")
