@@ -46,7 +46,7 @@ TURNS = 6
 
 
 @nb.njit(**jit)
-def _scrambled(x: int) -> int:
+def _scrambled(x: np.uint64) -> np.uint64:
     """Scrambles 64 bits: splitmix64's finaliser (Steele, Lea & Flood 2014, doi:10.1145/2660193.2660195)."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

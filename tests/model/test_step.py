@@ -75,7 +75,8 @@ def test_a_loop_of_steps_is_a_run_and_old_states_stay(effects: dict[str, dict[st
     seen = np.concatenate([now.attitude, now.rate, now.velocity, now.position, now.reported_attitude, now.gyro], axis=1)
     np.testing.assert_allclose(seen[0], whole[:20], rtol=1e-12, atol=1e-15)  # times are summed, or multiplied
     np.testing.assert_array_equal(begin.position, 0.0)
-    assert (now.steps, now.time) == (len(rows), pytest.approx(1.2))
+    assert now.steps == len(rows)
+    assert now.time == pytest.approx(1.2)
 
 
 def test_the_motor_lag_is_not_lost_between_steps() -> None:
