@@ -12,7 +12,7 @@ import numpy as np
 from quadid.types import FloatArray
 from quadid_replay.cdr_blocks import Blocks
 from quadid_replay.frames import cross, flip_attitude, flip_body, flip_world, from_euler, to_euler
-from quadid_replay.motors import RPM
+from quadid_replay.motors import RPM, motor_columns
 
 Signals = list[tuple[str, Sequence[float]]]
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
@@ -128,6 +128,19 @@ def _px4(name: str, values: Callable[[Any], Sequence[float]], published: bool = 
     return MessageType(lambda m: [values(m)], lambda blocks, extra: [(name, blocks[0])], stamp=stamp)
 
 
+def _px4_speeds(m: Any) -> list[float]:
+    """Speeds in the order of the motors, which each ESC names; in that of the ESCs where none does (older PX4).
+
+    Raises:
+        ValueError: some ESCs name a motor, and no order of all motors follows.
+    """
+    functions = [int(getattr(e, "actuator_function", 0)) for e in m.esc]
+    columns = motor_columns(functions)
+    if not columns and any(functions):
+        raise ValueError(f"esc_status: actuator_function {functions} names no complete row of motors")
+    return [abs(m.esc[k].esc_rpm) * RPM for k in columns or range(m.esc_count)]
+
+
 def _escs(name: str) -> MessageType:
     return MessageType(
         lambda m: [[abs(e.rpm) * RPM for e in getattr(m, name)]], lambda blocks, extra: [("rotor_speed", blocks[0])]
@@ -194,9 +207,7 @@ TYPES: dict[str, MessageType] = {
     "px4_msgs/BatteryStatus": _px4("battery", lambda m: [m.voltage_v], True),
     "px4_msgs/ActuatorMotors": _px4("actuator_motors", lambda m: list(m.control), True),
     "px4_msgs/ActuatorOutputs": _px4("outputs", lambda m: list(m.output), True),
-    "px4_msgs/EscStatus": _px4(
-        "rotor_speed", lambda m: [abs(e.esc_rpm) * RPM for e in m.esc[: m.esc_count]], True
-    ),
+    "px4_msgs/EscStatus": _px4("rotor_speed", _px4_speeds, True),
 }  # fmt: skip
 """Message types that are read, without the ``msg`` in the middle of their name."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from quadid_replay import TopicWriter, open_log, write_mcap
+from quadid_replay.mcap_messages import TYPES
 from quadid_replay.motors import RPM
 from quadid_replay.schemas import schema_text
 from rosbags.highlevel import AnyReader
@@ -259,3 +262,36 @@ def test_our_definitions_are_those_of_the_message_package(repository: Path) -> N
     theirs = {f.name: f.read_text() for f in (repository / "msgs" / "msg").glob("*.msg")}
     ours = {f.name: f.read_text() for f in folder.glob("*.msg")}
     assert ours == theirs, "copy msgs/msg/*.msg to replay/quadid_replay/schemas/quadid_msgs"
+
+
+@dataclass
+class _Esc:
+    esc_rpm: int
+    actuator_function: int
+
+
+def _escs_of(*functions: int) -> SimpleNamespace:
+    """px4_msgs/EscStatus of eight ESCs, of which so many are connected; the ESC in place k turns k + 1 hundred rpm."""
+    esc = [_Esc(100 * (k + 1), f) for k, f in enumerate([*functions, *[0] * (8 - len(functions))])]
+    return SimpleNamespace(timestamp=1_000_000, esc_count=4, esc=esc)
+
+
+@pytest.mark.parametrize(
+    ("functions", "places"),
+    [
+        ((0, 0, 0, 0), (1, 2, 3, 4)),
+        ((101, 102, 103, 104), (1, 2, 3, 4)),
+        ((104, 103, 101, 102), (3, 4, 2, 1)),
+        ((0, 0, 102, 101, 0, 104, 103), (4, 3, 7, 6)),
+        ((101, 201, 102, 103, 104), (1, 3, 4, 5)),
+    ],
+)
+def test_px4_escs_go_to_the_motors_that_they_name(functions: tuple[int, ...], places: tuple[int, ...]) -> None:
+    kind = TYPES["px4_msgs/EscStatus"]
+    (row,) = kind.blocks(_escs_of(*functions))
+    np.testing.assert_allclose(row, [100 * place * RPM for place in places])
+
+
+def test_px4_escs_that_name_no_complete_row_of_motors_are_refused() -> None:
+    with pytest.raises(ValueError, match="no complete row of motors"):
+        TYPES["px4_msgs/EscStatus"].blocks(_escs_of(101, 103, 104, 0))
