@@ -1,57 +1,43 @@
-"""Reads a log in this process: the reader of its format, and why a file cannot be read."""
+"""Formats of logs: the reader of each, and why a file cannot be read."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from quadid.errors import LogError
 from quadid.window import Recording
 from quadid_replay.bag_folder import bag_files, is_bag_folder
-from quadid_replay.recognise import ALLOWED, HEAD_BYTES, Format, recognise
+from quadid_replay.recognise import ALLOWED, FORMATS, HEAD_BYTES, LogFormat, recognise
+
+
+def reader_of(kind: str) -> Callable[..., Recording]:
+    """The function that reads the format of this name, with only the libraries imported that it needs."""
+    (module, name) = next(f.reader for f in FORMATS if f.name == kind).split(":")
+    read: Callable[..., Recording] = getattr(import_module(f"quadid_replay.{module}"), name)
+    return read
 
 
 def read_here(file: Path, preset: str, columns: Mapping[str, str] | None = None) -> Recording:
-    """Reads a log in this process, whatever its size; else as `open_log`."""
+    """Reads a log in this process, without limits; else as `open_log`."""
     kind = kind_of(file, columns)
+    given: dict[str, Any] = {"preset": preset, "columns": columns}
     try:
-        if kind in ("mcap", "rosbag2"):
-            from quadid_replay.mcap_reader import read_mcap
-
-            recording = read_mcap(file, preset=preset)
-        elif kind == "csv":
-            from quadid_replay.csv_reader import read_csv
-
-            recording = read_csv(file, columns)
-        else:
-            recording = _reader(kind)(file)
+        recording = reader_of(kind.name)(file, **{name: given[name] for name in kind.takes})
         return replace(recording, sha256=_sha256(file))
     except OSError as error:
         raise _unreadable(file, error) from error
 
 
-def _reader(kind: Format) -> Callable[[Path], Recording]:
-    """Imports only the library that this format needs."""
-    if kind == "dataflash":
-        from quadid_replay.dataflash_reader import read_dataflash as read
-    elif kind == "ulog":
-        from quadid_replay.ulog_reader import read_ulog as read
-    elif kind == "blackbox":
-        from quadid_replay.blackbox_reader import read_blackbox as read
-    elif kind == "usdlog":
-        from quadid_replay.usd_reader import read_usd as read
-    else:
-        from quadid_replay.tlog_reader import read_tlog as read
-    return read
-
-
-def kind_of(file: Path, columns: Mapping[str, str] | None) -> Format:
+def kind_of(file: Path, columns: Mapping[str, str] | None) -> LogFormat:
     """The format of a file; of a folder, that it is a recording of rosbag2."""
     try:
         if file.is_dir() and is_bag_folder(file):
-            return "rosbag2"
+            return next(f for f in FORMATS if f.name == "rosbag2")
     except (OSError, ValueError):  # `_head` says what is wrong with such a path
         pass
     return recognise(_head(file), file.name, (columns or {}).get("t", "t"))

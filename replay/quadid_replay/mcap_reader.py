@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -19,7 +17,6 @@ from quadid.sanitise import plain
 from quadid.window import Recording
 from quadid_replay.bag_topics import Topic
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
-from quadid_replay.definition_check import DefinitionError, check_definition
 from quadid_replay.mcap_decode import Source, decode_messages, source_of
 from quadid_replay.mcap_messages import SIGNALS, TYPES, type_name
 from quadid_replay.motors import active_outputs
@@ -35,7 +32,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
         preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
 
     Raises:
-        LogError: no topic of a known type, unknown preset, or a file made to exhaust memory.
+        LogError: no topic of a known type, or unknown preset.
     """
     bag = open_bag(path)
     notes: list[str] = []
@@ -66,9 +63,6 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
             continue
         try:
             decode = _decoder(topic.type, topic.definition)
-        except DefinitionError as error:
-            notes.append(f"{topic.name}: its message definition is damaged ({error}): not used")
-            continue
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
@@ -79,9 +73,7 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
 @lru_cache(maxsize=64)
 def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
     """The library's decoder of a type; making one costs more than decoding a hundred messages."""
-    check_definition(definition)
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):  # it prints
-        decode: Callable[[bytes], Any] = generate_dynamic(kind, definition)[kind]
+    decode: Callable[[bytes], Any] = generate_dynamic(kind, definition)[kind]
     return decode
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 from quadid.errors import LogError
 from quadid.window import Recording
-from quadid_replay.formats import kind_of, parts_of, read_here
+from quadid_replay.formats import kind_of, parts_of
 from quadid_replay.presets import AUTO, preset_rank
+from quadid_replay.reading import read_in_child
 
 LARGE = 4 << 20
-"""Files of this size [bytes] are read in a child process with limits."""
+"""Files of this size [bytes] are looked at for missing parts; of small ones a file system may store nothing apart."""
 _STORED = 0.02
 """A large file of which less than this share is stored holds nothing but zeros: its copy was not finished."""
 
@@ -19,7 +20,8 @@ _STORED = 0.02
 def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
 
-    A large one (`LARGE`) is read in a child process with limited memory and time, see `quadid_replay.reading`.
+    It is read in a child process with limited memory and time, see `quadid_replay.reading`; here only its first bytes
+    are looked at.
 
     Args:
         path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
@@ -33,17 +35,13 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
-    kind_of(file, columns)
+    kind = kind_of(file, columns)
     sizes = [part.stat() for part in parts_of(file)]
     size = sum(part.st_size for part in sizes)
-    if size >= LARGE:
-        stored = 512 * sum(part.st_blocks for part in sizes)
-        if stored < _STORED * size:
-            raise LogError(
-                f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
-                "copy it again: the copy or the logger stopped before the end",
-            )  # fmt: skip
-        from quadid_replay.reading import read_in_child  # limits of a process: not on every system
-
-        return read_in_child(file, size, preset, columns)
-    return read_here(file, preset, columns)
+    stored = 512 * sum(part.st_blocks for part in sizes)
+    if size >= LARGE and stored < _STORED * size:
+        raise LogError(
+            f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
+            "copy it again: the copy or the logger stopped before the end",
+        )  # fmt: skip
+    return read_in_child(file, kind.name, size, preset, columns)

@@ -1,13 +1,13 @@
-"""Tells the format of a log from its first bytes; the suffix is never believed."""
+"""The formats of logs, each told from its first bytes; the suffix is never believed."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import NamedTuple
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
 
-Format = Literal["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "blackbox", "csv"]
 HEAD_BYTES = 65536
 """How much of the file is looked at."""
 ALLOWED = (
@@ -15,13 +15,6 @@ ALLOWED = (
     "Crazyflie µSD log, Betaflight blackbox, CSV with a header row and a column t"
 )
 
-_MAGIC: tuple[tuple[bytes, Format], ...] = (
-    (b"\x89MCAP0\r\n", "mcap"),
-    (b"SQLite format 3\x00", "rosbag2"),
-    (b"ULog\x01\x12\x35", "ulog"),
-    (b"H Product:Blackbox", "blackbox"),
-    (b"\xbc\x02\x00", "usdlog"),
-)
 _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
     (b"#ROSBAG V2.0", "a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst DIR, then to MCAP"),
     (b"\x1f\x8b", "gzip-compressed", "unpack it: gunzip FILE"),
@@ -39,7 +32,27 @@ _FEW_COLUMNS = 3
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 
 
-def recognise(head: bytes, name: str, time: str = "t") -> Format:
+class LogFormat(NamedTuple):
+    """A format of logs: its name, how it begins, and what reads it.
+
+    Attributes:
+        name: as `Recording.format` has it.
+        begins: its first bytes, or what tells it from the first `HEAD_BYTES` and the name of a CSV's column of time.
+        reader: module of this package and function in it, which takes the path and returns a `Recording`.
+        takes: arguments of `quadid_replay.open_log` that the function takes beside the path.
+    """
+
+    name: str
+    begins: bytes | Callable[[bytes, str], bool]
+    reader: str
+    takes: tuple[str, ...] = ()
+
+    def fits(self, head: bytes, time: str) -> bool:
+        """Tells whether a log that begins with `head` is of this format."""
+        return head.startswith(self.begins) if isinstance(self.begins, bytes) else self.begins(head, time)
+
+
+def recognise(head: bytes, name: str, time: str = "t") -> LogFormat:
     """Returns the format of a log that begins with `head`.
 
     Args:
@@ -52,18 +65,12 @@ def recognise(head: bytes, name: str, time: str = "t") -> Format:
     """
     if not head:
         raise LogError(f"{name}: empty file", ALLOWED, "check that the logger finished writing, then copy it again")
-    for magic, kind in _MAGIC:
-        if head.startswith(magic):
-            return kind
     for magic, what, fix in _FOREIGN:
         if head.startswith(magic):
             raise LogError(f"{name}: {what}", ALLOWED, fix)
-    if _is_dataflash(head):
-        return "dataflash"
-    if _is_tlog(head):
-        return "tlog"
-    if _is_csv(head, time):
-        return "csv"
+    for known in FORMATS:
+        if known.fits(head, time):
+            return known
     cells = _cells(head)
     if len(cells) > _FEW_COLUMNS and all(cell.isprintable() for cell in cells):
         raise LogError(
@@ -107,11 +114,6 @@ def _frame_length(head: bytes, at: int) -> int | None:
     return 8 + 12 + payload + (13 if head[at + 10] & 1 else 0)
 
 
-def _is_csv(head: bytes, time: str) -> bool:
-    """Text whose first line that is not a comment holds the column of time."""
-    return time in _cells(head)
-
-
 def _cells(head: bytes) -> list[str]:
     """Cells of the header of a CSV; none where it is not text."""
     line = (header_line(head) or "").replace(";", ",").replace("\t", ",")
@@ -128,3 +130,16 @@ def header_line(head: bytes) -> str | None:
                 return None
             return text if text.replace("\t", " ").isprintable() else None
     return None
+
+
+FORMATS = (
+    LogFormat("mcap", b"\x89MCAP0\r\n", "mcap_reader:read_mcap", ("preset",)),
+    LogFormat("rosbag2", b"SQLite format 3\x00", "mcap_reader:read_mcap", ("preset",)),
+    LogFormat("ulog", b"ULog\x01\x12\x35", "ulog_reader:read_ulog"),
+    LogFormat("blackbox", b"H Product:Blackbox", "blackbox_reader:read_blackbox"),
+    LogFormat("usdlog", b"\xbc\x02\x00", "usd_reader:read_usd"),
+    LogFormat("dataflash", lambda head, time: _is_dataflash(head), "dataflash_reader:read_dataflash"),
+    LogFormat("tlog", lambda head, time: _is_tlog(head), "tlog_reader:read_tlog"),
+    LogFormat("csv", lambda head, time: time in _cells(head), "csv_reader:read_csv", ("columns",)),
+)
+"""In the order in which they are tried."""

@@ -51,19 +51,31 @@ class Database:
         try:
             self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
             self._connection.execute("PRAGMA trusted_schema=OFF")
+            self._connection.execute("PRAGMA temp_store=MEMORY")
+            self._size = path.stat().st_size
             # No value is larger than the file that holds it; what an expression makes would be.
-            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, _SHORTEST))
+            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._size, _SHORTEST))
             self.topics: dict[int, Topic] = self._read_topics()
         except (*_DAMAGE, MemoryError) as error:  # the latter for a row that claims to be larger than memory
             raise self._damaged(error) from error
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:
-        """Number, log time [ns] and payload, in order of log time."""
+        """Number, log time [ns] and payload, in order of log time.
+
+        Rows are put in order before any payload is read.  Together the payloads cannot be larger than the file: in one
+        where they are, they share pages.
+        """
         marks = ",".join(str(int(number)) for number in sorted(wanted))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp, id"
+        rows = f"SELECT timestamp, rowid, topic_id FROM messages WHERE topic_id IN ({marks})"
+        payload, left = "SELECT data FROM messages WHERE rowid = ?", self._size
         try:
-            for number, stamp, data in self._connection.execute(query):
-                if isinstance(stamp, int) and isinstance(data, bytes):
+            found = [row for row in self._connection.execute(rows) if isinstance(row[0], int)]
+            for stamp, row, number in sorted(found):
+                (data,) = self._connection.execute(payload, (row,)).fetchone() or (None,)
+                if isinstance(data, bytes):
+                    left -= len(data)
+                    if left < 0:
+                        raise sqlite3.DatabaseError("its messages share pages")
                     yield number, stamp, data
         except _DAMAGE as error:
             raise self._damaged(error) from error

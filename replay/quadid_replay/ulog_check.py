@@ -1,7 +1,6 @@
 """Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted.
 
-pyulog says a file is not corrupt when it simply ends inside a record, loops for ever on some damaged definitions, and
-expands nested message formats without limit.
+pyulog says a file is not corrupt when it simply ends inside a record, and loops for ever on some damaged definitions.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import struct
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
@@ -25,22 +23,6 @@ _NEAR = 65536
 """How far behind a damaged place records are looked for byte by byte; further on only sync marks are."""
 _CHAIN = 3
 """So many plausible records in a row are believed to be records."""
-MOST_FIELDS = 5000
-"""Most numbers that the messages of all topics read may hold once their nested types are expanded: pyulog takes
-microseconds for each. PX4's hold some hundreds."""
-_LONGEST = 6
-"""More digits than any length of a list has."""
-_BASIC = frozenset(f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)) | {
-    "float", "double", "bool", "char",
-}  # fmt: skip
-
-
-class Field(NamedTuple):
-    """A field of a message: its type, how many of it, its name."""
-
-    kind: str
-    many: int
-    name: str
 
 
 @dataclass
@@ -58,7 +40,7 @@ class UlogRecords:
     skipped: int = 0
     cut: bool = False
     described_anew: str = ""
-    formats: dict[str, list[Field]] = field(default_factory=dict)
+    formats: dict[str, str] = field(default_factory=dict)
     topics: dict[tuple[str, int], str] = field(default_factory=dict)
     """Message by topic without its version and instance."""
     wanted: set[int] = field(default_factory=set)
@@ -72,7 +54,7 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
     """Walks through all records and keeps those that matter for `topics`.
 
     Raises:
-        LogError: messages that expand beyond `MOST_FIELDS`, an encrypted or future log, or a file without any record.
+        LogError: an encrypted or future log, or a file without any record.
     """
     if path.stat().st_size <= _HEADER:
         raise LogError(f"{path.name}: holds a header and nothing else", "a complete ULog", "copy it again")
@@ -98,7 +80,6 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
             _take(found, path.name, kind, data[offset + 3 : end], topics)
             offset = size if found.described_anew else end
     found.cut |= not found.cut and offset < size
-    _check_sizes(found, path.name)
     found.clean.seek(0)
     return found
 
@@ -108,7 +89,7 @@ def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozens
         _note_flags(found, name, body)
         return
     if kind == ord("F"):
-        name, fields = _format(body)
+        name, _, fields = body.decode("utf-8", "replace").partition(":")
         if found.formats.setdefault(name, fields) != fields:
             found.described_anew = plain(name, 40)
             return
@@ -167,42 +148,3 @@ def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
         raise LogError(f"{name}: flags that this version cannot read", "ULog version 1", "update quadid")
     if body[8] & 1:
         found.boundaries = [b for b in struct.unpack("<3Q", body[16:40]) if b]
-
-
-def _format(body: bytes) -> tuple[str, list[Field]]:
-    """Name of a message and its fields."""
-    name, _, fields = body.decode("utf-8", "replace").partition(":")
-    parsed = []
-    for entry in fields.split(";"):
-        kind, _, given = entry.partition(" ")
-        kind, bracket, count = kind.partition("[")
-        if kind:
-            digits = count.rstrip("]")
-            many = int(digits[:_LONGEST]) if bracket and digits.isdecimal() else 1
-            parsed.append(Field(kind, many, given))
-    return name, parsed
-
-
-def _check_sizes(found: UlogRecords, path: str) -> None:
-    known: dict[str, int] = {}
-    numbers = 0
-    for message in found.topics.values():
-        numbers += _expanded(message, found.formats, known, 0)
-        if numbers > MOST_FIELDS:
-            raise LogError(
-                f"{path}: message '{plain(message, 40)}' expands to more than {MOST_FIELDS} numbers, with those before",
-                "messages as PX4 writes them", "this file is damaged or was made to harm: do not trust it",
-            )  # fmt: skip
-
-
-def _expanded(name: str, formats: dict[str, list[Field]], known: dict[str, int], depth: int) -> int:
-    """Counts the numbers of a message; a type that holds itself counts as endless."""
-    if depth > 32:
-        return MOST_FIELDS + 1
-    if name not in known:
-        known[name] = MOST_FIELDS + 1  # while being counted: met again means it holds itself
-        total = 0
-        for kind, count, _ in formats.get(name, []):
-            total += count if kind in _BASIC else count * _expanded(kind, formats, known, depth + 1)
-        known[name] = total
-    return known[name]

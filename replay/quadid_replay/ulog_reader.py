@@ -5,8 +5,6 @@ Body FRD and world NED are PX4's own; time is microseconds since boot, `timestam
 
 from __future__ import annotations
 
-import contextlib
-import io
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +60,7 @@ def read_ulog(path: Path) -> Recording:
     """Reads a ULog, whole or damaged.
 
     Raises:
-        LogError: nothing usable in it, or a file made to exhaust memory.
+        LogError: nothing usable in it.
     """
     records = collect_records(path, _TOPICS)
     log = _load(path, records)
@@ -103,9 +101,8 @@ def _notes(records: UlogRecords, size: int) -> list[str]:
 
 def _load(path: Path, records: UlogRecords) -> _Log:
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints
-            ulog = ULog(records.clean)
-    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, OSError) as error:
+        ulog = ULog(records.clean)
+    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
         raise LogError(
             f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
             "a PX4 ULog", "copy the file again from the vehicle",

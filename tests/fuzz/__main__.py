@@ -54,8 +54,8 @@ def main() -> None:
         _keep(kind, outcome, given.findings)
         entry = {
             "start": first, "stop": first + count, "read": outcome.read, "refused": outcome.refused,
-            "findings": len(outcome.findings), "seconds": round(outcome.seconds, 1),
-            "slowest": round(outcome.slowest, 3), "date": f"{datetime.now(UTC):%Y-%m-%d}", "revision": revision,
+            "stopped": outcome.stopped, "findings": len(outcome.findings), "seconds": round(outcome.seconds, 1),
+            "date": f"{datetime.now(UTC):%Y-%m-%d}", "revision": revision,
         }  # fmt: skip
         book.note(account.setdefault(kind, []), entry)
         book.save(given.account, account)

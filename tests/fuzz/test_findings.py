@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import time
-import tracemalloc
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zstandard
@@ -47,32 +43,6 @@ def test_a_message_whose_list_of_numbers_is_empty_is_no_sample(tmp_path: Path) -
     empty = mcap_of([("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": []})], True)
     with pytest.raises(LogError, match="no usable flight data.*4 messages could not be decoded"):
         open_log(opened(tmp_path, empty))
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "uint8 POWER_SUPPLY_HEALTH_UNSPEC_FAILURE_AND_SO_ON__X=1",  # exponential in the library's pattern
-        "uint8 " + "A" * 100 + "!=1",
-        "float64[4000000000] x",
-        "Nothing[2000000000] x\n=====\nMSG: quadid_msgs/Nothing\n# no field",
-        "float64 " + "x" * 200_000,
-    ],
-)
-def test_definitions_made_to_stall_the_parser_are_refused_at_once(
-    tmp_path: Path, line: str, happened: Happened
-) -> None:
-    kind = "quadid_msgs/msg/MotorCommand"
-    good = schema_text(kind)
-    first, rest = good.split("=" * 80, 1)
-    message = ("motor_command", kind, good, lambda ns: {"header": header(ns), "values": [0.5] * 4})
-    assert open_log(opened(tmp_path, mcap_of([message], True))).channels
-    hostile = opened(tmp_path, mcap_of([message], True, shown=f"{first}{line}\n{'=' * 80}{rest}"))
-    began = time.process_time()
-    with pytest.raises(LogError, match="no topic.*definition is damaged"):
-        open_log(hostile)
-    seconds = time.process_time() - began
-    happened(5, f"MCAP definition '{line[:24]}…', which stalls the library, refused after {seconds:.2f} s of CPU")
 
 
 def test_esc_records_without_a_stamp_are_not_used(tmp_path: Path) -> None:
@@ -159,11 +129,9 @@ def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> N
     packed = zstandard.compress(bytes(15 << 20))
     body = struct.pack("<QQQII", 0, 1, 15 << 20, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
     hostile = opened(tmp_path, log + bytes([6]) + struct.pack("<Q", len(body)) + body)
-    began = time.process_time()
     recording = open_log(hostile)
-    seconds = time.process_time() - began
     assert any("damaged chunks" in warning for warning in recording.warnings), "before, two million records of nothing"
-    happened(5, f"a chunk of 15 MiB of zeros: refused as no records after {seconds:.2f} s of CPU")
+    happened(5, "a chunk of 15 MiB of zeros: refused as no records")
 
 
 def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,29 +149,6 @@ def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypat
     tables = usd_records.collect_usd_records(log.closed(), "log").tables
     assert {name: len(table) for name, table in tables.items()} == {"fixedFrequency": 2000, "modeChanged": 2000}
     assert sum(looked) < 100 * 4000, "each run used to look at all that follows"
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_a_small_file_never_takes_much_memory(tmp_path: Path, compression: str, happened: Happened) -> None:
-    """Two chunks of 32 MiB of zeros in 140 kB: each was allowed, and lz4 takes twice what it returns."""
-    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
-    content = bytes(32 << 20)
-    body, name = pack(content), compression.encode()
-    head = struct.pack("<QQQII", 0, 1, len(content), zlib.crc32(content), len(name)) + name
-    chunk = head + struct.pack("<Q", len(body)) + body
-    kind = "quadid_msgs/msg/MotorCommand"
-    message = ("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5] * 4})
-    data = mcap_of([message], False)
-    path = opened(tmp_path, data + 2 * (struct.pack("<BQ", 6, len(chunk)) + chunk))
-    tracemalloc.start()
-    with pytest.raises(LogError, match="inflate to more than 50 times"):
-        open_log(path)
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 16 << 20
-    happened(
-        1, f"two {compression} chunks of 32 MiB in {path.stat().st_size >> 10} kB: refused within {most >> 20} MiB"
-    )
 
 
 @pytest.mark.parametrize("index", [12, 13, 255])
@@ -296,62 +241,13 @@ def test_a_ulog_message_described_anew_with_millions_of_numbers_ends_what_is_rea
     recording = open_log(opened(tmp_path, bytes(log.data)))
     assert any("esc_report redefined" in w for w in recording.warnings)
     assert len(recording.channels["gyro"].t) == 400
-    began = time.process_time()
-    with pytest.raises(LogError, match="expands to more than"):
-        open_log(opened(tmp_path, campaign.input_of("ulog", 946_475)))
-    seconds = time.process_time() - began
-    assert seconds < 0.25
-    happened(31, f"a ULog message described anew: read up to there, said; one of two million numbers: {seconds:.2f} s")
-
-
-def test_topics_without_end_take_no_more_than_their_numbers(tmp_path: Path, happened: Happened) -> None:
-    """66 kB took 37 s: the library expands a message for every topic that the log subscribes to."""
-    for instances in (1, 256):
-        log = Ulog()
-        log.format("vehicle_attitude", "uint64_t timestamp;float[4900] q;")
-        for k in range(3000):
-            log.record("A", struct.pack("<BH", k % instances, k) + b"vehicle_attitude")
-        path = opened(tmp_path, bytes(log.data))
-        began = time.process_time()
-        with pytest.raises(LogError, match="expands to more than|no usable flight data"):
-            open_log(path)
-        assert time.process_time() - began < campaign.allowed_seconds(path.stat().st_size)
-    happened(5, "ULog of 66 kB with 3000 topics of 4901 numbers: refused at once, it took 37 s")
-
-
-def test_a_length_of_thousands_of_digits_is_no_traceback(tmp_path: Path) -> None:
-    log = Ulog()
-    log.format("vehicle_attitude", f"uint64_t timestamp;float[{'9' * 5000}] q;")
-    log.subscribe("vehicle_attitude")
-    with pytest.raises(LogError, match="expands to more than"):
-        open_log(opened(tmp_path, bytes(log.data)))
+    happened(31, "a ULog message described anew: read up to there, and said")
 
 
 def test_stamps_beyond_what_a_header_holds_are_no_sample(tmp_path: Path) -> None:
     """Fuzzing: a description whose seconds have 64 bits."""
     recording = open_log(opened(tmp_path, campaign.input_of("mcap", 968_079)))
     assert any("could not be decoded" in w for w in recording.warnings)
-
-
-def test_messages_without_content_are_counted_as_what_they_take(tmp_path: Path, happened: Happened) -> None:
-    """4 MB of them took 18 s and 638 MiB in the caller's process."""
-    kind = "quadid_msgs/msg/MotorCommand"
-    log = mcap_of(
-        [("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5]})], False
-    )
-    record = struct.pack("<BQ", 5, 23) + struct.pack("<HIQQ", 1, 7, 10**18, 0) + b"x"
-    content = record * ((4 << 20) // len(record))
-    packed = zstandard.compress(content)
-    chunk = struct.pack("<QQQII", 0, 2**62, len(content), zlib.crc32(content), 4) + b"zstd"
-    chunk += struct.pack("<Q", len(packed)) + packed
-    data = log + 46 * (struct.pack("<BQ", 6, len(chunk)) + chunk)
-    path = opened(tmp_path, data + struct.pack("<BQ", 0x80, 4_100_000 - len(data)) + bytes(4_100_000 - len(data)))
-    began = time.process_time()
-    with pytest.raises(LogError, match="inflate to more than 50 times"):
-        open_log(path)
-    seconds = time.process_time() - began
-    assert seconds < 10.0
-    happened(5, f"MCAP of 4 MB with six million messages of one byte: refused after {seconds:.1f} s, it took 18 s")
 
 
 def test_senders_without_end_take_no_more_than_their_bytes(tmp_path: Path, happened: Happened) -> None:
@@ -362,19 +258,15 @@ def test_senders_without_end_take_no_more_than_their_bytes(tmp_path: Path, happe
         log.mav.srcComponent = k // 255
         log.add(0.001 * k, attitude(0.001 * k))
         data += log.data
-    path = opened(tmp_path, bytes(data))
-    began = time.process_time()
     with pytest.raises(LogError, match="also in the log.* and 23 more") as told:
-        open_log(path)
-    seconds = time.process_time() - began
-    assert seconds < campaign.allowed_seconds(len(data))
+        open_log(opened(tmp_path, bytes(data)))
     assert len(str(told.value)) < 2000
     real = Tlog(7)
     real.add(0.0, heartbeat())
     for k in range(50):
         real.add(0.02 * k, attitude(10.0 + 0.02 * k))
     assert len(open_log(opened(tmp_path, bytes(data + real.data))).channels["attitude"].t) >= 50
-    happened(5, f"telemetry log of 20,000 senders in {len(data) >> 10} kB: refused after {seconds:.1f} s, was 7 s")
+    happened(5, f"telemetry log of 20,000 senders in {len(data) >> 10} kB: refused in one line")
 
 
 def function(output: int, value: int) -> Any:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer as RosWriter
-from quadid_replay import mcap_decode, open_log, write_mcap
+from quadid_replay import mcap_decode, write_mcap
 from quadid_replay.bag_topics import Topic
+from quadid_replay.formats import read_here
 from quadid_replay.mcap_decode import decode_messages, source_of
 from quadid_replay.mcap_messages import MessageType
 from quadid_replay.schemas import schema_text
@@ -36,7 +37,7 @@ def both_ways(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Recording | 
 
     def read() -> Recording | str:
         try:
-            return open_log(path)
+            return read_here(path, "auto")
         except LogError as error:
             return str(error)
 

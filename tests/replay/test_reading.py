@@ -1,43 +1,52 @@
-"""Large logs are read in a child with limits of memory and time; what no log is, is refused before it is read."""
+"""The process in which logs are read: what comes out of it, its limits, and that no format can get around them."""
 
 from __future__ import annotations
 
+import json
+import multiprocessing
 import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-import quadid_replay.opening
 import quadid_replay.reading
-from quadid_replay import open_log, write_csv, write_mcap, write_tlog
-from quadid_replay.reading import Limits, limits, read_in_child
+from quadid_replay import answer, open_log, write_csv, write_mcap, write_tlog
+from quadid_replay.formats import read_here
+from quadid_replay.reading import Limits, limits
 
 from quadid.errors import LogError
+from quadid.window import Recording
 from tests.faults.evidence import Happened
+from tests.fuzz.formats import FORMATS
 from tests.fuzz.seeds import seeds
 from tests.replay.synthetic import full_recording
 
 
-@pytest.fixture
-def all_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every log counts as large."""
-    monkeypatch.setattr(quadid_replay.opening, "LARGE", 0)
+def same(one: Recording, other: Recording) -> None:
+    assert {**vars(one), "channels": None} == {**vars(other), "channels": None}
+    assert list(one.channels) == list(other.channels)
+    for name, channel in one.channels.items():
+        found = other.channels[name]
+        assert (found.t.tobytes(), found.values.tobytes()) == (channel.t.tobytes(), channel.values.tobytes())
+        assert (found.values.shape, found.source, found.faults) == (
+            channel.values.shape,
+            channel.source,
+            channel.faults,
+        )
+        assert not found.values.flags.writeable
 
 
-def test_a_child_reads_what_is_read_here(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    write_mcap(path, full_recording(1.0, 50.0))
-    here, there = open_log(path), read_in_child(path, path.stat().st_size, "auto")
-    assert (here.name, here.sha256, here.warnings, here.breaks) == (
-        there.name,
-        there.sha256,
-        there.warnings,
-        there.breaks,
-    )
-    for name, channel in here.channels.items():
-        np.testing.assert_array_equal(there.channels[name].values, channel.values)
-        np.testing.assert_array_equal(there.channels[name].t, channel.t)
-        assert not there.channels[name].values.flags.writeable
+@pytest.mark.parametrize("kind", ["mcap", "rosbag2", "tlog", "dataflash", "ulog", "usdlog", "blackbox"])
+def test_a_child_reads_what_is_read_here(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "log").write_bytes(FORMATS[kind].finish(seeds(kind)[0]))
+    same(read_here(tmp_path / "log", "auto"), open_log(tmp_path / "log"))
 
 
 def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,25 +62,28 @@ def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytes
         allowed.append(size)
         return limits(size)
 
-    monkeypatch.setattr(quadid_replay.opening, "LARGE", 0)
     monkeypatch.setattr(quadid_replay.reading, "limits", noted)
     assert open_log(folder).channels
     assert allowed == [sum(file.stat().st_size for file in folder.glob("*.mcap"))]
 
 
-def test_no_code_of_the_folder_we_stand_in_is_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
-) -> None:
-    """Whoever packs a folder of logs may put a numpy.py into it: `python -m` would import that one."""
+@pytest.mark.parametrize("path", ["", os.pathsep])
+def test_no_code_of_the_folder_we_stand_in_is_run(tmp_path: Path, path: str, happened: Happened) -> None:
+    """Whoever packs a folder of logs may put a json.py into it; an empty name in PYTHONPATH means that folder."""
     write_mcap(tmp_path / "a.mcap", full_recording(1.0, 50.0))
-    (tmp_path / "numpy.py").write_text("open('ran', 'w').close()\nraise SystemExit\n")
-    monkeypatch.chdir(tmp_path)
-    assert read_in_child(tmp_path / "a.mcap", 1 << 20, "auto").channels
+    (tmp_path / "json.py").write_text("open('ran', 'w').close()\nraise SystemExit\n")
+    script = (
+        "import json, os\nfrom quadid_replay import open_log\n"
+        f"os.environ['PYTHONPATH'] = {path!r}\nprint(len(open_log('a.mcap').channels))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert int(done.stdout) > 4, done.stderr
     assert not (tmp_path / "ran").exists()
-    happened(25, "a log beside a numpy.py in the folder we stand in: read, and that file is not run")
+    happened(25, "a log beside a json.py in the folder we stand in: read, and that file is not run")
 
 
-@pytest.mark.usefixtures("all_large")
 def test_more_memory_than_allowed_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
@@ -83,20 +95,205 @@ def test_more_memory_than_allowed_is_refused(
     happened(5, f"CSV of {path.stat().st_size >> 20} MB under a limit of 60 MiB: the child is stopped, the log refused")
 
 
-@pytest.mark.usefixtures("all_large")
-def test_more_time_than_allowed_is_refused_and_errors_are_those_of_the_reader(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
-) -> None:
+def test_errors_are_those_of_the_reader_and_limits_are_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "b.csv").write_text("t,p\n0,1\n")
     with pytest.raises(LogError, match="gyro lacks column q, r; allowed: all of p q r"):
         open_log(tmp_path / "b.csv")
-    monkeypatch.setenv("QUADID_READ_SECONDS", "0.0001")  # 2 ms by the clock: no interpreter starts in that
-    with pytest.raises(LogError, match="b.csv: reading it takes longer than 0 s.*QUADID_READ_SECONDS"):
-        open_log(tmp_path / "b.csv")
     monkeypatch.setenv("QUADID_READ_SECONDS", "soon")
     with pytest.raises(LogError, match="QUADID_READ_SECONDS='soon'; allowed: a positive number"):
-        limits(1)
-    happened(5, "a log that takes longer than its time limit is refused, its reader killed")
+        open_log(tmp_path / "b.csv")
+
+
+def test_threads_and_forked_processes_read_at_once(tmp_path: Path) -> None:
+    for k in range(4):
+        write_csv(tmp_path / f"{k}.csv", full_recording(1.0 + k, 50.0))
+    paths = [tmp_path / f"{k % 4}.csv" for k in range(24)]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(open_log, paths))
+    assert [r.name for r in found] == [p.name for p in paths]
+    assert len({len(r.channels["gyro"].t) for r in found}) == 4
+    with multiprocessing.get_context("fork").Pool(2) as forked:
+        assert forked.map(_rows, paths) == [len(r.channels["gyro"].t) for r in found]
+    assert _rows(paths[0]) == len(found[0].channels["gyro"].t), "the process that forked still has its own"
+
+
+def _rows(path: Path) -> int:
+    return len(open_log(path).channels["gyro"].t)
+
+
+def test_a_reading_process_that_was_killed_is_started_again(tmp_path: Path) -> None:
+    write_csv(tmp_path / "a.csv", full_recording(1.0, 50.0))
+    for _ in range(2):
+        assert open_log(tmp_path / "a.csv").channels
+        process = quadid_replay.reading._PROCESS._process
+        assert process is not None
+        process.kill()
+        process.wait()
+
+
+def _changed(line: dict[str, object], numbers: bytes) -> memoryview:
+    return memoryview(json.dumps(line).encode() + b"\n" + numbers)
+
+
+def test_an_answer_is_checked_at_the_door() -> None:
+    recording = full_recording(0.1, 50.0)
+    whole = b"".join(answer.pack(recording))
+    head, _, numbers = whole.partition(b"\n")
+    line = json.loads(head)
+    found = answer.unpack(memoryview(whole))
+    assert isinstance(found, Recording)
+    assert list(found.channels) == list(recording.channels)
+    first = line["channels"][0]
+    bad: list[memoryview] = [
+        memoryview(b""), memoryview(b"\x80\x04."), memoryview(b"[]\n"), memoryview(whole[:-8]),
+        memoryview(whole + bytes(8)), _changed(line, np.full(len(numbers) // 8, np.nan).tobytes()),
+        _changed({**line, "channels": [["os", *first[1:]], *line["channels"][1:]]}, numbers),
+        _changed({**line, "channels": [[*first[:3], -1, 1 << 60], *line["channels"][1:]]}, numbers),
+        _changed({**line, "channels": [[*first[:3], 1 << 39, 1 << 39], *line["channels"][1:]]}, numbers),
+        _changed({**line, "epoch": "now"}, numbers), _changed({**line, "warnings": [["x"]]}, numbers),
+        _changed({k: v for k, v in line.items() if k != "modes"}, numbers),
+    ]  # fmt: skip
+    for one in bad:
+        with pytest.raises(answer.BadAnswerError):
+            answer.unpack(one)
+    told = answer.unpack(_changed({**line, "warnings": ["a\x1b[2Jb\nc" + "x" * 10_000]}, numbers))
+    assert isinstance(told, Recording)
+    assert told.warnings[0].startswith("a?[2Jb?c")
+    assert len(told.warnings[0]) <= 2000
+
+
+# A format of somebody else, added as docs/logs.md says, and one that does what its file says.
+
+HARMFUL = """
+import os, signal, socket, tempfile, time
+from pathlib import Path
+
+def read_harm(path):
+    deed = path.read_bytes()[4:].decode()
+    if deed == "compute":
+        while True:
+            pass
+    if deed == "sleep":
+        signal.sigwait([signal.SIGUSR1])
+    if deed == "take memory":
+        kept = []
+        while True:
+            kept.append(bytearray(1 << 24))
+    if deed == "write":
+        with open(path.with_suffix(".written"), "wb", buffering=0) as file:
+            while True:
+                file.write(bytes(1 << 20))
+    if deed == "open":
+        kept = []
+        while True:
+            kept.append(path.open())
+    if deed == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if deed == "leave":
+        os._exit(0)
+    if deed == "print":
+        print("x" * 100_000)
+    raise KeyError(deed)
+"""
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path:
+    """A folder with the package in it, to which the formats were added."""
+    folder = tmp_path_factory.mktemp("extended")
+    shutil.copytree(repository / "replay" / "quadid_replay", folder / "quadid_replay")
+    page = (repository / "docs" / "logs.md").read_text(encoding="utf-8").partition("## Add a log format")[2]
+    reader, line = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (folder / "quadid_replay" / "xyz_reader.py").write_text(reader)
+    (folder / "quadid_replay" / "harm_reader.py").write_text(HARMFUL)
+    table = folder / "quadid_replay" / "recognise.py"
+    added = line + '    LogFormat("harm", b"HARM", "harm_reader:read_harm"),\n'
+    table.write_text(table.read_text().replace("FORMATS = (\n", f"FORMATS = (\n{added}"))
+    return folder
+
+
+def told(folder: Path, *paths: Path, seconds: str = "", memory: str = "") -> list[str]:
+    """What `open_log` of that folder's package tells of these files, in another process."""
+    script = (
+        "import json, sys\nfrom quadid.errors import LogError\nfrom quadid_replay import open_log\n"
+        "for path in sys.argv[1:]:\n    try:\n        log = open_log(path)\n"
+        "        print(json.dumps(repr((log.format, log.warnings, {n: c.values[-1].tolist() for n, c in "
+        "log.channels.items()}))))\n"
+        "    except LogError as error:\n        print(json.dumps(str(error)))\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(folder), "QUADID_READ_SECONDS": seconds, "QUADID_READ_MEMORY_MB": memory}
+    command = [sys.executable, "-c", script, *map(str, paths)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == len(paths), done.stderr
+    return lines
+
+
+def test_the_format_of_the_page_is_read(tmp_path: Path, extended: Path) -> None:
+    rows = np.zeros(50, np.dtype([("t", "<u8"), ("gyro", "<f4", 3), ("motor", "<u2", 4)]))
+    rows["t"], rows["gyro"], rows["motor"] = 20_000 * np.arange(50), (0.5, 0.25, -1.0), 65535
+    (tmp_path / "a").write_bytes(b"XYZ1" + rows.tobytes())
+    (tmp_path / "cut").write_bytes(b"XYZ1" + rows.tobytes() + b"rest")
+    whole, cut = told(extended, tmp_path / "a", tmp_path / "cut")
+    assert whole == repr(("xyz", (), {"gyro": [0.5, -0.25, 1.0], "motor_command": [1.0] * 4}))
+    assert "it was cut" in cut
+
+
+def test_a_format_that_does_harm_is_stopped_by_its_limit(tmp_path: Path, extended: Path, happened: Happened) -> None:
+    expected = {
+        "compute": "takes longer than 1 s of processor time.*QUADID_READ_SECONDS",
+        "sleep": "takes longer than 6 s by the clock.*QUADID_READ_SECONDS",
+        "take memory": "takes more than 300 MiB of memory.*QUADID_READ_MEMORY_MB",
+        "write": "reading it writes files",
+        "open": "opens too many files",
+        "crash": "its reader ended with SIGSEGV.*QUADID_READ_MEMORY_MB",
+        "leave": "returned is no recording",
+        "print": "its reader failed .KeyError: 'print'.*report it",
+        "a strange thing": "its reader failed .KeyError.*harm_reader.py.*report it",
+    }
+    paths = []
+    for deed in expected:
+        paths.append(tmp_path / deed.replace(" ", "-"))
+        paths[-1].write_bytes(b"HARM" + deed.encode())
+    for (deed, pattern), said in zip(
+        expected.items(), told(extended, *paths, seconds="0.3", memory="300"), strict=True
+    ):
+        assert re.search(pattern, said), (deed, said)
+        assert "fix: " in said, said
+    written = sum(path.stat().st_size for path in tmp_path.glob("*.written"))
+    assert written == 0
+    happened(5, f"a reader that {', '.join(list(expected)[:6])}s: each stopped by its limit, which the error names")
+
+
+def test_a_reader_ends_with_the_program_that_asked(tmp_path: Path, extended: Path) -> None:
+    (tmp_path / "log").write_bytes(b"HARMsleep")
+    script = f"from quadid_replay import open_log; print(flush=True); open_log({str(tmp_path / 'log')!r})"
+    env = {**os.environ, "PYTHONPATH": str(extended)}
+    with subprocess.Popen([sys.executable, "-c", script], env=env, stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        program.stdout.readline()
+        while len(below := [*_descendants(program.pid)]) < 2:
+            assert program.poll() is None
+        program.send_signal(signal.SIGKILL)
+    while any(Path(f"/proc/{pid}").exists() and not _zombie(pid) for pid in below):
+        pass
+
+
+def _zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def _descendants(pid: int) -> Iterator[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return
+    for child in map(int, children):
+        yield child
+        yield from _descendants(child)
 
 
 def sparse(path: Path, head: bytes, size: int) -> Path:
@@ -141,7 +338,7 @@ def test_paths_that_are_no_logs(tmp_path: Path, happened: Happened) -> None:
     happened(5, f"{', '.join(names)} given as log: each refused with its reason, none opened for long")
 
 
-def test_round_trips_do_not_notice(tmp_path: Path, all_large: None) -> None:
+def test_round_trips_do_not_notice(tmp_path: Path) -> None:
     for write in (write_csv, write_tlog):
         write(tmp_path / "log", full_recording(1.0, 50.0))
         assert len(open_log(tmp_path / "log").channels) > 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import time
 from pathlib import Path
 
 import numpy as np
@@ -147,8 +146,6 @@ def test_a_database_whose_messages_are_computed_is_refused(tmp_path: Path, messa
     connection = sqlite3.connect(path)
     connection.executescript(f"{TOPICS}{messages}")
     connection.close()
-    began = time.process_time()
     with pytest.raises(LogError, match="computed|no rosbag2") as told:
         open_log(path)
-    assert time.process_time() - began < 5.0
     happened(25, f"rosbag2 of {path.stat().st_size >> 10} kB with '{messages[:40]}...': {str(told.value)[:80]}")
