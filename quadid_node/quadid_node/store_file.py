@@ -37,7 +37,8 @@ BUSY_SECONDS = 5.0
 """How long another program's lock is waited for [s]."""
 
 
-_NAMES = " UNION ".join(f"SELECT vehicle FROM {table}" for table in ("sets", "candidates", "events"))
+_SHOWN = ("sets", "candidates", "events")
+_NAMES = " UNION ".join(f"SELECT vehicle FROM {table}" for table in _SHOWN)
 
 
 UNREADABLE = (ValueError, TypeError, LookupError, OverflowError, RecursionError, QuadidError)
@@ -66,6 +67,9 @@ def read_history(
     try:
         with contextlib.closing(connect(path, read_only=True)) as db:
             check_tables(db)
+            for table in _SHOWN:  # rows that share pages would make a small file large
+                if db.execute(f"PRAGMA quick_check({table})").fetchone()[0] != "ok":
+                    raise sqlite3.DatabaseError("malformed: its pages do not add up")
             return {
                 "sets": _newest(db, "SELECT wall, data", "sets", vehicle, sets),
                 "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),

@@ -19,11 +19,13 @@ import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 from quadid_cli.main import app_main
+from quadid_node.store_file import make_tables
 from quadid_replay import reading
 from quadid_replay.schemas import schema_text
 
 from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of
+from tests.replay.shared_pages import share_first_row
 from tests.replay.test_mcap import header
 from tests.replay.test_tlog import Tlog, attitude
 from tests.replay.test_ulog import Ulog
@@ -114,101 +116,22 @@ def definition(line: str) -> Callable[[], bytes]:
 def shared_overflow(cells: int, size: int) -> Callable[[], bytes]:
     """A rosbag2 database whose messages all have one chain of overflow pages for their payload."""
 
-    def made(page: int = 512) -> bytes:
+    def made() -> bytes:
         path = Path("made.db3").absolute()
         path.unlink(missing_ok=True)
-        with sqlite3.connect(path) as db:
-            db.execute(f"PRAGMA page_size={page}")
-            db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
-            db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB)")
-            db.execute("INSERT INTO topics VALUES(1, '/imu', 'sensor_msgs/msg/Imu', 'cdr')")
-            db.executemany(
-                "INSERT INTO messages VALUES(?, 1, ?, ?)", ((k, 10**12 + k * 7919 % 10007, bytes(size)) for k in (1, 2))
-            )
-            # One page of cells a message each; all begin alike, and the last four bytes of each are the chain's first.
-            root = db.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()[0]
+        db = sqlite3.connect(path)
+        db.executescript(
+            "PRAGMA page_size=512; CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB);"
+            "INSERT INTO topics VALUES(1, '/imu', 'sensor_msgs/msg/Imu', 'cdr');"
+        )
+        db.execute("INSERT INTO messages VALUES(1, 1, 1000000000000, ?)", (bytes(size),))
+        db.commit()
         db.close()
-        data = bytearray(path.read_bytes())
-        leaf = _leaf_of(data, root, page)
-        at = struct.unpack(">H", leaf[8:10])[0]  # the first cell
-        cell = leaf[at : _end_of_cell(leaf, at, page)]
-        per = (page - 8) // (len(cell) + 6)
-        pages, level, number = [], [], len(data) // page + 1
-        for first in range(1, cells + 1, per):
-            rows = range(first, min(first + per, cells + 1))
-            pages.append(_page_of([_with_row(cell, row) for row in rows], page))
-            level.append((number, rows[-1]))
-            number += 1
-        while len(level) > 40:
-            above = []
-            for a in range(0, len(level), 40):
-                pages.append(_interior(level[a : a + 40], page))
-                above.append((number, level[a : a + 40][-1][1]))
-                number += 1
-            level = above
-        data[(root - 1) * page : root * page] = _interior(level, page)
-        data += b"".join(pages)
-        data[28:32] = struct.pack(">I", len(data) // page)
-        data[92:96] = data[24:28]
-        return bytes(data)
+        share_first_row(path, "messages", cells)
+        return path.read_bytes()
 
     return made
-
-
-def _varint(value: int) -> bytes:
-    parts = [value & 0x7F]
-    while value := value >> 7:
-        parts.append(value & 0x7F | 0x80)
-    return bytes(reversed(parts))
-
-
-def _skip_varint(data: bytes, at: int) -> int:
-    while data[at] & 0x80:
-        at += 1
-    return at + 1
-
-
-def _leaf_of(data: bytes, root: int, page: int) -> bytes:
-    found = data[(root - 1) * page : root * page]
-    while found[0] == 5:
-        child = struct.unpack(">I", found[struct.unpack(">H", found[12:14])[0] :][:4])[0]
-        found = data[(child - 1) * page : child * page]
-    return bytes(found)
-
-
-def _end_of_cell(leaf: bytes, at: int, page: int) -> int:
-    ends = sorted({*struct.unpack(f">{leaf[4] + 256 * leaf[3]}H", leaf[8 : 8 + 2 * (leaf[4] + 256 * leaf[3])]), page})
-    return ends[ends.index(at) + 1]
-
-
-def _with_row(cell: bytes, row: int) -> bytes:
-    size = _skip_varint(cell, 0)
-    return cell[:size] + _varint(row) + cell[_skip_varint(cell, size) :]
-
-
-def _page_of(cells: list[bytes], page: int) -> bytes:
-    out, at, places = bytearray(page), page, []
-    for cell in cells:
-        at -= len(cell)
-        out[at : at + len(cell)] = cell
-        places.append(at)
-    out[0], out[3:5], out[5:7] = 13, struct.pack(">H", len(cells)), struct.pack(">H", at)
-    out[8 : 8 + 2 * len(places)] = struct.pack(f">{len(places)}H", *places)
-    return bytes(out)
-
-
-def _interior(children: list[tuple[int, int]], page: int) -> bytes:
-    out, at, places = bytearray(page), page, []
-    for number, key in children[:-1]:
-        cell = struct.pack(">I", number) + _varint(key)
-        at -= len(cell)
-        out[at : at + len(cell)] = cell
-        places.append(at)
-    out[0], out[3:5], out[5:7], out[8:12] = (
-        5, struct.pack(">H", len(places)), struct.pack(">H", at), struct.pack(">I", children[-1][0]),
-    )  # fmt: skip
-    out[12 : 12 + 2 * len(places)] = struct.pack(f">{len(places)}H", *places)
-    return bytes(out)
 
 
 def nested(levels: int, each: int) -> Callable[[], bytes]:
@@ -317,3 +240,33 @@ def test_a_small_file_costs_no_more_than_its_limits(
     assert seconds < SECONDS + STARTING
     assert {*os.listdir(tmp_path)} == kept
     happened(5, f"{kind} ({size >> 10} kB): {seconds:.1f} s of processor time with the start; '{said[:100]}'")
+
+
+ROWS = {
+    "sets": "vehicle, sequence, state, reason, approved_by, wall, data) VALUES ('v', 1, 'accepted', '', '', 1, ?",
+    "candidates": "id, vehicle, state, gate, reason, wall, data) VALUES (1, 'v', 'accepted', '', '', 1, ?",
+    "events": "id, vehicle, level, kind, wall, text) VALUES (1, 'v', 'INFO', '', 1, ?",
+}
+
+
+@pytest.mark.parametrize("table", ROWS)
+def test_a_history_whose_rows_share_pages_is_refused(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], happened: Happened
+) -> None:
+    """4 MB of history were 40 GB of rows, all of them kept."""
+    path = tmp_path / "h.sqlite"
+    make_tables(path)
+    db = sqlite3.connect(path)
+    db.execute("PRAGMA journal_mode = DELETE")
+    db.execute(f"INSERT INTO {table} ({ROWS[table]})", (" " * 2_000_000,))
+    db.commit()
+    db.close()
+    share_first_row(path, table, 20_000)
+    for command in (
+        ["history", "--vehicle", "v", "--history", path, "--candidates", "9", "--events", "9"],
+        ["export", "--vehicle", "pelican", "--history", path, "--format", "mujoco", "--out", tmp_path],
+    ):
+        monkeypatch.setattr(sys, "argv", ["quadid", *map(str, command)])
+        assert app_main() == 2
+        assert "its pages do not add up" in capfd.readouterr().err
+    happened(12, f"history of {path.stat().st_size >> 20} MB whose {table} are 40 GB in shared pages: refused")
