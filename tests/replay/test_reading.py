@@ -207,7 +207,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path
     (folder / "quadid_replay" / "xyz_reader.py").write_text(reader)
     (folder / "quadid_replay" / "harm_reader.py").write_text(HARMFUL)
     table = folder / "quadid_replay" / "recognise.py"
-    added = line + '    LogFormat("harm", b"HARM", "harm_reader:read_harm"),\n'
+    added = f'    {line.strip()},\n    LogFormat("harm", b"HARM", "harm_reader:read_harm"),\n'
     table.write_text(table.read_text().replace("FORMATS = (\n", f"FORMATS = (\n{added}"))
     return folder
 
