@@ -28,6 +28,7 @@ setup(
         "console_scripts": [
             "identify = quadid_node.identify:main",
             "replay = quadid_node.replay_node:main",
+            "bridge = quadid_node.bridge:main",
         ]
     },
 )

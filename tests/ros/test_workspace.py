@@ -35,7 +35,7 @@ def assert_layout(prefix: Path, package: Path) -> None:
     """What `ros2 run quadid_node identify` and `ros2 launch quadid_node identify.launch.py` look up under a prefix."""
     assert (prefix / "share/ament_index/resource_index/packages/quadid_node").is_file()
     assert (prefix / "share/quadid_node/package.xml").is_file()
-    for executable in ("identify", "replay"):
+    for executable in ("identify", "replay", "bridge"):
         assert os.access(prefix / "lib/quadid_node" / executable, os.X_OK)
     for folder in ("launch", "config"):
         expected = {path.name for path in (package / folder).iterdir() if path.suffix in (".py", ".yaml", ".xml")}

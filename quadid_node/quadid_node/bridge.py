@@ -1,0 +1,262 @@
+"""`ros2 run quadid_node bridge`: sets parameters of a controller node from accepted parameter sets.
+
+Every set is checked as docs/using-with-ros.md asks of a controller; what passes is mapped to parameters of one named
+node, held against limits and a largest step, and set in one transaction.  With `dry_run`, the default, the bridge only
+says what it would set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import rclpy
+import rclpy.parameter
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from quadid.errors import QuadidError
+from quadid_node.convert import message_class, service_class, to_message
+from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
+from quadid_node.transport import without_shared_memory
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+SAME_MASS = 0.02
+"""Relative difference of masses [1] within which a set belongs to the controller's vehicle."""
+RETRY_SECONDS = 1.0
+"""A controller that does not answer is asked again after this time [s]; health is reported as often."""
+_NUMBER = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?"
+_ENTRY = re.compile(rf"(\S+) = (?:({_NUMBER}) \* )?(\w+) in ({_NUMBER}) \.\. ({_NUMBER})")
+OPTIONS = {
+    "controller": ("", "Name of the node whose parameters are set, as ros2 node list shows it."),
+    "map": ([""], "Entries 'gains.roll.p = 11.0 * J_xx in 0.01 .. 1.0': parameter, factor, name in the set, limits."),
+    "dry_run": (True, "Only say what would be set; false applies the newest set. A rollback makes it true."),
+    "step": (0.5, "Largest relative change of a parameter of the controller by one set."),
+    "mass": (0.0, "[kg] of the controller's vehicle; 0: sets of any mass."),
+    "vehicle_id": ("", "Only sets of this vehicle; '': any on the topic."),
+    "restore_out_of_date": (False, "When a set is withdrawn, put back the values from before the first set."),
+}
+"""Parameters: default and description."""
+
+
+class Entry(NamedTuple):
+    """One parameter of the controller: `factor` times the value `source` of a set, within `low` to `high`."""
+
+    target: str
+    factor: float
+    source: str
+    low: float
+    high: float
+
+
+class Plan(NamedTuple):
+    """Values to set by parameter, and what is left as it is, for people; or why nothing is set."""
+
+    values: dict[str, float]
+    left: str = ""
+    refused: str = ""
+
+
+def entry(text: str) -> Entry:
+    """Reads an entry of `map`; raises QuadidError."""
+    found = _ENTRY.fullmatch(text.strip())
+    if found is None:
+        raise QuadidError(
+            f"map: '{text}'", "'parameter = factor * name in low .. high', as in the option's description"
+        )
+    target, factor, source, low, high = found.groups()
+    made = Entry(target, float(factor or 1.0), source, float(low), float(high))
+    if not made.low < made.high:
+        raise QuadidError(f"map: '{text}'", "a lower limit below the upper one")
+    return made
+
+
+def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
+    """Why a set is not for this controller, or not in force; empty when it may be applied."""
+    if message.schema_version != SCHEMA_VERSION:
+        return f"schema {message.schema_version}, this bridge knows {SCHEMA_VERSION}"
+    if vehicle and message.vehicle_id != vehicle:
+        return f"it belongs to {message.vehicle_id}"
+    if message.state not in (message.STATE_ACCEPTED, message.STATE_ROLLED_BACK):
+        return f"not in force: {message.reason}"
+    if message.sequence <= newest:
+        return f"set {message.sequence} is not newer than {newest}"
+    if message.out_of_date:
+        return f"out of date ({message.out_of_date_code}): {message.out_of_date_reason}"
+    if mass and not abs(message.mass / mass - 1.0) <= SAME_MASS:
+        return f"it rests on a mass of {message.mass:.3g} kg, the controller's vehicle has {mass:.3g} kg"
+    return ""
+
+
+def plan(message: Any, entries: Sequence[Entry], now: Mapping[str, Any], step: float) -> Plan:
+    """What to set, from a set and the controller's values now; all of it or nothing."""
+    found = dict(zip(message.names, zip(message.values, message.status, strict=True), strict=True))
+    values, left = dict[str, float](), []
+    for target, factor, source, low, high in entries:
+        if source not in found:
+            return Plan({}, refused=f"{target}: the set has no {source}")
+        estimate, status = found[source]
+        value, before = factor * estimate, now.get(target)
+        if status != message.STATUS_IDENTIFIED:
+            left.append(f"{target} (the data do not determine {source})")
+        elif not isinstance(before, float):
+            kind = "not declared" if before is None else "no double"
+            return Plan({}, refused=f"{target} is {kind} in the controller")
+        elif not (math.isfinite(value) and low <= value <= high):
+            return Plan({}, refused=f"{target} = {value:.4g}, allowed: {low:g} .. {high:g}")
+        elif not abs(value - before) <= step * abs(before):
+            return Plan({}, refused=f"{target} would change from {before:.4g} to {value:.4g}: more than {step:.0%}")
+        else:
+            values[target] = value
+    return Plan(values, ", ".join(left), "" if values else f"nothing to set: {', '.join(left)}")
+
+
+class BridgeNode(Node):
+    """Applies sets to one controller; one set at a time, the newest wins."""
+
+    def __init__(self) -> None:
+        """Reads the options; raises QuadidError."""
+        super().__init__("quadid_bridge")
+        for name, (default, text) in OPTIONS.items():
+            self.declare_parameter(name, default, ParameterDescriptor(description=text))
+        controller = self._option("controller")
+        if not controller:
+            raise QuadidError("controller is not given", fix="-p controller:=/name, as ros2 node list shows it")
+        self._entries = [entry(text) for text in self._option("map") if text]
+        if not self._entries:
+            raise QuadidError("map is empty", fix="give a parameter file, as quadid_node/config/bridge.yaml")
+        group = ReentrantCallbackGroup()  # callbacks wait for answers, which must come meanwhile
+        self._client = AsyncParameterClient(self, controller, callback_group=group)
+        self._newest: Any = None
+        self._applied, self._busy, self._said, self._level = 0, False, "no set yet", b"\x00"
+        self._original: dict[str, float] = {}
+        self._before: dict[str, float] = {}
+        self.add_post_set_parameters_callback(self._on_option)
+        kind, topic = message_class(PARAMETER_SET), TOPICS["parameters"][0]
+        self.create_subscription(kind, topic, self._on_set, LATCHED, callback_group=group)
+        trigger = service_class("std_srvs/Trigger")
+        self.create_service(trigger, "~/rollback", self._on_rollback, callback_group=group)
+        self._health = self.create_publisher(message_class(TOPICS["diagnostics"][1]), TOPICS["diagnostics"][0], 10)
+        self.create_timer(RETRY_SECONDS, self._report, callback_group=group)
+
+    def _option(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _say(self, text: str, level: bytes = b"\x00") -> None:
+        if text != self._said:
+            self._said, self._level = text, level
+            if level == b"\x00":
+                self.get_logger().info(text)
+            else:
+                self.get_logger().warning(text)
+
+    async def _report(self) -> None:
+        """Once a second: health, and what could not be applied yet."""
+        stamp = self.get_clock().now().to_msg()
+        status = {
+            "level": self._level, "name": f"{self.get_name()}: controller", "message": self._said,
+            "hardware_id": self._option("vehicle_id"),
+            "values": [{"key": "applied set", "value": str(self._applied)}],
+        }  # fmt: skip
+        fields = {"header": {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}}, "status": [status]}
+        self._health.publish(to_message(TOPICS["diagnostics"][1], fields))
+        await self._work()
+
+    async def _on_set(self, message: Any) -> None:
+        self._newest = message
+        await self._work()
+
+    def _on_option(self, changed: Sequence[Any]) -> None:
+        """A plan that was only shown is carried out once `dry_run` is false: with the next report."""
+        if any(option.name == "dry_run" for option in changed):
+            self._said = ""
+
+    async def _work(self) -> None:
+        """Applies the newest set, if that is asked for and possible."""
+        if self._busy or self._newest is None:
+            return
+        self._busy = True
+        try:
+            await self._apply(self._newest)
+        finally:
+            self._busy = False
+
+    async def _apply(self, message: Any) -> None:
+        if message.sequence == self._applied:
+            return
+        why = objection(message, self._option("vehicle_id"), self._option("mass"), self._applied)
+        if why:
+            self._say(f"set {message.sequence} not applied: {why}", b"\x01")
+            if message.out_of_date and self._original and self._option("restore_out_of_date"):
+                await self._set(self._original, f"set {message.sequence} is out of date: first values put back")
+                self._original, self._applied = {}, message.sequence
+            return
+        if not self._client.services_are_ready():
+            self._say(f"{self._option('controller')} does not answer", b"\x01")
+            return
+        targets = [e.target for e in self._entries]
+        read = await self._client.get_parameters(targets)
+        now = dict(zip(targets, (rclpy.parameter.parameter_value_to_python(v) for v in read.values), strict=False))
+        made = plan(message, self._entries, now, self._option("step"))
+        shown = ", ".join(f"{name} {now[name]:.4g} -> {value:.4g}" for name, value in made.values.items())
+        if made.refused:
+            self._say(f"set {message.sequence} not applied: {made.refused}", b"\x01")
+        elif self._option("dry_run"):
+            self._say(f"dry run: set {message.sequence} would set {shown}{made.left and f'; stays: {made.left}'}")
+        elif await self._set(made.values, f"set {message.sequence} applied: {shown}"):
+            self._before = {name: now[name] for name in made.values}
+            self._original = {**self._before, **self._original}
+            self._applied = message.sequence
+
+    async def _set(self, values: Mapping[str, float], done: str) -> bool:
+        """Sets parameters of the controller, all or none; says `done`, or why not."""
+        asked = [Parameter(name, value=value) for name, value in values.items()]
+        result: SetParametersResult = (await self._client.set_parameters_atomically(asked)).result
+        if result.successful:
+            self._say(done)
+        else:
+            self._say(f"nothing is set, {self._option('controller')} refuses: {result.reason}", b"\x01")
+        return bool(result.successful)
+
+    async def _on_rollback(self, request: Any, response: Any) -> Any:
+        """Puts the values from before the last set back; from then on the bridge only shows what it would set."""
+        if not self._before:
+            response.success, response.message = False, "no set was applied"
+            return response
+        self.set_parameters([Parameter("dry_run", value=True)])
+        response.success = await self._set(self._before, "rolled back: dry_run is true from now on")
+        response.message = self._said
+        if response.success:
+            self._before, self._applied = {}, 0
+        return response
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the bridge; returns the exit code: 0 done, 2 bad options."""
+    without_shared_memory()
+    rclpy.init(args=args)
+    code = 0
+    try:
+        rclpy.spin(BridgeNode())
+    except QuadidError as error:
+        print(f"bridge: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
+        code = 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        with contextlib.suppress(KeyboardInterrupt):
+            rclpy.try_shutdown()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
