@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from quadid.sanitise import LONGEST_NAME
+from quadid.vehicle_parts import Strict
 
 MOST_FLIGHTS = 100
 """Flights that a file remembers."""
 
 
-class FittedFlight(BaseModel):
+class FittedFlight(Strict):
     """A flight that values were fitted to, so that it is known again under another name, in another format, in part.
 
     Attributes:
@@ -22,15 +23,13 @@ class FittedFlight(BaseModel):
         marks: short hashes of some stretches of its gyro, see `quadid_workflow.overlap`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     log: str = Field(max_length=LONGEST_NAME)
     seconds: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
     begin: Annotated[float, Field(allow_inf_nan=False)] | None = None
     marks: Annotated[str, Field(max_length=600)] = ""
 
 
-class Proof(BaseModel):
+class Proof(Strict):
     """What shows that the values of this file predict.
 
     Attributes:
@@ -39,8 +38,6 @@ class Proof(BaseModel):
         error: largest of their errors over one second, in noise variances (1 is the noise floor).
         fitted: flights that the values rest on; their standard deviations are no knowledge beside the same flights.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     verdict: Literal["good", "fair", "poor"]
     unseen: tuple[str, ...] = ()

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from quadid.errors import nearest
+from quadid.vehicle_parts import Strict
 
 SIGNALS: dict[str, str] = {
     "v_x": "m/s", "v_y": "m/s", "v_z": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s", "g_x": "", "g_y": "",
@@ -26,7 +27,7 @@ MOST_FACTORS = 3
 MOST_TERMS = 500
 
 
-class ResidualTerm(BaseModel):
+class ResidualTerm(Strict):
     """A force or moment beyond the catalogue: `value` times a product of signals.
 
     Attributes:
@@ -34,8 +35,6 @@ class ResidualTerm(BaseModel):
         product: up to three of `SIGNALS`; empty for a constant.
         value: coefficient, in the SI unit `unit`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     acts_on: str
     product: tuple[str, ...] = Field(default=(), max_length=MOST_FACTORS)

@@ -16,7 +16,7 @@ from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.provenance import Proof
 from quadid.residual import MOST_TERMS, ResidualTerm
-from quadid.sanitise import LONGEST_NAME
+from quadid.sanitise import LONGEST_LINE, LONGEST_NAME, plain
 from quadid.types import FloatArray
 from quadid.vehicle_parts import (
     MIXERS,
@@ -260,7 +260,7 @@ class Vehicle(Strict):
                 del data[name]
         if self.mounting == Mounting():
             del data["mounting"]
-        head = "".join(f"# {line}\n" for line in self._remark.splitlines())
+        head = "".join(f"# {plain(line, LONGEST_LINE)}\n" for line in self._remark.splitlines())
         return head + str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))
 
     def with_remark(self, remark: str) -> Vehicle:

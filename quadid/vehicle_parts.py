@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from quadid.sanitise import plain
 from quadid.types import FloatArray
 
 DEFAULT_BOUND_FACTOR = 4.0
@@ -24,9 +26,28 @@ MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
 
 
 class Strict(BaseModel):
-    """A frozen part of a file that allows no other keys."""
+    """A frozen part of a file that allows no other keys, and no text but printable text of one line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _printable(cls, value: Any) -> Any:
+        for text in _texts(value):
+            if not text.isprintable():
+                raise ValueError(f"'{plain(text, 60)}' has a line break or another character that does not print")
+        return value
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in a value, keys too."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from _texts([*value.keys(), *value.values()])
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _texts(item)
 
 
 class Rotor(Strict):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from quadid.types import Json
+from quadid_report.templating import environment
 from quadid_report.verdict import digits
 
 
@@ -30,17 +31,15 @@ def render(page: Json) -> str:
             `quadid_report.verdict`), ``parameters``, ``parameter_figure``, ``diagnoses``, ``sets``, ``quality``,
             ``noise``, ``warnings``, ``provenance``.
     """
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    environment.filters |= {"number": number, "code": code, "unit": unit, "digits": digits}
+    language = environment("html")
+    language.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    language.filters |= {"number": number, "code": code, "unit": unit, "digits": digits}
     figures = all_figures(page)
     scripts = {name: closed(text) for name, text in (("plotly", _drawing(figures)), ("page", _asset("page.js")))}
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
-    template = environment.from_string(_asset("page.html"))
-    return template.render(
+    return language.get_template("page.html.j2").render(
         page={**_EMPTY, **page},
         figures=packed(figures),
         style=Markup(_asset("page.css")),

@@ -1,12 +1,20 @@
-"""The forms by name."""
+"""The forms by name, each a template in ``templates/manoeuvres``.
+
+Scripts watch the envelope themselves, begin only when the pilot has switched to them in flight, and end in a mode that
+holds the place.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
 from quadid.errors import ParameterError, nearest
+from quadid.types import Json
 from quadid_report.manoeuvres.plan import Plan
-from quadid_report.manoeuvres.scripts import ardupilot_lua, px4_ros2
-from quadid_report.manoeuvres.sticks import sticks
-from quadid_report.manoeuvres.system_id import system_id
+from quadid_report.templating import render
 
 FORMS = {
     "ardupilot-lua": "Lua script for ArduCopter, all axes at once",
@@ -14,6 +22,13 @@ FORMS = {
     "px4": "ROS 2 script for PX4's Offboard mode, all axes at once",
     "sticks": "instructions for a pilot",
 }
+PEAK = math.sqrt(2.0)
+"""Of a swing over its rms."""
+SID_AXES = {"roll": 1, "pitch": 2, "yaw": 3, "throttle": 13}
+"""What ArduCopter's SystemID mode adds a sweep to: roll and pitch angle [deg], yaw rate [deg/s], throttle (share of
+full).  It stops itself on landing and beyond the largest lean angle; fence and battery failsafe are the autopilot's
+own.  https://ardupilot.org/copter/docs/systemid-mode.html"""
+_WHAT = "a manoeuvre that shows mass-normalised thrust, drag torque and inertia"
 
 
 def check_form(form: str) -> None:
@@ -34,16 +49,40 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
         ParameterError: an unknown form, or too short a manoeuvre for it.
     """
     check_form(form)
+    facts = {**asdict(plan), **plan.envelope, "header": plan.header(plan.promise, _WHAT)}
     if form == "ardupilot-lua":
-        return {".manoeuvre.lua": ardupilot_lua(plan)}
-    if form == "ardupilot-sid":
-        if not plan.sweeps:
-            raise ParameterError(
-                f"too short for sweeps of one axis after the other: {plan.seconds:g} s",
-                "36 s or more",
-                "use --seconds 60",
-            )
-        return system_id(plan, hover_throttle)
+        return {".manoeuvre.lua": render("manoeuvres/ardupilot.lua", facts)}
     if form == "px4":
-        return {".manoeuvre_px4.py": px4_ros2(plan)}
-    return {".sticks.txt": sticks(plan)}
+        return {".manoeuvre_px4.py": render("manoeuvres/px4.py", facts)}
+    if form == "sticks":
+        facts["header"] = plan.header(plan.promise, "what to do with the sticks")
+        return {".sticks.txt": render("manoeuvres/sticks.txt", {**facts, "blocks": _blocks(plan)})}
+    if not plan.sweeps:
+        raise ParameterError(
+            f"too short for sweeps of one axis after the other: {plan.seconds:g} s",
+            "36 s or more",
+            "use --seconds 60",
+        )
+    return {
+        f".sid_{i}_{sweep['axis']}.param": render(
+            "manoeuvres/system_id.param", {**facts, **_sweep(plan, i, sweep, hover_throttle)}
+        )
+        for i, sweep in enumerate(plan.sweeps, 1)
+    }
+
+
+def _sweep(plan: Plan, i: int, sweep: Json, hover_throttle: float) -> dict[str, Any]:
+    axis, size = str(sweep["axis"]), float(sweep["amplitude"])
+    what = f"sweeps of SystemID mode, {i} of {len(plan.sweeps)} ({axis})"
+    magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
+    header = plan.header(plan.promise_sweeps, what)
+    return {"sweep": sweep, "axis": SID_AXES[axis], "magnitude": magnitude, "header": header}
+
+
+def _blocks(plan: Plan) -> list[tuple[list[dict[str, Any]], int]]:
+    """Movements of the sticks at one time, alike ones counted."""
+    shown = [
+        [{**s, "start": 0.0, "peak": PEAK * s["amplitude"], "peak_deg": math.degrees(PEAK * s["amplitude"])} for s in b]
+        for _, b in groupby(plan.segments, key=lambda s: s["start"])
+    ]
+    return [(block, len(list(same))) for block, same in groupby(shown)]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, rotor_losses
 from quadid.model.thrust import ThrustModel
 from quadid.parameters import NOMINAL_UNITS
-from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
@@ -21,23 +20,24 @@ TO_FLU = np.diag([1.0, -1.0, -1.0])
 """Turns body FRD into body FLU (its own inverse)."""
 SHORTEST_LAG = 1e-3
 """Programs divide by the time constant of the motors [s]."""
-TENSOR = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
-"""Entries of an inertia tensor as SDF and URDF call them."""
 
 
-def number(value: float) -> str:
-    """A number with eight digits, never minus zero."""
-    return f"{float(value) + 0.0:.8g}"
+class RotorFacts(NamedTuple):
+    """One rotor.
 
+    Attributes:
+        frd, flu: from the CG [m], shape (3,).
+        spin: its sign in Omega_r; `turn_flu` the sign of its torque on the vehicle about +z of FLU, -z of FRD.
+        thrust: coefficient [N s^2/rad^2].
+        full_thrust: at full command [N], where the full rotor speed is known.
+    """
 
-def row(values: Iterable[float], separator: str = ", ") -> str:
-    """Numbers beside each other."""
-    return separator.join(map(number, values))
-
-
-def matrix(values: FloatArray) -> str:
-    """A matrix as Python and TOML read it."""
-    return "[" + ", ".join(f"[{row(line)}]" for line in values) + "]"
+    frd: FloatArray
+    flu: FloatArray
+    spin: int
+    turn_flu: int
+    thrust: float
+    full_thrust: float | None
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class Facts:
 
     vehicle: Vehicle
     source: str
+    tensor = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+    """Entries of an inertia tensor as SDF and URDF call them."""
 
     def value(self, name: str) -> float:
         """Value of a nominal parameter, SI."""
@@ -66,6 +68,21 @@ class Facts:
         if prior.sigma is None:
             return "not from data: as the vehicle file has it, without a sigma"
         return f"fitted, or given with its uncertainty: 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
+
+    def interval(self, name: str, scale: float = 1.0) -> tuple[float, float]:
+        """95 % interval of a nominal parameter on the log scale, times `scale`; no width for what was not measured."""
+        prior = self.vehicle.parameters[name]
+        half = Z95 * (prior.sigma or 0.0) / prior.initial
+        return scale * prior.initial * math.exp(-half), scale * prior.initial * math.exp(half)
+
+    @cached_property
+    def rotors(self) -> list[RotorFacts]:
+        """Every rotor, in the order of the vehicle file."""
+        full = [None] * len(self.arms) if self.full_thrust is None else self.full_thrust.tolist()
+        return [
+            RotorFacts(frd, TO_FLU @ frd, rotor.spin, -rotor.spin, float(thrust), most)
+            for frd, rotor, thrust, most in zip(self.arms, self.vehicle.rotors, self.thrust, full, strict=True)
+        ]
 
     @cached_property
     def arms(self) -> FloatArray:
@@ -186,7 +203,7 @@ class Facts:
         lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
         if left:
             lines.append(f"Effects that have no place here: {', '.join(left)}")
-        return [plain(line, LONGEST_LINE) for line in lines]
+        return lines
 
     def _optional(self, name: str, used: tuple[str, ...]) -> list[str]:
         """Optional numbers of an effect that say something and are not among `used`."""
@@ -195,7 +212,3 @@ class Facts:
             p for p in there if self.effect(name, p.name) != (self.effect(name, p.beside) if p.beside else p.neutral)
         ]
         return [f"{name}.{p.name}" for p in said if f"{name}.{p.name}" not in used]
-
-    def xml_comment(self, used: tuple[str, ...]) -> str:
-        """The header inside an XML comment, which two hyphens would end."""
-        return "\n".join(re.sub("-(?=-)", "- ", f"  {line}") for line in self.header(used))

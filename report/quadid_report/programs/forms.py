@@ -1,15 +1,16 @@
-"""Every form by name."""
+"""Every form by name: whose it is, which effects it carries, its templates, and what only it wants to know."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, nearest
 from quadid.vehicle import Vehicle
-from quadid_report.programs import agilicious, ardupilot, drone_models, gazebo, isaac_lab, mujoco, px4, rotorpy, urdf
+from quadid_report.programs import particulars
 from quadid_report.programs.facts import Facts
+from quadid_report.templating import render
 
 
 class Form(NamedTuple):
@@ -18,12 +19,15 @@ class Form(NamedTuple):
     Attributes:
         program: whose.
         carried: effects that it can hold, and optional numbers of these; all others are named in the file as left out.
-        texts: makes the text that belongs in a file, by the ending of its name.
+        templates: name of the template of every file, by the ending of the file's name.
+        particulars: what the templates need beside `Facts`; ``lost`` among it are effects that it cannot hold of this
+            vehicle.
     """
 
     program: str
     carried: tuple[str, ...]
-    texts: Mapping[str, Callable[[Facts], str]]
+    templates: Mapping[str, str]
+    particulars: Callable[[Facts], Mapping[str, Any]] = lambda facts: {}
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -33,28 +37,45 @@ class Form(NamedTuple):
 
 ALL = (*EFFECTS, *(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters), "residual")
 """Everything that a vehicle file holds."""
-
-
-def _yaml(facts: Facts) -> str:
-    head = facts.header(ALL)
-    return "".join(f"# {line}\n" for line in head) + facts.vehicle.to_yaml()
-
+_BODY = ("cg_offset", "product_of_inertia")
+_LAGS = ("motor_lag", "motor_lag.tau_down")
 
 FORMS: dict[str, Form] = {
-    "yaml": Form("quadid", ALL, {".yaml": _yaml}),
-    "px4": Form("PX4, SIH, EKF2", px4.CARRIED, {".params": px4.px4}),
-    "ardupilot": Form(
-        "ArduPilot, SITL", ardupilot.CARRIED,
-        {".param": ardupilot.ardupilot_parameters, ".sitl.json": ardupilot.ardupilot_frame},
+    "yaml": Form("quadid", ALL, {".yaml": "quadid.yaml"}, particulars.own_file),
+    "px4": Form(
+        "PX4, SIH, EKF2",
+        (*_BODY, "weak_rotor", "rotor_drag", "parasitic_drag", "rate_damping", "motor_lag"),
+        {".params": "px4.params"},
+        particulars.px4,
     ),
-    "gazebo": Form("Gazebo", gazebo.CARRIED, {".sdf": gazebo.gazebo}),
-    "rotorpy": Form("RotorPy", rotorpy.CARRIED, {"_params.py": rotorpy.rotorpy}),
-    "agilicious": Form("Agilicious", agilicious.CARRIED, {".agilicious.yaml": agilicious.agilicious}),
-    "mujoco": Form("MuJoCo", mujoco.CARRIED, {".mjcf.xml": mujoco.mujoco}),
-    "urdf": Form("URDF", urdf.CARRIED, {".urdf": urdf.urdf}),
-    "drone-models": Form("drone-models, crazyflow", drone_models.CARRIED, {".params.toml": drone_models.drone_models}),
-    "isaac-lab": Form("Isaac Lab", isaac_lab.CARRIED, {"_isaaclab.py": isaac_lab.isaac_lab}),
-}  # fmt: skip
+    "ardupilot": Form(
+        "ArduPilot, SITL",
+        ("thrust_curve",),
+        {".param": "ardupilot.param", ".sitl.json": "ardupilot.sitl.json"},
+        particulars.ardupilot,
+    ),
+    "gazebo": Form("Gazebo", (*_BODY, *_LAGS, "rotor_drag", "weak_rotor"), {".sdf": "gazebo.sdf"}, particulars.gazebo),
+    "rotorpy": Form(
+        "RotorPy",
+        (*_BODY, "motor_lag", "rotor_drag", "axial_inflow", "parasitic_drag", "imu_lever_arm"),
+        {"_params.py": "rotorpy.py"},
+    ),
+    "agilicious": Form(
+        "Agilicious",
+        ("cg_offset", "motor_lag", "rotor_drag"),
+        {".agilicious.yaml": "agilicious.yaml"},
+        particulars.agilicious,
+    ),
+    "mujoco": Form("MuJoCo", (*_BODY, "weak_rotor"), {".mjcf.xml": "mujoco.mjcf.xml"}),
+    "urdf": Form("URDF", _BODY, {".urdf": "vehicle.urdf"}),
+    "drone-models": Form(
+        "drone-models, crazyflow",
+        (*_BODY, *_LAGS, "rotor_drag", "rotor_drag.central", "axial_inflow", "axial_inflow.central"),
+        {".params.toml": "drone_models.toml"},
+        particulars.drone_models,
+    ),
+    "isaac-lab": Form("Isaac Lab", (*_BODY, *_LAGS), {"_isaaclab.py": "isaac_lab.py"}, particulars.isaac_lab),
+}
 FORMATS = tuple(FORMS)
 
 
@@ -70,9 +91,12 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
         Text by the ending of the file name it belongs in.
 
     Raises:
-        ParameterError: unknown form.
+        ParameterError: unknown form, or a vehicle that it cannot hold.
     """
     if form not in FORMS:
         raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
-    facts = Facts(vehicle, source)
-    return {end: write(facts) for end, write in FORMS[form].texts.items()}
+    facts, asked = Facts(vehicle, source), FORMS[form]
+    own = asked.particulars(facts)
+    header = facts.header(tuple(name for name in asked.carried if name not in own.get("lost", ())))
+    values = {**own, "f": facts, "v": vehicle, "rotors": facts.rotors, "header": header}
+    return {end: render(f"programs/{name}", values) for end, name in asked.templates.items()}
