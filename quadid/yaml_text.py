@@ -44,12 +44,21 @@ def read_mapping(text: str, origin: str, wanted: str = "a YAML mapping") -> dict
     Raises:
         VehicleError: no mapping, or one of the things named above; one line.
     """
+    value = read_value(text, origin)
+    if not isinstance(value, dict):
+        kind = "nothing" if value is None else "a list" if isinstance(value, list) else "one value"
+        raise VehicleError(f"{origin}: holds {kind}", wanted)
+    return value
+
+
+def read_value(text: str, origin: str) -> Any:
+    """Returns what a YAML text holds, as `read_mapping` does, whatever that is; None for nothing."""
     if len(text) > LARGEST:
         raise VehicleError(f"{origin}: {len(text)} characters", f"up to {LARGEST}", "is this the right file?")
     try:
         _check_depth(text)
         node = yaml.compose(text, Loader=_LOADER)
-        value = None if node is None else _value(node, "")
+        return None if node is None else _value(node, "")
     except _RefusedError as error:
         raise VehicleError(f"{origin}: {plain(error.why, 200)}", fix=error.instead) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -57,13 +66,9 @@ def read_mapping(text: str, origin: str, wanted: str = "a YAML mapping") -> dict
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}"
         raise VehicleError(
-            f"{origin}: not YAML{where} ({plain(getattr(error, 'problem', None) or first, 160)})", "a YAML mapping",
+            f"{origin}: not YAML{where} ({plain(getattr(error, 'problem', None) or first, 160)})", "YAML",
             "indent with spaces, and write `name: value`",
         ) from error  # fmt: skip
-    if not isinstance(value, dict):
-        kind = "nothing" if value is None else "a list" if isinstance(value, list) else "one value"
-        raise VehicleError(f"{origin}: holds {kind}", wanted)
-    return value
 
 
 def _check_depth(text: str) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega
 from quadid_replay.esc_messages import extend_dialect
+from quadid_workflow.files import read_regular
 
 from quadid.errors import QuadidError
 from quadid_node.mavlink_peers import Peers
@@ -122,7 +123,7 @@ def read_key(path: Path) -> bytes:
         LinkError: no such file, or no key in it; the link is then not opened at all.
     """
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise LinkError(f"signing key {path} cannot be read ({error.strerror})", fix="check the path") from error
     text = data.strip()

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from quadid_workflow.files import read_regular
+
 from quadid.errors import QuadidError, VehicleError
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
@@ -86,7 +88,7 @@ def read_vehicle(name: str) -> Vehicle:
     if path.suffix.lower() not in (".yaml", ".yml") and "/" not in name:
         return Vehicle.shipped(name)
     try:
-        return Vehicle.from_yaml(path.read_text(encoding="utf-8"), path.name)
+        return Vehicle.from_yaml(read_regular(path).decode("utf-8"), path.name)
     except (OSError, UnicodeDecodeError) as error:
         raise VehicleError(f"vehicle file {name} cannot be read ({error})", "a shipped name or a YAML file") from error
 

@@ -263,7 +263,10 @@ def _outputs(
     found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
     notes += [found.problem] if found.problem else []
     motors = [] if found.problem else found.columns or active_outputs(pulses)
-    if not motors:
+    lost = [k + 1 for k in motors if k not in place]
+    if lost:
+        notes.append(f"motors on outputs {lost}, of which the log holds no column: no output is used")
+    if not motors or lost:
         return []
     label = " ".join([*dict.fromkeys(place[k][0] for k in motors), *(place[k][1] for k in motors)])
     return [RawChannel("motor_command", first.t, pulses[:, motors], label, first.refused)]

@@ -16,7 +16,7 @@ from quadid_cli.simulate import check_target, stream
 from quadid_replay import open_log
 from quadid_workflow.simulate import SimulateError, parse_effects, read_manoeuvre
 
-from quadid.errors import ParameterError
+from quadid.errors import ParameterError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
 
@@ -100,8 +100,12 @@ def test_manoeuvre_files(tmp_path: Path) -> None:
     assert read_manoeuvre(file)[0].axis == "roll"
     for text in ("[]", "segments: 3", "- 5", "{", "- {axis: roll}"):
         file.write_text(text)
-        with pytest.raises((SimulateError, ParameterError)):
+        with pytest.raises((SimulateError, ParameterError, VehicleError)):
             read_manoeuvre(file)
+    laughs = ["a0: &a0 [x, x]", *(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]" for k in range(1, 40))]
+    file.write_text("\n".join([*laughs, "segments: [{axis: *a39, kind: doublet}]"]))
+    with pytest.raises(VehicleError, match="anchors and aliases"):
+        read_manoeuvre(file)
     with pytest.raises(SimulateError, match="no manoeuvre file"):
         read_manoeuvre(tmp_path / "none.yaml")
 

@@ -1,8 +1,10 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all; files of users read without waiting for one that is none."""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 from quadid.errors import QuadidError
@@ -10,6 +12,18 @@ from quadid.errors import QuadidError
 
 class OutputError(QuadidError):
     """A place that cannot be written to."""
+
+
+def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
+    """Reads at most `most` bytes of a file.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or a folder, which may have no end and need never begin.
+    """
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        return file.read(most)
 
 
 def write_text(path: str | Path, text: str) -> Path:

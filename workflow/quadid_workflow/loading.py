@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from quadid.errors import LogError, VehicleError
+from quadid_workflow.files import read_regular
 from quadid_workflow.log_parts import LogPart, flown_parts, left_on_ground, names_of, parse_part
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
     from quadid.window import Recording, Window
 
-_LARGEST_VEHICLE_FILE = 1 << 20
 GRID = 50.0
 """Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
@@ -91,8 +91,7 @@ def load_vehicle(name: str) -> Vehicle:
     if path.is_dir():
         raise VehicleError(f"{name} is a directory", "a shipped name or a YAML file", "name the file in it")
     try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_VEHICLE_FILE)
+        data = read_regular(path)
     except FileNotFoundError as error:
         raise VehicleError(f"no vehicle file {name}", "a shipped name or a YAML file", "check the path") from error
     except OSError as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.errors import ParameterError, QuadidError, nearest
+from quadid_workflow.files import read_regular
 from quadid_workflow.loading import as_vehicle, write_recording
 from quadid_workflow.searching import check_seed
 
@@ -21,7 +22,6 @@ LONGEST = 3600.0
 """Longest flight [s]: every step of it is held in memory."""
 WIDEST = 0.9
 """Largest fraction by which true parameters leave those of the type."""
-_LARGEST_MANOEUVRE = 1 << 20
 
 
 class SimulateError(QuadidError):
@@ -148,21 +148,21 @@ def read_manoeuvre(path: Path) -> list[Segment]:
     """Reads a manoeuvre file: a list of segments, or a mapping with that list as ``segments``.
 
     Raises:
-        SimulateError: not a readable YAML list.
+        SimulateError: no such file, or no list of segments.
+        VehicleError: not YAML, or with anchors, tags or doubled keys.
         ParameterError: a segment that cannot be flown.
     """
-    import yaml
-
     from quadid.flight import Segment
+    from quadid.yaml_text import read_value
 
     try:
-        data = yaml.safe_load(path.read_bytes()[:_LARGEST_MANOEUVRE].decode("utf-8"))
+        data = read_value(read_regular(path).decode("utf-8"), path.name)
     except FileNotFoundError as error:
         raise SimulateError(f"no manoeuvre file {path}", "a YAML file", "check the path") from error
     except OSError as error:
         raise SimulateError(f"cannot read {path}: {error.strerror}", "a YAML file", "check the path") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SimulateError(f"{path.name}: not YAML", "a list of segments") from error
+    except UnicodeDecodeError as error:
+        raise SimulateError(f"{path.name}: not text", "a list of segments") from error
     if isinstance(data, dict):
         data = data.get("segments")
     if not isinstance(data, list) or not all(isinstance(entry, dict) for entry in data) or not data:
