@@ -23,7 +23,7 @@ from quadid.online.command_reconstruction import CommandReconstruction
 from quadid.online.rows import Rows, columns_on_grid
 from quadid.resample import HALF_WIDTH, lowpass
 from quadid.resampling_plan import make_plan
-from quadid.rotor_signal import RotorSignal, rotor_signal
+from quadid.rotor_signal import RotorSignal, rotor_channel, rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import CHANNELS, Block, Recording, Sample
@@ -258,6 +258,8 @@ class Resampler:
             if misfits and not told:
                 wanted = f"{len(self._vehicle.rotors)}, the rotors of '{self._vehicle.name}'"
                 raise LogError(f"live: {misfits[0]}", wanted, "choose the vehicle file that belongs to these data")
+            if told and rotor_channel(recording, self._vehicle)[0] is None:
+                raise LogError("live: rotor speeds or motor commands pause", fix="they are used once they come")
             return rotor_signal(recording, self._vehicle)
         until = float(at[-1]) + (HALF_WIDTH + 2.0) * self._step
         self._reconstruction.advance(self._buffers, until, float(at[0]) - HISTORY)

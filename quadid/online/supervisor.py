@@ -163,7 +163,10 @@ class Supervisor:
         else:
             self.rejected += 1
         outbox.act(Publish("candidate", item))
-        outbox.state(self._phase_of(decision.state), f"{decision.check}: {decision.reason}")
+        said, waiting = f"{decision.check}: {decision.reason}", active_set.pending
+        if waiting is not None and decision.state is SetState.REJECTED:
+            said = f"set {waiting.sequence} waits for approval; a newer estimate was held back ({decision.check})"
+        outbox.state(self._phase_of(decision.state), said)
 
     def _phase_of(self, state: SetState) -> Phase:
         if state is SetState.PENDING or self._active_set.pending is not None:

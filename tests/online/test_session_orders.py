@@ -8,6 +8,7 @@ import pytest
 
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.gate import Decision
 from quadid.online.jobs import Job
 from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, events, published
@@ -31,6 +32,30 @@ FLIGHT = light_flight(30.0)
 
 def never(job: Job) -> None:
     """A worker that does not answer."""
+
+
+def test_after_a_set_waits_nobody_is_told_to_keep_flying(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(PELICAN, MANUAL)
+    works(session, between(FLIGHT, 0.0, 10.7, EPOCH), tells())
+    waiting = session.status().pending
+    refusal = Decision(SetState.REJECTED, "agreement", "2 of 3 windows agree so far: keep flying")
+    monkeypatch.setattr("quadid.online.supervisor.decide", lambda case, settings: refusal)
+    works(session, between(FLIGHT, 10.7, 14.7, EPOCH), tells())
+    status = session.status()
+    assert (status.phase, status.pending) == (Phase.PENDING, waiting)
+    assert "keep flying" not in status.reason
+    assert f"set {waiting} waits for approval" in status.reason
+
+
+def test_rotor_speeds_that_came_and_pause_are_no_matter_of_an_autopilots_log_profile() -> None:
+    """The publisher of the rotor speeds was restarted; the status named PX4's SDLOG_PROFILE."""
+    session = Session(PELICAN, QUICK)
+    works(session, between(FLIGHT, 0.0, 8.7, EPOCH), tells())
+    paused = [s for s in between(FLIGHT, 8.7, 24.0, EPOCH) if s.channel != "rotor_speed"]
+    works(session, paused, tells())
+    assert session.status().phase is Phase.BLOCKED
+    assert "pause" in session.status().reason
+    assert "SDLOG" not in session.status().reason
 
 
 def with_two_sets(shift: float = 0.0) -> Session:
