@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quadid_workflow.diagnose import diagnose as diagnose
+    from quadid_workflow.excite import propose as excite
     from quadid_workflow.export import export as export
     from quadid_workflow.health import health as health
     from quadid_workflow.identify import identify as identify
+    from quadid_workflow.init import init as init
     from quadid_workflow.inspect import inspect as inspect
     from quadid_workflow.loading import load as load
     from quadid_workflow.score import score as score
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PUBLIC = {
+    "init": "quadid_workflow.init",
     "load": "quadid_workflow.loading",
     "inspect": "quadid_workflow.inspect",
     "identify": "quadid_workflow.identify",
@@ -47,16 +50,18 @@ _PUBLIC = {
 """Public names and where they are defined."""
 _ROOMS = ("identify", "diagnose", "health")
 """Names that are packages too: those are callable (`quadid.callable_room`)."""
-__all__ = [*_PUBLIC]
+__all__ = [*_PUBLIC, "excite"]
 
 
 def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return importlib.import_module(f"quadid.{name}")
+    if name == "excite":
+        return importlib.import_module("quadid_workflow.excite").propose
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'quadid' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PUBLIC})
+    return sorted([*__all__, "__version__"])

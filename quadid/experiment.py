@@ -92,7 +92,7 @@ class Proposal:
         return np.array([np.hypot(moved[:, 0], moved[:, 1]).max(), max(-moved[:, 2].min(), 0.0), moved[:, 2].max()])
 
 
-class Simulator:
+class TrialFlights:
     """Flies what is believed of the vehicle and weighs the flights."""
 
     def __init__(self, vehicle: Vehicle, noise: NoiseModel | None, seed: int) -> None:
@@ -150,7 +150,7 @@ def scaled(segments: Sequence[Segment], factor: float) -> tuple[Segment, ...]:
     return tuple(replace(s, amplitude=min(s.amplitude * factor, AMPLITUDES[s.axis][1])) for s in segments)
 
 
-def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Movement]:
+def movements(simulator: TrialFlights, limits: Limits, advance: Advance) -> list[Movement]:
     """Every candidate movement at the amplitude that the limits allow, with its information."""
     out = []
     todo = [(mix, band) for mix in MIXES for band in BANDS]
@@ -167,7 +167,7 @@ def movements(simulator: Simulator, limits: Limits, advance: Advance) -> list[Mo
 
 
 def design_manoeuvre(
-    simulator: Simulator, known: FloatArray, limits: Limits, seconds: float, advance: Advance
+    simulator: TrialFlights, known: FloatArray, limits: Limits, seconds: float, advance: Advance
 ) -> Proposal:
     """Chooses a manoeuvre of about `seconds` and predicts what it would give.
 
@@ -211,7 +211,7 @@ def design_manoeuvre(
     )  # fmt: skip
 
 
-def one_axis_at_a_time(simulator: Simulator, limits: Limits, seconds: float) -> tuple[Segment, ...]:
+def one_axis_at_a_time(simulator: TrialFlights, limits: Limits, seconds: float) -> tuple[Segment, ...]:
     """Sweeps of roll, pitch, yaw and throttle one after the other, as large as the limits allow.
 
     Args:

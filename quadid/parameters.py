@@ -138,6 +138,41 @@ class ParameterSet:
         scale = np.where(sigma > 0.0, sigma, np.inf)
         return np.asarray(self.covariance / np.outer(scale, scale))
 
+    def sample(self, n: int, seed: int = 0, floor: float = 0.1) -> tuple[FloatArray, dict[str, str]]:
+        """Draws parameter values from the joint covariance, as logarithms, so that none changes its sign.
+
+        A parameter that this flight did not identify has at least the spread `floor`: what was not measured is never
+        drawn with no width.
+
+        Args:
+            n: number of draws.
+            seed: decides them.
+            floor: least relative standard deviation of a parameter that is not identified.
+
+        Returns:
+            Values, shape (n, parameters); names with the reason of those whose spread is the floor.
+
+        Raises:
+            ParameterError: fewer than one draw, a floor that is not positive, or a value that is not positive.
+        """
+        if n < 1 or not floor > 0.0:
+            raise ParameterError(f"{n} draws with a floor of {floor}", "1 or more, a positive floor")
+        if not np.all(self.values > 0.0):
+            raise ParameterError("a value that is not positive has no logarithm", "positive parameters")
+        shape = self.covariance / np.outer(self.values, self.values)
+        sigma = np.sqrt(np.diag(shape))
+        floors = {
+            p.name: f"{p.status.value}: not measured, drawn with {floor:.0%}"
+            for p, s in zip(self.parameters, sigma, strict=True)
+            if not s > 0.0 or (p.status is not Status.IDENTIFIED and s < floor)
+        }
+        for i, name in enumerate(self.names):
+            if name in floors:
+                shape[i, :] = shape[:, i] = 0.0
+                shape[i, i] = floor**2
+        draws = np.random.default_rng(seed).multivariate_normal(np.zeros(len(self)), shape, size=n, method="eigh")
+        return self.values * np.exp(draws), floors
+
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self.parameters)
 

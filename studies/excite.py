@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from quadid_workflow.excite import knowledge
 
-from quadid.experiment import Limits, Proposal, Simulator, design_manoeuvre
+from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre
 from quadid.flight import Flight, draw_truth, fly
 from quadid.identify.fit import FitOptions, fit
 from quadid.identify.optimal_input import halfwidths
@@ -54,7 +54,7 @@ def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
     vehicle = poor_guess(CRAFT, truth.as_dict(), seed)
     first = fly(CRAFT, truth, seconds, seed, "gentle").window
     believed, known, noise = knowledge(vehicle, [first], seed, quiet)
-    proposal = design_manoeuvre(Simulator(believed, noise, seed), known, LIMITS, seconds, quiet)
+    proposal = design_manoeuvre(TrialFlights(believed, noise, seed), known, LIMITS, seconds, quiet)
     length = proposal.seconds
     flown = fly(CRAFT, truth, length, seed + 1, "scripted", segments=proposal.segments)
     widths = [proposal.now]
@@ -62,7 +62,7 @@ def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
         widths.append(obtained([first, fly(CRAFT, truth, length, seed + 1, profile).window], vehicle, seed))
     found = fit([first, flown.window], vehicle, FitOptions(iterations=0, seed=seed))
     # The same manoeuvre weighed again with what it told: differs from the forecast where the guess was poor.
-    wiser = Simulator(fitted_vehicle(found), found.noise, seed)
+    wiser = TrialFlights(fitted_vehicle(found), found.noise, seed)
     again = wiser.information(wiser.fly(proposal.segments, length))
     widths += [proposal.after, halfwidths(known + again), obtained([first, flown.window], vehicle, seed)]
     second = fly(CRAFT, truth, length, seed + 2, "scripted", segments=proposal.segments).window

@@ -199,6 +199,38 @@ def test_what_a_notebook_needs(logs: dict[str, str], tmp_path: Path) -> None:
     )
 
 
+def test_drawn_vehicles_have_the_covariance_and_fly(logs: dict[str, str]) -> None:
+    fit = quadid.identify(logs["good"], vehicle="pelican")
+    thetas, floors = fit.sample(4000, seed=3)
+    p = fit.parameters
+    known = [i for i, name in enumerate(p.names) if name not in floors]
+    spread = np.cov(np.log(thetas[:, known]).T)
+    wanted = (p.covariance / np.outer(p.values, p.values))[np.ix_(known, known)]
+    np.testing.assert_allclose(np.sqrt(np.diag(spread)), np.sqrt(np.diag(wanted)), rtol=0.06)
+    assert np.corrcoef(spread.ravel(), wanted.ravel())[0, 1] > 0.99
+    batch = quadid.Simulator(fit.vehicle, thetas[:20])
+    state = batch.start(dt=0.01)
+    for _ in range(50):
+        batch.advance(state, np.full(4, fit.vehicle.hover_speed()), 0.01)
+    assert np.isfinite(state.position).all()
+    assert np.unique(state.velocity[:, 2]).size == 20
+
+
+def test_what_was_not_measured_is_never_drawn_without_width() -> None:
+    from quadid.parameters import Parameter, ParameterSet, Status
+
+    unknown = Parameter("J_r", "kg m^2", 3e-5, sigma=1e-9, status=Status.PRIOR_DOMINATED)
+    known = Parameter("b", "N s^2/rad^2", 2e-5, sigma=2e-7, status=Status.IDENTIFIED)
+    drawn, floors = ParameterSet((known, unknown), np.diag([2e-7**2, 1e-18])).sample(4000)
+    assert list(floors) == ["J_r"]
+    np.testing.assert_allclose(np.log(drawn).std(axis=0), [0.01, 0.1], rtol=0.05)
+
+
+def test_the_module_lists_public_names_only() -> None:
+    assert {"excite", "init", "identify", "Simulator"} <= set(dir(quadid))
+    assert not [n for n in dir(quadid) if n.startswith("_") and n != "__version__"]
+
+
 def test_the_import_is_cheap_and_reads_no_logs() -> None:
     text = (
         "import sys, quadid\n"

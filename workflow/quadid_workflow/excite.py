@@ -142,7 +142,7 @@ def propose(
     """
     from quadid_report.programs.facts import Facts
 
-    from quadid.experiment import Limits, Simulator, design_manoeuvre, manoeuvre_file
+    from quadid.experiment import Limits, TrialFlights, design_manoeuvre, manoeuvre_file
 
     check_limits(seconds, tilt, rate_limit, height, battery)
     check_seed(seed)
@@ -151,7 +151,7 @@ def propose(
     given = read(logs, described)
     windows = [w for log in given for w in log.windows]
     believed, known, noise = knowledge(described, windows, seed, advance)
-    proposal = design_manoeuvre(Simulator(believed, noise, seed), known, limits, seconds, advance)
+    proposal = design_manoeuvre(TrialFlights(believed, noise, seed), known, limits, seconds, advance)
     plan = _plan(believed.name, proposal, tilt, height, battery)
     result = {
         **_result(believed.name, proposal, tilt, rate_limit),

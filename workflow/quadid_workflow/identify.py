@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from quadid.identify.fit import Fit
     from quadid.identify.result import ScoredSet
     from quadid.parameters import ParameterSet
+    from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
     from quadid_workflow.loading import Log
 
@@ -86,6 +87,27 @@ class Identified(Fitted):
             {**{k: v for k, v in p.items() if k != "ci95"}, "low": p["ci95"][0], "high": p["ci95"][1]}
             for p in self.result["parameters"]
         ]
+
+    def sample(self, n: int, seed: int = 0) -> tuple[FloatArray, dict[str, str]]:
+        """Draws vehicles from the joint covariance, for `quadid.Simulator(fit.vehicle, thetas)`.
+
+        Args:
+            n: number of vehicles.
+            seed: decides them.
+
+        Returns:
+            Full parameter vectors, shape (n, size); and, by name, why a parameter has only a floor for its spread:
+            not identified by this flight, or an effect that the vehicle file states and no flight fitted, which stays
+            as it is.
+        """
+        import numpy as np
+
+        from quadid.model.layout import Layout
+
+        values, floors = self.parameters.sample(n, seed)
+        thetas = np.repeat(Layout(self.vehicle).initial(self.vehicle)[None], n, axis=0)
+        thetas[:, : len(self.parameters)] = values
+        return thetas, floors | dict.fromkeys(self.vehicle.effects, "as in the vehicle file, without a spread")
 
     def plot(self, log: int = -1, group: str = "rates") -> Any:
         """Measured and simulated outputs of one log as a plotly figure.
