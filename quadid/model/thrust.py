@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 
@@ -27,6 +28,12 @@ class ThrustModel:
         layout = Layout(vehicle)
         return cls(layout, layout.initial(vehicle))
 
+    def with_b(self, b: float) -> ThrustModel:
+        """The same with another `b` [N s^2/rad^2]."""
+        other = copy(self)
+        other._b = b
+        return other
+
     def at_speed(self, speed: float) -> FloatArray:
         """Thrust of each rotor [N], shape (rotors,), where all turn at `speed` [rad/s]."""
         return np.asarray(self.single(np.full((1, len(self._share)), speed))[0])
@@ -44,15 +51,17 @@ class ThrustModel:
         """Speed [rad/s] at which the rotors, all alike, carry `weight` [N]."""
         return self._dead_speed + math.sqrt(max(self._each(weight) - self._offset, 1e-9) / self._b)
 
-    def secant(self, weight: float) -> float:
-        """Share of `b` that a model without the curve has: exact where the rotors carry `weight` [N]."""
-        return self._each(weight) / (self._b * self.hover_speed(weight) ** 2)
+    def like(self, stated: ThrustModel, weight: float) -> float:
+        """The `b` with which `stated` carries `weight` [N] at the speed at which this one does [N s^2/rad^2].
 
-    def tangent(self, secant: float, weight: float) -> float:
-        """The `b` of this curve whose b at hover is `secant` [N s^2/rad^2]."""
-        each = self._each(weight)
-        beyond = max(math.sqrt(each / secant) - self._dead_speed, 1e-9)
-        return max(each - self._offset, 1e-9) / beyond**2
+        Losses of single rotors count with their mean, a curve with what it gives at hover.
+        """
+        beyond = max(self.hover_speed(weight) - stated._dead_speed, 1e-9)
+        return max(stated._each(weight) - stated._offset, 1e-9) / beyond**2
+
+    def slope(self, weight: float) -> FloatArray:
+        """Change of each rotor's thrust with its speed where they carry `weight` [N], shape (rotors,) [N s/rad]."""
+        return np.asarray(2.0 * self._b * (self.hover_speed(weight) - self._dead_speed) * self._share)
 
     def _each(self, weight: float) -> float:
         return weight / max(float(self._share.sum()), 1e-9)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, replace
 
-from quadid.online.records import WAITS, Event, OnlineSet, Publish, SetState
+from quadid.online.records import WAITS, Event, OnlineSet, Publish, Reference, SetState
 
 Action = Publish | Event
 MOST_HELD = 60
@@ -30,6 +31,7 @@ class ActiveSet:
         approval: auto or manual; a rollback by a person makes it manual.
         seen: end of the data that the set in force rests on [s, session time]; minus infinity for none of this flight.
         watched: deviance lost to the predecessor so far; gains do not pile up.
+        load: mass over that of the vehicle file, as changes since a person last approved a set tell it.
     """
 
     def __init__(
@@ -54,6 +56,8 @@ class ActiveSet:
             # A number of its own: who uses the set already learns that it is stale now.
             self.in_force = replace(restored, sequence=self._number(), state=SetState.STALE, reason=reason)
         self.baseline = baseline or self.in_force
+        self._trusted = self.baseline is not None
+        self.load = 1.0
         self.seen = -math.inf
         self.watched, self._watch_from = 0.0, math.inf
 
@@ -66,6 +70,14 @@ class ActiveSet:
     def predecessor(self) -> OnlineSet | None:
         """The set a rollback would return to."""
         return self._earlier[-1] if self._earlier else None
+
+    def reference(self, stated: Container[str]) -> Reference:
+        """What a set is compared with, where the vehicle file claims to know the parameters `stated`."""
+        if self._trusted:
+            return "history"
+        if self.baseline is not None:
+            return self.baseline.reference
+        return "vehicle_file" if "b" in stated else "none"
 
     def accept(self, item: OnlineSet, by: str, t: float, stop: float) -> list[Action]:
         """Puts a set in force.
@@ -84,6 +96,8 @@ class ActiveSet:
         self._held.clear()
         if self.baseline is None or by != "auto":
             self.baseline = accepted
+        if by != "auto":
+            self._trusted, self.load = True, 1.0
         self.watched, self._watch_from, self.seen = 0.0, stop, stop
         return [
             Publish("parameters", accepted),
@@ -147,7 +161,7 @@ class ActiveSet:
         self._held.clear()
         self._watch_from = math.inf
         if by != "auto":
-            self.approval, self.baseline = "manual", self.in_force
+            self.approval, self.baseline, self._trusted = "manual", self.in_force, True
         event = Event(t, "warning", "rollback", reason)
         return Answer(True, reason, (Publish("parameters", self.in_force), event))
 

@@ -104,6 +104,13 @@ class Estimator:
         return ThrustModel(self._layout, self.theta)
 
     @property
+    def published(self) -> ThrustModel:
+        """Thrust by the b that is published and the vehicle file's own effects: what who uses the six has."""
+        fused = self.fusion.estimate()
+        stated = ThrustModel.stated(self.vehicle)
+        return stated if fused is None else stated.with_b(math.exp(fused.z[B]))
+
+    @property
     def input_hash(self) -> str:
         """SHA-256 (hex) over vehicle, seed and all windows learned from."""
         return self._hash.hex()
@@ -118,6 +125,11 @@ class Estimator:
     def torque_sigma(self) -> FloatArray:
         """Standard deviations of log(b / J_xx) and log(b / J_yy)."""
         return np.asarray(np.hypot(self.z_sigma[0], self.z_sigma[2:4]))
+
+    @property
+    def stated(self) -> dict[str, tuple[float, float]]:
+        """Value and standard deviation of the parameters that the vehicle file claims to know."""
+        return {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
 
     def value(self, name: str) -> float:
         """A nominal parameter, the best at hand."""
@@ -168,9 +180,8 @@ class Estimator:
         assert fused is not None
         best = reply.theta if reply.excited or not self.learned else self.theta
         self.theta, self.learned = self._free.placed(best, fused.z), True
-        if "thrust_curve" not in self.vehicle.effects:  # then windows tell the b at hover of a curve they fit along
-            weight = self.vehicle.mass * GRAVITY
-            self.theta[B] = ThrustModel(self._layout, self.theta).tangent(self.value("b"), weight)
+        # Windows tell the b of the vehicle file's model; the curve and the losses that are fitted along have their own.
+        self.theta[B] = self.published.like(ThrustModel(self._layout, self.theta), self.vehicle.mass * GRAVITY)
 
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:
@@ -244,11 +255,13 @@ class Estimator:
         agreeing, odd = self.fusion.agreement(most)
         disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
         missed = () if reply.between_rows is None else zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)
-        stated = {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
+        left_out = self.fusion.left_out()
+        assert left_out is not None
         return Case(
             parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
             self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
-            self.fusion.counted - sets.seen, stated=stated, walked=self._walked(most), between_rows=dict(missed),
+            self.fusion.counted - sets.seen, stated=self.stated, walked=self._walked(most), between_rows=dict(missed),
+            left_out=left_out,
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:
@@ -284,10 +297,10 @@ class Estimator:
         return tuple(out)
 
     def _thrust_ratio(self, windows: Sequence[Window]) -> float:
-        """Thrust by the model over what the accelerometer felt."""
+        """Thrust by the published numbers over what the accelerometer felt."""
         lift = [-w.accel[:, 2] for w in windows if w.accel is not None]
         felt = float(np.nanmean(np.concatenate(lift))) if lift else GRAVITY
-        total = float(np.mean(np.concatenate([self.thrust.total(w.rotor_speed) for w in windows])))
+        total = float(np.mean(np.concatenate([self.published.total(w.rotor_speed) for w in windows])))
         return total / (self.vehicle.mass * max(felt, 1e-3))
 
 

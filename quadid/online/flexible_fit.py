@@ -5,7 +5,9 @@ of its own in each window: what cannot be told from the parameters widens their 
 Segments are short, because what no effect describes grows with their length.
 
 What is left of a window is a quadratic model in the nominal six, the effects eliminated (Schur complement).  Its b is
-that of thrust b w^2 at hover, which all windows share, unlike the steepness of a curve (`ThrustModel.secant`).
+the one with which the vehicle file's own model carries the weight at the same speed (`ThrustModel.like`): all rotors
+count alike, and all windows share it, unlike the steepness of a curve.  What the six leave out of the thrust is told
+beside them (`left_out`).
 
 What the rotors do between two readings is not seen.  Where sticks move in steps and a rate loop rings, torque over
 inertia is several per cent off and no residual says so; so every second row of the rotors is left out, and how far that
@@ -25,7 +27,7 @@ from quadid.identify.covariance import variance_ratio
 from quadid.identify.gauss_newton import Polished, polish, robust_weights
 from quadid.identify.noise_estimation import residual_noise
 from quadid.identify.noise_model import NoiseModel
-from quadid.identify.priors import Prior, prior_terms
+from quadid.identify.priors import Prior, posterior_covariance, prior_terms
 from quadid.identify.schur_complement import eliminated
 from quadid.identify.shooting import Free, Shooting
 from quadid.model.layout import B
@@ -58,7 +60,8 @@ ROOM = 16.0
 What the nominal model made of a flight that it misses is no better guess: it may be wrong by as much.
 """
 MOVING = ("command", "rotor", "air", "body")
-"""Where effects act that move the vehicle; of sensors only the filter of the IMU is fitted along."""
+"""Where effects act that move the vehicle; of sensors only what shifts their time is fitted along:"""
+TIMING = ("imu_lag", "attitude_delay")
 
 
 def with_room(vehicle: Vehicle) -> Vehicle:
@@ -78,12 +81,11 @@ def moving_names(problem: Shooting) -> list[str]:
     known |= {n for n in ("velocity", "battery") if all(getattr(w, n) is not None for w in windows)}
     out = list(NOMINAL_NAMES)
     for effect in EFFECTS.values():
-        moves = (effect.acts in MOVING and not effect.per_log) or effect.name == "imu_lag"
+        moves = (effect.acts in MOVING and not effect.per_log) or effect.name in TIMING
         seen = known.issuperset(effect.needs) and (effect.flexible != "with_velocity" or problem.has_velocity)
         if moves and seen and effect.name != "weak_rotor":
             out += (*effect.entries, *effect.refinements)
-    losses = [n for n in problem.layout.entries if n.startswith("weak_rotor.loss_")]
-    return out + losses[1:]
+    return out + [n for n in problem.layout.entries if n.startswith("weak_rotor.loss_")]
 
 
 def flexible_prior(nominal: Prior, free: Free, problem: Shooting) -> Prior:
@@ -128,18 +130,20 @@ def reduced(start: float, stop: float, problem: Shooting, free: Free, prior: Pri
     effects = np.arange(len(precision)) >= six
     h, g, scores = lin.information + np.diag(precision * effects), lin.gradient + pull * effects, lin.grad
     z = free.scaled(result.theta[free.index])[:six]
-    if "thrust_curve" not in problem.vehicle.effects:
-        z[B], slopes = _at_hover(problem, free, result.theta)
-        back = np.eye(len(g))
-        back[B] = -slopes / slopes[B]
-        back[B, B] = 1.0 / slopes[B]
-        h, g, scores = back.T @ h @ back, back.T @ g, scores @ back
+    z[B], slopes = _at_hover(problem, free, result.theta)
+    back = np.eye(len(g))
+    back[B] = -slopes / slopes[B]
+    back[B, B] = 1.0 / slopes[B]
+    h, g, scores = back.T @ h @ back, back.T @ g, scores @ back
     information, gain = eliminated(h[:six, :six], h[:six, six:], h[six:, six:])
     step = np.linalg.solve(information, g[:six] - gain @ g[six:])
     own = replace(lin, grad=scores[:, :six] - scores[:, six:] @ gain.T)
     excess = np.sqrt(np.maximum(variance_ratio(own, np.asarray(np.linalg.inv(information)))[0], 1.0))
     information = 0.5 * (information + information.T) / np.outer(excess, excess)
-    return WindowEstimate(start, stop, z, information, information @ step, lin.total_cost, lin.total_rows)
+    return WindowEstimate(
+        start, stop, z, information, information @ step, lin.total_cost, lin.total_rows,
+        left_out(problem, free, prior, result),
+    )  # fmt: skip
 
 
 def halved(window: Window, first: int) -> Window:
@@ -197,12 +201,35 @@ def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:
     return replace(estimate, information=information, score=information @ step)
 
 
+def left_out(problem: Shooting, free: Free, prior: Prior, result: Polished) -> FloatArray:
+    """What b w^2 leaves out of the thrust at hover: a row of values and one of their standard deviations, shape (2, R).
+
+    The value of a rotor is the logarithm of its thrust's change with speed, as fitted, over that by the published b.  A
+    thrust curve, a support force and an accelerometer of another scale give all rotors the same, a weak rotor itself.
+    """
+    weight, stated = problem.vehicle.mass * GRAVITY, ThrustModel.stated(problem.vehicle)
+
+    def value(at: FloatArray) -> FloatArray:
+        fitted = ThrustModel(problem.layout, at)
+        six = stated.with_b(fitted.like(stated, weight))
+        return np.log(np.maximum(fitted.slope(weight), 1e-12) / six.slope(weight))
+
+    here = value(result.theta)
+    steps = np.array(
+        [(value(free.move(result.theta, step)) - here) / STEP for step in STEP * np.eye(len(free.entries))]
+    )
+    covariance = posterior_covariance(result.lin.information, prior)
+    excess = np.maximum(variance_ratio(result.lin, covariance)[0], 1.0)
+    spread = np.sqrt(excess)[:, None] * steps
+    return np.stack([here, np.sqrt(np.einsum("pr,pq,qr->r", spread, covariance, spread))])
+
+
 def _at_hover(problem: Shooting, free: Free, theta: FloatArray) -> tuple[float, FloatArray]:
-    """Logarithm of the b at hover, and its derivatives to all scaled parameters."""
-    weight = problem.vehicle.mass * GRAVITY
+    """Logarithm of the published b, and its derivatives to all scaled parameters."""
+    weight, stated = problem.vehicle.mass * GRAVITY, ThrustModel.stated(problem.vehicle)
 
     def value(at: FloatArray) -> float:
-        return float(np.log(at[B] * ThrustModel(problem.layout, at).secant(weight)))
+        return float(np.log(ThrustModel(problem.layout, at).like(stated, weight)))
 
     here, steps = value(theta), STEP * np.eye(len(free.entries))
     return here, np.array([(value(free.move(theta, step)) - here) / STEP for step in steps])

@@ -38,6 +38,7 @@ class WindowEstimate:
         information: Fisher information there, without prior, shape (P, P).
         score: half the gradient of the cost there, shape (P,).
         cost: cost at z; rows: independent residuals, so that cost / rows is 1 at the noise floor.
+        left_out: what the parameters leave out of each rotor's thrust, and its standard deviations, shape (2, R).
     """
 
     start: float
@@ -47,6 +48,7 @@ class WindowEstimate:
     score: FloatArray
     cost: float
     rows: float
+    left_out: FloatArray
 
     @property
     def mse(self) -> float:
@@ -66,7 +68,7 @@ class WindowEstimate:
     @property
     def finite(self) -> bool:
         """Whether every number of it is one."""
-        arrays = (self.z, self.information, self.score)
+        arrays = (self.z, self.information, self.score, self.left_out)
         return math.isfinite(self.cost) and all(bool(np.isfinite(a).all()) for a in arrays)
 
     def deviance(self, z: FloatArray) -> float:
@@ -185,6 +187,16 @@ class Fusion:
         own = self._alone(window)
         difference = own.z - z
         return float(difference @ np.linalg.solve(own.covariance + covariance, difference))
+
+    def left_out(self) -> FloatArray | None:
+        """Weighted mean of `WindowEstimate.left_out` of disjoint windows, shape (2, R), widened where they scatter."""
+        told = np.array([w.left_out for w in self.disjoint()])
+        if not len(told):
+            return None
+        weight = 1.0 / told[:, 1] ** 2
+        mean = np.sum(weight * told[:, 0], axis=0) / weight.sum(axis=0)
+        scatter = np.sum(weight * (told[:, 0] - mean) ** 2, axis=0) / max(len(told) - 1, 1)
+        return np.stack([mean, np.sqrt(np.maximum(scatter, 1.0) / weight.sum(axis=0))])
 
     def agreement(self, most: int) -> tuple[int, tuple[int, float] | None]:
         """How many of the newest disjoint windows agree in a row with the fused estimate, `most` at most.

@@ -12,8 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.chi_square import Z95
 from quadid.identify.covariance import PRIOR_SHARE
+from quadid.online.consistency import Factor
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
+from quadid.types import FloatArray
 
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
@@ -71,11 +73,13 @@ class Case:
         approval: auto or manual, now.
         age: time since the data that the set in force rests on [s].
         unexplained: what speaks against the model: a sensor's scale that a diagnosis found, or empty.
-        unproven: what is still to be known of the sensors, or empty.
+        doubts: factors that b, J_xx and J_yy may be off by, as the sensors disagree.
         stated: value and standard deviation of the parameters that the vehicle file claims to know.
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
+        left_out: of each rotor's thrust by b w^2 and standard deviations, shape (2, R) (`flexible_fit.left_out`).
+        loaded: why the vehicle may have another mass than the vehicle file says, or empty.
     """
 
     parameters: ParameterSet
@@ -89,10 +93,12 @@ class Case:
     approval: str
     age: float = math.inf
     unexplained: str = ""
-    unproven: str = ""
+    doubts: tuple[Factor, ...] = ()
     stated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     walked: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     between_rows: Mapping[str, float] = field(default_factory=dict)
+    left_out: FloatArray = field(default_factory=lambda: np.zeros((2, 1)))
+    loaded: str = ""
 
 
 @dataclass(frozen=True)
@@ -116,9 +122,10 @@ def decide(case: Case, settings: GateSettings) -> Decision:
         if name == "step_limit" and _step(case, settings, 2.0) is None:
             return Decision(SetState.PENDING, name, f"{reason}: a person must approve it")
         return Decision(SetState.REJECTED, name, reason)
-    moved = _reference(case, settings)
-    if moved is not None:
-        return Decision(SetState.PENDING, "reference", f"{moved}: a person must approve it")
+    for name, check in JUDGED:
+        reason = check(case, settings)
+        if reason is not None:
+            return Decision(SetState.PENDING, name, f"{reason}: a person must approve it")
     story = f"{case.agreeing} windows agree; {_gain_text(case)}"
     if case.approval != "auto":
         return Decision(SetState.PENDING, "approval", f"{WAITS}{story}")
@@ -149,7 +156,7 @@ def _bounds(case: Case, settings: GateSettings) -> str | None:
     why = implausible(case.parameters, settings)
     if why:
         return why
-    if not 0.8 < case.thrust_ratio < 1.25:
+    if not (case.thrust_ratio > 0.0 and abs(math.log(case.thrust_ratio)) <= settings.width):
         return f"b would give {case.thrust_ratio:.2f} times the thrust measured by the accelerometer"
     return None
 
@@ -175,7 +182,7 @@ def _agreement(case: Case, settings: GateSettings) -> str | None:
     if case.agreeing < settings.windows:
         return f"{case.agreeing} of {settings.windows} windows without a common sample agree so far: keep flying"
     for name, (change, sigma) in case.walked.items():
-        if _far(change, sigma, settings):
+        if _far(change, sigma, settings.reference):
             return f"torque over inertia ({name}) walks: {math.expm1(change):+.1%} from the first to the last of them"
     return None
 
@@ -204,6 +211,44 @@ def _is_sharper(case: Case, settings: GateSettings) -> bool:
     )
 
 
+def _too_far(off: FloatArray, sigma: FloatArray, settings: GateSettings) -> tuple[bool, bool]:
+    """Whether something may be off by more than a parameter's interval may be wide; and whether data would tell."""
+    far = np.abs(off) + Z95 * sigma > settings.width
+    return bool(far.any()), bool((far & (Z95 * sigma > 0.5 * settings.width)).any())
+
+
+def _unproven(case: Case, settings: GateSettings) -> str | None:
+    """What has to be known better before anything is published: how far sensors agree, how thrust follows speed."""
+    for f in case.doubts:
+        if _too_far(np.array([f.off]), np.array([f.sigma]), settings)[1]:
+            return f"{f}, wanted +- {0.5 * settings.width / Z95:.3f}: whether the sensors agree is not known yet"
+    if _too_far(case.left_out[0], case.left_out[1], settings)[1]:
+        half = Z95 * float(case.left_out[1].max())
+        return f"how thrust follows rotor speed is known to {half:.1%} only, wanted {0.5 * settings.width:.1%}: climb"
+    return None
+
+
+def _doubtful(case: Case, settings: GateSettings) -> str | None:
+    for f in case.doubts:
+        if _too_far(np.array([f.off]), np.array([f.sigma]), settings)[0]:
+            return f"{f}: b, J_xx and J_yy may be off by it, allowed {settings.width:.0%}"
+    return None
+
+
+def _left_out(case: Case, settings: GateSettings) -> str | None:
+    """What the six leave out of the thrust: the fit knows it, who uses them does not."""
+    value, sigma = case.left_out
+    if not _too_far(value, sigma, settings)[0]:
+        return None
+    own = value - value.mean()
+    worst = int(np.argmax(np.abs(own)))
+    if abs(own[worst]) > abs(value.mean()):
+        off = f"rotor {worst + 1} gives {math.expm1(value[worst]):+.0%} against b"
+        return f"{off}: it is not like the others, or its speed is read wrongly"
+    off = f"thrust changes with rotor speed {math.expm1(value.mean()):+.0%} off b w^2"
+    return f"{off}: a thrust curve that the vehicle file lacks, a support or pull, or an accelerometer's scale"
+
+
 def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
     """Steps beyond so many times the limits: a person may approve up to twice."""
     for reference, limit, what in (
@@ -226,7 +271,7 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
 
 
 def _reference(case: Case, settings: GateSettings) -> str | None:
-    """Torque over inertia against what was trusted first: a controller's gain, which mass leaves as it is.
+    """What was trusted first: inertias, and torque over inertia, a controller's gain, which mass leaves as it is.
 
     Room is left for what the reference did not know. The estimate's own deviation gives none: rotor speeds that drift
     widen it, and what it cannot tell apart from the reference it has not shown to be near it.
@@ -236,20 +281,20 @@ def _reference(case: Case, settings: GateSettings) -> str | None:
         known = {p.name: (p.value, p.sigma) for p in case.baseline.parameters if p.status not in UNKNOWN}
         what = "the first accepted or last approved set"
     for name in ("J_xx", "J_yy"):
-        change, variance = 0.0, 0.0
-        for p, sign in ((case.parameters["b"], 1.0), (case.parameters[name], -1.0)):
-            if p.name in known:
-                value, sigma = known[p.name]
-                change += sign * math.log(p.value / value)
-                variance += (sigma / value) ** 2
-        if _far(change, math.sqrt(variance), settings):
-            off = f"torque over inertia ({name}) is {math.expm1(change):+.1%} off {what}"
-            return f"{off}, allowed {settings.reference:.1%}: rotor speeds wrong by a factor look like this"
+        for shares, limit, of, looks in (
+            ({"b": 1.0, name: -1.0}, settings.reference, f"torque over inertia ({name})", "rotor speeds"),
+            ({name: 1.0}, settings.width, name, "a mass, an accelerometer or a gyro"),
+        ):
+            both = [(case.parameters[n].value, *known[n], share) for n, share in shares.items() if n in known]
+            change = sum(share * math.log(now / old) for now, old, _, share in both)
+            if _far(change, math.hypot(*(sigma / old for _, old, sigma, _ in both)), limit):
+                off = f"{of} is {math.expm1(change):+.1%} off {what}, allowed {limit:.1%}"
+                return f"{off}: {looks} wrong by a factor would look like this"
     return None
 
 
-def _far(change: float, sigma: float, settings: GateSettings) -> bool:
-    return abs(change) > math.log1p(settings.reference) + 2.0 * sigma
+def _far(change: float, sigma: float, limit: float) -> bool:
+    return abs(change) > math.log1p(limit) + 2.0 * sigma
 
 
 def _gain_text(case: Case) -> str:
@@ -266,8 +311,15 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("physical_bounds", _bounds),
     ("interval_width", _width),
     ("agreement", _agreement),
-    ("sensors", lambda case, _: case.unproven or None),
+    ("sensors", _unproven),
     ("held_out_gain", _held_out),
     ("step_limit", _step),
 )
 """Name and function of every check, in the order in which they are asked."""
+JUDGED: tuple[tuple[str, Check], ...] = (
+    ("mass", lambda case, _: case.loaded or None),
+    ("sensors", _doubtful),
+    ("thrust", _left_out),
+    ("reference", _reference),
+)
+"""What no further flight settles: a person decides."""

@@ -15,6 +15,11 @@ WAITS = "waits for approval: "
 """Begins the reason of a set that passed every check; what follows stays true once it is approved."""
 
 
+Reference = Literal["history", "vehicle_file", "none"]
+"""What a set was compared with: sets of earlier flights or that a person approved, a b of the vehicle file with its
+sigma, or nothing, where a wrong scale of all rotor speeds cannot be seen."""
+
+
 class Phase(StrEnum):
     """What a session is doing; the values read as sentences."""
 
@@ -58,6 +63,7 @@ class OnlineSet:
         mass: of the vehicle that the set rests on [kg]; NaN: not noted.
         outdated: why a set in force is known to be out of date; empty: it is not known to be.
         outdated_code: the same for programs: an effect's name, ``unknown_cause`` or ``disagreement``.
+        reference: what rotor speeds, force and mass were checked against.
     """
 
     sequence: int
@@ -75,6 +81,7 @@ class OnlineSet:
     mass: float = float("nan")
     outdated: str = ""
     outdated_code: str = ""
+    reference: Reference = "none"
 
 
 @dataclass(frozen=True)

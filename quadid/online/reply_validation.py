@@ -41,6 +41,8 @@ def is_estimate(estimate: WindowEstimate, vehicle: Vehicle, start: float, stop: 
     shapes = (estimate.z.shape, estimate.score.shape, estimate.information.shape)
     if shapes != ((SIX,), (SIX,), (SIX, SIX)) or (estimate.start, estimate.stop) != (start, stop):
         return False
+    if estimate.left_out.shape != (2, len(vehicle.rotors)) or np.any(estimate.left_out[1] <= 0.0):
+        return False
     if not estimate.finite:
         return True
     entries = [Layout(vehicle).entry(name) for name in NOMINAL_NAMES]

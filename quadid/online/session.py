@@ -21,7 +21,7 @@ from quadid.health.trim_estimation import FlightTrim
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor
-from quadid.online.consistency import Consistency
+from quadid.online.consistency import LEAD, Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
 from quadid.online.grid_buffer import GridBuffer
@@ -229,7 +229,7 @@ class Session:
 
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
-        self._consistency.add(self._store.span(tick - self._tick - _EPS, tick - _EPS))
+        self._consistency.add(self._store.span(tick - self._tick - LEAD - _EPS, tick - _EPS), self._tick)
         if self._consistency.fault:
             yield
             # A unit, frame or motor order that is wrong has a name; which two channels it sets apart is less of a help.

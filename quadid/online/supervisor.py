@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from quadid.online.active_set import ActiveSet
 from quadid.online.background_diagnosis import BackgroundDiagnosis
+from quadid.online.change_detection import LEAST, ChangePoint
 from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
@@ -59,8 +60,9 @@ class Supervisor:
         self._outbox.state(Phase.COLLECTING, f"{why}: learning restarts")
 
     def changed(self, request: ChangeRequest, reply: ChangeReply) -> None:
-        """Publishes what a sudden change was."""
+        """Publishes what a sudden change was; where it may be the mass, the sets after it wait for a person."""
         finding = reply.finding
+        self._active_set.load *= _load(request.change, finding)
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
         self._has_changed(request.start, request.stop, finding, "finding", text, request.start + 0.1, "unknown_cause")
 
@@ -145,7 +147,8 @@ class Supervisor:
         scale = self._diagnosis.wrong_scale
         case = replace(
             self._estimator.case(parameters, request, reply, active_set, self._gate.windows),
-            unexplained=f"the diagnosis is in force: {scale}" if scale else "", unproven=self._consistency.unproven,
+            unexplained=f"the diagnosis is in force: {scale}" if scale else "", doubts=self._consistency.doubts(),
+            loaded=self._loaded,
         )  # fmt: skip
         decision = decide(case, self._gate)
         mse, unseen = self._estimator.scores()
@@ -153,7 +156,7 @@ class Supervisor:
         item = OnlineSet(
             0, decision.state, decision.reason, parameters, outbox.stamp(self._estimator.start), stop,
             self._estimator.rows, mse, unseen, self._estimator.input_hash, check=decision.check,
-            mass=self._estimator.vehicle.mass,
+            mass=self._estimator.vehicle.mass, reference=active_set.reference(self._estimator.stated),
         )  # fmt: skip
         if decision.state is SetState.ACCEPTED:
             outbox.act(*active_set.accept(item, "auto", stop, request.stop))
@@ -168,11 +171,27 @@ class Supervisor:
             said = f"set {waiting.sequence} waits for approval; a newer estimate was held back ({decision.check})"
         outbox.state(self._phase_of(decision.state), said)
 
+    @property
+    def _loaded(self) -> str:
+        load, mass = self._active_set.load, self._estimator.vehicle.mass
+        if abs(math.log(load)) <= LEAST:
+            return ""
+        changed = f"the mass changed by about {load - 1.0:+.0%} in flight, as far as the thrust tells"
+        return f"{changed}; b and the inertias of this set rest on {mass:g} kg"
+
     def _phase_of(self, state: SetState) -> Phase:
         if state is SetState.PENDING or self._active_set.pending is not None:
             return Phase.PENDING
         force = self._active_set.in_force
         return Phase.ACCEPTED if force is not None and force.state is not SetState.STALE else Phase.CANDIDATE
+
+
+def _load(change: ChangePoint, finding: OnlineFinding | None) -> float:
+    """Factor on the mass that a change may be."""
+    if finding is not None and finding.effect == "mass_change":
+        return max(1.0 + finding.values["fraction"], LEAST)
+    sure = finding is not None and finding.confident
+    return 1.0 if sure or change.channel != "thrust" else math.exp(-change.size)
 
 
 def _unrevealed(reply: FitReply) -> str:

@@ -21,6 +21,8 @@ from quadid.model.layout import Layout
 from quadid.online.flexible_fit import (
     alike,
     flexible_fit,
+    flexible_prior,
+    left_out,
     reduced,
     sampling_error,
     widened,
@@ -170,7 +172,7 @@ def _fit(request: FitRequest) -> FitReply:
     lin = result.lin
     estimate = WindowEstimate(
         request.start, request.stop, free.scaled(result.theta[free.index]), lin.information, lin.gradient,
-        lin.total_cost, lin.total_rows,
+        lin.total_cost, lin.total_rows, _curved(shooting, result),
     )  # fmt: skip
     measured = None
     if request.measure:
@@ -184,6 +186,13 @@ def _fit(request: FitRequest) -> FitReply:
         joined = replace(request, vehicle=with_room(request.vehicle))
         return replace(_flexible(joined, result.theta, None), lack=lack)
     return replace(reply, misfit=_share_of(measured or noise, sensor), lack=lack)
+
+
+def _curved(shooting: Shooting, result: Polished) -> FloatArray:
+    """What the nominal six leave out of the thrust (`left_out`), a thrust curve freed beside them."""
+    free = shooting.free([*NOMINAL_NAMES, "thrust_curve.dead_speed"])
+    prior = flexible_prior(prior_of(shooting.vehicle), free, shooting)
+    return left_out(shooting, free, prior, polish(shooting, result.theta, free, prior, result.states, iterations=3))
 
 
 def _share_of(noise: NoiseModel, sensor: NoiseModel) -> FloatArray:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.jsonable import jsonable
-from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, SessionStatus, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Reference, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
 
 
@@ -41,7 +41,7 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
         "approved_by": item.approved_by, "start": number(item.start), "stop": number(item.stop),
         "samples": item.samples, "mse": number(item.mse), "mse_held_out": number(item.mse_held_out),
         "input_hash": item.input_hash, "mass": number(item.mass), "outdated": item.outdated,
-        "outdated_code": item.outdated_code,
+        "outdated_code": item.outdated_code, "reference": item.reference,
         "parameters": parameters_to_dict(item.parameters),
     }  # fmt: skip
     if covariance:
@@ -65,6 +65,7 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
         _float(data["start"]), _float(data["stop"]), int(data["samples"]), _float(data["mse"]),
         _float(data["mse_held_out"]), str(data["input_hash"]), str(data["approved_by"]), str(data["check"]),
         _float(data.get("mass")), str(data.get("outdated", "")), str(data.get("outdated_code", "")),
+        _reference(data.get("reference", "none")),
     )  # fmt: skip
 
 
@@ -98,6 +99,13 @@ def status_to_dict(status: SessionStatus) -> dict[str, Any]:
     excitation = dict(zip(NOMINAL_NAMES, status.excitation.tolist(), strict=True))
     data: dict[str, Any] = jsonable({**vars(status), "phase": status.phase.name.lower(), "excitation": excitation})
     return data
+
+
+def _reference(value: object) -> Reference:
+    for known in get_args(Reference):
+        if value == known:
+            return known  # type: ignore[no-any-return]
+    raise ValueError(f"a set with reference {str(value)[:40]!r}; allowed: {', '.join(get_args(Reference))}")
 
 
 def _float(value: float | None) -> float:

@@ -60,6 +60,7 @@ def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
         "out_of_date": bool(item.outdated),
         "out_of_date_reason": item.outdated,
         "out_of_date_code": item.outdated and (item.outdated_code or "unknown_cause"),
+        "reference": item.reference,
         "mass": item.mass,
         "names": [p.name for p in parameters],
         "units": [p.unit or "1" for p in parameters],

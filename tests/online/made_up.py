@@ -65,9 +65,9 @@ def flown_attitude(first: FloatArray, rate: FloatArray) -> FloatArray:
 
 PIECES = 5000
 """Far more pieces than there ever are between two polls: a session that would never end is stopped."""
-GATE = GateSettings(windows=2, pause=0.0)
+GATE = GateSettings(windows=2, pause=0.0, width=0.15)
 QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
-"""A first set after 8 s, and no pause before the next."""
+"""A first set after 8 s, when sensors have been compared to some 5 %, and no pause before the next."""
 DROPPED = light_flight(30.0, 1, 14.3)
 """15 % of thrust are lost after 14.3 s."""
 
@@ -91,6 +91,11 @@ def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shif
     return [replace(s, t=s.t + shift) for s in stream if start - 1e-9 <= s.t < stop - 1e-9]
 
 
+def nothing_left_out(sigma: float = 0.005) -> FloatArray:
+    """What a fit says that knows the thrust of four rotors to be b w^2, each to `sigma`."""
+    return np.stack([np.zeros(4), np.full(4, sigma)])
+
+
 def tells(sigma: float = 0.005, **factors: float) -> Worker:
     """A worker whose fits say the truth times `factors`, with a relative standard deviation of `sigma`."""
 
@@ -99,8 +104,9 @@ def tells(sigma: float = 0.005, **factors: float) -> Worker:
             return request.failed("made up")
         values = np.array([TRUE[n] * factors.get(n, 1.0) for n in NOMINAL_NAMES])
         window = WindowEstimate(
-            request.start, request.stop, np.log(values), np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0
-        )
+            request.start, request.stop, np.log(values), np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0,
+            nothing_left_out(),
+        )  # fmt: skip
         theta = request.theta.copy()
         theta[:6] = values
         return FitReply(request.number, "", np.full(6, sigma), True, window, theta)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from quadid.model.layout import Layout
+from quadid.model.layout import LOSS, Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.estimator import Estimator
@@ -18,6 +18,7 @@ from quadid.parameters import Status
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid.vehicle_parts import ParameterPrior
 from tests.online.driving import drive, events, flight, published, samples
+from tests.online.made_up import nothing_left_out
 from tests.online.test_gate import TRUE
 
 PELICAN = Vehicle.shipped("pelican")
@@ -42,7 +43,7 @@ def test_where_the_coupling_is_free_yaw_claims_no_more_than_the_vehicle_file() -
     learner.fit_along()
     layout = Layout(model)
     off = np.log(layout.initial(model)[:6]) + np.array([0.1, 0.3, 0.2, 0.2, 0.3, 0.3])
-    sure = WindowEstimate(0.0, 10.0, off, np.diag(np.full(6, 1e6)), np.zeros(6), 900.0, 900.0)
+    sure = WindowEstimate(0.0, 10.0, off, np.diag(np.full(6, 1e6)), np.zeros(6), 900.0, 900.0, nothing_left_out())
     theta = layout.initial(model)
     theta[:6] = np.exp(off)
     asked = learner.request(1, Cut((flight(24.0, 5, effects=LAGGING).window.slice(0, 500),), 10.0, 0), 0.0, 10.0)
@@ -61,9 +62,22 @@ def test_the_secant_of_a_thrust_curve_carries_the_weight() -> None:
     thrust, weight = ThrustModel(Layout(model), theta), PELICAN.mass * GRAVITY
     hover = math.sqrt(weight / 4.0 / float(theta[0])) - 120.0
     assert thrust.total(np.full((1, 4), hover))[0] == pytest.approx(weight)
-    secant = thrust.secant(weight) * float(theta[0])
+    stated = ThrustModel.stated(PELICAN)
+    secant = thrust.like(stated, weight)
     assert 4.0 * secant * hover**2 == pytest.approx(weight)
-    assert thrust.tangent(secant, weight) == pytest.approx(theta[0])
+    assert stated.with_b(secant).like(thrust, weight) == pytest.approx(theta[0])
+    step = 1e-3
+    rise = (thrust.at_speed(hover + step) - thrust.at_speed(hover - step)) / (2.0 * step)
+    assert thrust.slope(weight) == pytest.approx(rise)
+
+
+def test_the_b_of_a_vehicle_is_the_mean_of_its_rotors_whichever_is_weak() -> None:
+    theta = Layout(PELICAN).initial(PELICAN)
+    for rotor in range(4):
+        weak = theta.copy()
+        weak[LOSS + rotor] = 0.12
+        b = ThrustModel(Layout(PELICAN), weak).like(ThrustModel.stated(PELICAN), PELICAN.mass * GRAVITY)
+        assert b == pytest.approx(0.97 * theta[0])
 
 
 def test_a_bare_guess_has_room_and_given_bounds_stay() -> None:

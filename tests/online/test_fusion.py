@@ -7,13 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quadid.online.fusion import Fusion, WindowEstimate
+from tests.online.made_up import nothing_left_out
 
 P = 3
 PRIOR = np.full(P, 0.7)
 
 
 def window(start: float, z: np.ndarray, information: np.ndarray, seconds: float = 10.0) -> WindowEstimate:
-    return WindowEstimate(start, start + seconds, z, information, np.zeros(P), 100.0, 100.0)
+    return WindowEstimate(start, start + seconds, z, information, np.zeros(P), 100.0, 100.0, nothing_left_out())
 
 
 def random_information(rng: np.random.Generator) -> np.ndarray:
@@ -40,7 +41,9 @@ def test_a_score_that_is_not_zero_is_a_step_still_to_be_made() -> None:
     information = random_information(np.random.default_rng(1))
     best, away = np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.1, 0.1])
     fusion = Fusion(np.zeros(P), np.full(P, 1e6), memory=1e12)
-    fusion.add(WindowEstimate(0.0, 10.0, away, information, information @ (away - best), 100.0, 100.0))
+    fusion.add(
+        WindowEstimate(0.0, 10.0, away, information, information @ (away - best), 100.0, 100.0, nothing_left_out())
+    )
     fused = fusion.estimate()
     assert fused is not None
     assert np.allclose(fused.z, best, atol=1e-9)
@@ -98,8 +101,8 @@ def test_a_change_is_seen_and_noise_is_not() -> None:
 
 def test_poor_residuals_make_a_window_count_less() -> None:
     information = np.eye(P) * 1e4
-    good = WindowEstimate(0.0, 10.0, np.zeros(P), information, np.zeros(P), 100.0, 100.0)
-    poor = WindowEstimate(10.0, 20.0, np.full(P, 0.01), information, np.zeros(P), 900.0, 100.0)
+    good = WindowEstimate(0.0, 10.0, np.zeros(P), information, np.zeros(P), 100.0, 100.0, nothing_left_out())
+    poor = WindowEstimate(10.0, 20.0, np.full(P, 0.01), information, np.zeros(P), 900.0, 100.0, nothing_left_out())
     fusion = Fusion(np.zeros(P), PRIOR, 1e12)
     fusion.add(good)
     fusion.add(poor)

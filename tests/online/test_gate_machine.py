@@ -42,7 +42,7 @@ from tests.online.driving import flight, samples
 from tests.online.test_gate import TRUE
 
 PELICAN = Vehicle.shipped("pelican")
-GATE = GateSettings(windows=2, width=0.08, yaw_width=0.6)
+GATE = GateSettings(windows=2, width=0.15, yaw_width=0.6)
 SETTINGS = SessionSettings(window=4.0, refit=2.0, diagnose=0.0, gate=GATE)
 NEEDED = ("gyro", "accel", "attitude", "rotor_speed")
 CONTROLLER = ("b", "J_xx", "J_yy")
@@ -83,7 +83,8 @@ def estimate(request: FitRequest, factors: dict[str, float], sigma: float) -> Fi
     with np.errstate(invalid="ignore"):
         z = np.log(values)
     window = WindowEstimate(
-        request.start, request.stop, z, np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0
+        request.start, request.stop, z, np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0,
+        np.stack([np.zeros(4), np.full(4, 0.005)]),
     )  # fmt: skip
     theta = request.theta.copy()
     theta[:6] = values

@@ -20,6 +20,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.window import Sampling, Window
 from tests.online.driving import flight, samples
+from tests.online.made_up import nothing_left_out
 
 PELICAN = Vehicle.shipped("pelican")
 
@@ -63,7 +64,9 @@ def test_an_added_covariance_leaves_the_optimum_and_widens_by_itself() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6))
     information = root @ root.T + 50.0 * np.eye(6)
-    own = WindowEstimate(0.0, 10.0, rng.normal(size=6), information, rng.normal(size=6), 900.0, 300.0)
+    own = WindowEstimate(
+        0.0, 10.0, rng.normal(size=6), information, rng.normal(size=6), 900.0, 300.0, nothing_left_out()
+    )
     shift: FloatArray = np.array([0.0, 0.0, 0.08, 0.05, 0.0, 0.0])
     wide = widened(own, np.outer(shift, shift))
 
@@ -82,7 +85,7 @@ class Moved:
     shifts: tuple[FloatArray, FloatArray]
 
     def __call__(self, monkeypatch: pytest.MonkeyPatch, sampling: Sampling, spacing: float) -> FloatArray:
-        own = WindowEstimate(0.0, 10.0, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0)
+        own = WindowEstimate(0.0, 10.0, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0, nothing_left_out())
         moved = iter([replace(own, score=-shift) for shift in self.shifts])
         monkeypatch.setattr(flexible_fit_room, "reduced", lambda *_: next(moved))
         windows = (window(1.0, sampling),)
@@ -120,7 +123,9 @@ def test_windows_of_one_minute_say_an_error_that_lasts_once() -> None:
     missed = np.diag(np.full(6, 0.04**2))
     fusion, length, count = Fusion(np.zeros(6), np.full(6, 1e3), 1e9), LASTING / 5.0, 5
     for k in range(count):
-        own = WindowEstimate(k * length, (k + 1) * length, np.zeros(6), information, np.zeros(6), 900.0, 900.0)
+        own = WindowEstimate(
+            k * length, (k + 1) * length, np.zeros(6), information, np.zeros(6), 900.0, 900.0, nothing_left_out()
+        )
         assert alike(own) == pytest.approx(count)
         fusion.add(widened(own, alike(own) * missed))
     fused = fusion.estimate()
@@ -151,7 +156,9 @@ def test_windows_that_err_together_are_not_surer_for_it() -> None:
     fusion = Fusion(np.zeros(6), np.ones(6), 1e9)
     for k, (roll, pitch) in enumerate([(0.06, 0.05), (0.05, 0.06), (0.04, 0.06)]):
         missed = np.diag(np.array([0.0, 0.0, roll, pitch, 0.0, 0.0]) ** 2)
-        own = WindowEstimate(10.0 * k, 10.0 * k + 10.0, np.zeros(6), information, np.zeros(6), 900.0, 900.0)
+        own = WindowEstimate(
+            10.0 * k, 10.0 * k + 10.0, np.zeros(6), information, np.zeros(6), 900.0, 900.0, nothing_left_out()
+        )
         fusion.add(widened(own, missed))
     fused = fusion.estimate()
     assert fused is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_hover_publishes_nothing() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.15, -0.12])
-def test_a_change_of_mass_is_found_within_five_seconds_and_learned(fraction: float) -> None:
+def test_a_change_of_mass_is_found_within_five_seconds_and_what_is_learned_waits_for_a_person(fraction: float) -> None:
     at = 22.3
     made = flight(46.0, 8, "excited", (("mass_change", "time", at), ("mass_change", "fraction", fraction)))
     session = Session(PELICAN, SessionSettings(gate=GateSettings(windows=2)))
@@ -94,10 +95,17 @@ def test_a_change_of_mass_is_found_within_five_seconds_and_learned(fraction: flo
     assert finding.values["fraction"] == pytest.approx(fraction, rel=0.1)
     assert finding.values["time"] == pytest.approx(at, abs=0.1)
     actions = drive(session, [s for s in stream if s.t > at + 5.0])
-    sets = published(actions)
-    assert sets, "the changed vehicle was learned"
-    assert all(s.start >= at for s in sets), "nothing from before the change"
-    assert sets[-1].parameters["b"].value == pytest.approx(made.truth.parameters.b / (1.0 + fraction), rel=0.01)
+    assert not [s for s in published(actions) if not s.outdated], "b and inertias would rest on the old mass"
+    waits = session.active_set.pending
+    assert waits is not None, "the changed vehicle was learned"
+    assert (waits.state, waits.check) == (SetState.PENDING, "mass")
+    told = re.search(r"changed by about ([+-]\d+)%", waits.reason)
+    assert told is not None, waits.reason
+    assert int(told[1]) / 100.0 == pytest.approx(fraction, abs=0.02)
+    assert waits.start >= at, "nothing from before the change"
+    assert waits.parameters["b"].value == pytest.approx(made.truth.parameters.b / (1.0 + fraction), rel=0.01)
+    assert session.approve("ann").done
+    assert session.active_set.load == 1.0, "who approved it has judged the mass"
 
 
 def test_manual_approval_waits_and_rollback_stays_manual() -> None:

@@ -20,7 +20,7 @@ from tests.online.driving import EPOCH, events, published
 from tests.online.made_up import PELICAN, PIECES, answered, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set, scaled
 
-QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2))
+QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2, width=0.15))
 """A first set after 8 s."""
 FLIGHT = light_flight(30.0)
 EARLIER = replace(online_set(scaled(b=0.97)), sequence=7, reason="of yesterday")
@@ -138,7 +138,7 @@ def test_the_grid_has_the_rate_of_the_settings() -> None:
 
 
 def test_windows_the_gate_and_memory_follow_the_settings() -> None:
-    three = QUICK.model_copy(update={"gate": GateSettings(windows=3)})
+    three = QUICK.model_copy(update={"gate": GateSettings(windows=3, width=0.15)})
     (first,) = published(works(Session(PELICAN, three), between(FLIGHT, 0.0, 14.7), tells()))
     assert first.stop == 12.0
     sharp, blunt = (

@@ -1,0 +1,131 @@
+"""Faults that every single check let pass: what is accepted is within 5 % of the truth, and says what it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quadid.online import Session, SessionSettings
+from quadid.online.records import OnlineSet, SetState
+from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import ParameterPrior
+from quadid.window import Recording
+from tests.online.driving import drive, flight, published, samples
+from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
+from tests.online.test_gate import TRUE, online_set
+
+SETTINGS = SessionSettings(refit=5.0, diagnose=0.0)
+SECONDS = 41.0
+
+
+def with_channel(recording: Recording, name: str, change: Callable[[FloatArray], FloatArray]) -> Recording:
+    channel = recording.channels[name]
+    return replace(
+        recording, channels={**recording.channels, name: replace(channel, values=np.asarray(change(channel.values)))}
+    )
+
+
+def flown(recording: Recording, restored: OnlineSet | None = None) -> tuple[Session, list[OnlineSet]]:
+    session = Session(PELICAN, SETTINGS, restored)
+    return session, [s for s in published(drive(session, samples(recording))) if s.state is SetState.ACCEPTED]
+
+
+def off(item: OnlineSet, name: str) -> float:
+    return item.parameters[name].value / TRUE[name] - 1.0
+
+
+def supported(share: float) -> Callable[[FloatArray], FloatArray]:
+    """Speeds of a flight in which something carries this share of the weight all the time."""
+    carried = share * PELICAN.mass * GRAVITY / 4.0 / TRUE["b"]
+    return lambda speed: np.sqrt(np.maximum(speed**2 - carried, 1.0))
+
+
+def about_the_mean(factor: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda force: force.mean(axis=0) + factor * (force - force.mean(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "check", "word"),
+    [
+        ("rotor_speed", lambda w: w * [0.9, 1.0, 1.0, 1.0], "thrust", "rotor 1"),
+        ("rotor_speed", lambda w: w * [0.95, 0.95, 1.0, 1.0], "thrust", "rotor"),
+        ("rotor_speed", supported(0.15), "thrust", "support"),
+        ("rotor_speed", supported(0.08), "thrust", "support"),
+        ("accel", about_the_mean(1.3), "thrust", "accelerometer"),
+        ("accel", about_the_mean(1.12), "thrust", "accelerometer"),
+    ],
+)
+def test_what_one_number_cannot_say_waits_for_a_person(
+    name: str, change: Callable[[FloatArray], FloatArray], check: str, word: str
+) -> None:
+    session, sets = flown(with_channel(flight(SECONDS, 3).recording, name, change))
+    assert not sets
+    waits = session.active_set.pending
+    assert waits is not None, session.status().reason
+    assert waits.check == check
+    assert word in waits.reason
+
+
+@pytest.mark.parametrize("rotor", [1, 3])
+def test_a_weak_rotor_moves_b_by_its_share_whichever_it_is(rotor: int) -> None:
+    made = flight(SECONDS, 3, "excited", (("weak_rotor", "rotor", float(rotor)), ("weak_rotor", "loss", 0.12)))
+    session, sets = flown(made.recording)
+    assert not sets
+    waits = session.active_set.pending
+    assert waits is not None
+    assert f"rotor {rotor}" in waits.reason
+    assert off(waits, "b") == pytest.approx(-0.03, abs=0.01), "the mean of the rotors"
+
+
+def test_a_thrust_curve_that_the_vehicle_file_lacks_waits_and_one_that_it_has_is_published() -> None:
+    made = flight(SECONDS, 3, "excited", (("thrust_curve", "dead_speed", 60.0),))
+    session, sets = flown(made.recording)
+    assert not sets
+    waits = session.active_set.pending
+    assert waits is not None
+    assert "thrust curve" in waits.reason
+    knows = PELICAN.model_copy(update={"effects": {"thrust_curve": {"dead_speed": 60.0}}})
+    told = Session(knows, SETTINGS)
+    accepted = published(drive(told, samples(made.recording)))
+    assert accepted, told.status().reason
+    assert all(abs(off(s, n)) < 0.05 for s in accepted for n in ("b", "J_xx", "J_yy"))
+
+
+def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent() -> None:
+    made = flight(SECONDS, 3).recording
+    for name, factor in (("accel", 1.04), ("gyro", 0.97), ("rotor_speed", 0.985)):
+        made = with_channel(made, name, lambda v, k=factor: v * k)  # type: ignore[misc]
+    assert not flown(made)[1]
+    assert not flown(made, online_set(TRUE, sigma=0.001))[1]
+
+
+def test_an_attitude_that_comes_late_leaves_the_inertias_alone() -> None:
+    made = flight(SECONDS, 3).recording
+    late = made.channels["attitude"]
+    _, sets = flown(replace(made, channels={**made.channels, "attitude": replace(late, t=late.t + 0.1)}))
+    assert all(abs(off(s, n)) < 0.05 for s in sets for n in ("b", "J_xx", "J_yy"))
+
+
+def test_a_set_says_what_it_was_compared_with() -> None:
+    """The first flight of a vehicle whose file guesses has nothing to be compared with."""
+    stream = between(light_flight(60.0), 0.0, 12.0)
+    knows = PELICAN.parameters | {"b": ParameterPrior(initial=TRUE["b"], sigma=TRUE["b"] * 0.02)}
+    measured = PELICAN.model_copy(update={"parameters": knows})
+
+    def reference(vehicle: Vehicle, restored: OnlineSet | None = None) -> str:
+        session = Session(vehicle, QUICK, restored)
+        return published(works(session, stream, tells()))[-1].reference
+
+    assert reference(PELICAN) == "none"
+    assert reference(measured) == "vehicle_file"
+    assert reference(PELICAN, online_set(TRUE)) == "history"
+    manual = Session(PELICAN, QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})}))
+    works(manual, stream, tells())
+    assert manual.approve("ann").done
+    assert manual.active_set.in_force is not None
+    assert manual.active_set.in_force.reference == "none"
+    assert manual.active_set.reference(()) == "history", "what a person approved is trusted"
