@@ -87,6 +87,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._neighbours: Neighbours | None = None
         self._intake = Intake()
         self._bond: Bond | None = None
+        self._zenoh: Any = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._speaker = Speaker(self)
         self._change_state = self._service_change_state.callback
@@ -182,6 +183,10 @@ class IdentifyNode(PollingNode, LifecycleNode):
             beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
         self._hint = preset.motor_hint
+        if values["zenoh"]:
+            from quadid_node.zenoh_link import ZenohLink
+
+            self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
         self._speaker.open(self._observer)
         commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
         for name, kind, answer in commands.offered():
@@ -247,6 +252,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
             destroy(item)
         self._open.clear()
         self._speaker.close()
+        if self._zenoh is not None:
+            self._zenoh.close()
+            self._zenoh = None
         if self._service is not None:
             self._service.close()
             self._service = None
@@ -304,6 +312,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 self._log(output.level, output.text)
             elif self._service is not None and not self._speaker.silent and output.topic in messages.RESULTS:
                 self._send(output.topic, messages.RESULTS[output.topic](output, self._id, self._service.boot_id))
+                if self._zenoh is not None:
+                    self._zenoh.publish(output)
         if self._service is not None and self._service.approval != self.get_parameter("approval").value:
             self._read_back({"approval": self._service.approval})
 
@@ -349,7 +359,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
             self._neighbours.look(self._speaker.deaf())
             self._claim_topic()
             self._neighbours.note(self._speaker.ours, self._speaker.problem)
-            notes, health = dict(self._neighbours.notes), self._service.health()
+            health = self._service.health()
+            if self._zenoh is not None:
+                self._zenoh.report(health)
+                self._neighbours.note("zenoh", self._zenoh.problem)
+                if self._active:
+                    self._zenoh.attend()
+            notes = dict(self._neighbours.notes)
             if self._active:
                 status = messages.fit_status(health.status, self._id, health.fit_seconds)
             if "no rotor speeds" in status["reason"]:

@@ -62,6 +62,7 @@ PARAMETERS: tuple[NodeParameter, ...] = (
         (0.0, 3600.0),
     ),
     P("ground_worker", "", "Zenoh locator or configuration file where a 'quadid worker' fits for this node; '': none."),
+    P("zenoh", "", "Zenoh locator or configuration file to publish on too, for 'quadid watch'; '': none."),
     P("worker_memory", 1000, "[MiB] most memory of the fit process; 0: no limit.", (0, 65536)),
 )
 """Every parameter of the node."""

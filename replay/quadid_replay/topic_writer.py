@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO
 
+import yaml
 from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
@@ -17,6 +18,20 @@ from quadid_replay.writing import open_for_writing
 
 CHUNK_BYTES = 1 << 20
 """Compresses well; a caller who must not be held up for ten milliseconds takes less."""
+
+LATCHED = ("quadid/parameters", "quadid/diagnosis", "quadid/health")
+"""Ends of topics that the node offers transient local, depth 1: `ros2 bag play` offers them likewise."""
+
+
+def offered_qos(topic: str) -> str:
+    """QoS of a topic's publisher in the form of rosbag2 since Jazzy, which plays with it."""
+    latched = topic.endswith(LATCHED)
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    return yaml.safe_dump([{
+        "history": "keep_last", "depth": 1 if latched else 10, "reliability": "reliable",
+        "durability": "transient_local" if latched else "volatile", "deadline": forever, "lifespan": forever,
+        "liveliness": "automatic", "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False,
+    }], sort_keys=False)  # fmt: skip
 
 
 class TopicWriter:
@@ -77,7 +92,9 @@ class TopicWriter:
         """Writes one message that is CDR already."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._writer.register_channel(topic, "cdr", self._schema(kind))
+            channel = self._writer.register_channel(
+                topic, "cdr", self._schema(kind), {"offered_qos_profiles": offered_qos(topic)}
+            )
             self._channels[topic] = channel
         sequence = self._sequence.get(channel, 0)
         self._sequence[channel] = sequence + 1

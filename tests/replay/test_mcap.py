@@ -18,6 +18,7 @@ from quadid_replay.mcap_messages import TYPES
 from quadid_replay.motors import RPM
 from quadid_replay.schemas import schema_text
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
 
 from quadid.errors import LogError
 from tests.replay.synthetic import full_recording
@@ -295,3 +296,16 @@ def test_px4_escs_go_to_the_motors_that_they_name(functions: tuple[int, ...], pl
 def test_px4_escs_that_name_no_complete_row_of_motors_are_refused() -> None:
     with pytest.raises(ValueError, match="no complete row of motors"):
         TYPES["px4_msgs/EscStatus"].blocks(_escs_of(101, 103, 104, 0))
+
+
+def test_written_topics_say_how_they_are_offered_so_that_a_bag_is_played_latched(tmp_path: Path) -> None:
+    path = tmp_path / "sets.mcap"
+    with TopicWriter(path) as writer:
+        for topic, kind in (("quad1/quadid/parameters", "ParameterSet"), ("quadid/candidate", "ParameterSet")):
+            writer.write(topic, f"quadid_msgs/msg/{kind}", {"sequence": 1}, EPOCH)
+    with AnyReader([path]) as reader:
+        told = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}  # type: ignore[union-attr]
+    latched, plain = told["quad1/quadid/parameters"], told["quadid/candidate"]
+    assert (latched.durability, latched.depth) == (QosDurability.TRANSIENT_LOCAL, 1)
+    assert (plain.durability, plain.depth) == (QosDurability.VOLATILE, 10)
+    assert latched.reliability == plain.reliability == QosReliability.RELIABLE
