@@ -59,8 +59,9 @@ def measured_rows(t: FloatArray, values: FloatArray) -> BoolArray:
 
 
 def measured_period(t: FloatArray, values: FloatArray) -> float:
-    """Period [s] at which `values` were measured, see `measured_rows` and `sample_period`."""
-    return sample_period(t[measured_rows(t, values)])
+    """Period [s] at which `values` were measured, see `fresh_rows`, `measured_rows` and `sample_period`."""
+    fresh = fresh_rows(values)
+    return sample_period(t[fresh][measured_rows(t[fresh], values[fresh])])
 
 
 def period_of(steps: FloatArray) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
 from quadid.inspection.airborne import Spans
 from quadid.inspection.airborne import flying_spans as flying_spans
 from quadid.inspection.airborne import proposed_cuts as proposed_cuts
@@ -11,10 +14,10 @@ from quadid.inspection.findings import Check as Check
 from quadid.inspection.findings import CheckResult as CheckResult
 from quadid.inspection.findings import Inspection as Inspection
 from quadid.inspection.geometry import geometry_check, mass_check
-from quadid.inspection.motor_checks import Lagged, hover_check, lagged_motion, motor_order_check
+from quadid.inspection.motor_checks import better_order, hover_check, lagged_motion, motor_order_check, reordered
 from quadid.inspection.outlook import missing_signals, parameter_outlook
 from quadid.inspection.position import position_checks
-from quadid.inspection.rotor_checks import rotor_speed_check
+from quadid.inspection.rotor_checks import readings_check, rotor_speed_check
 from quadid.inspection.rotor_timing import rotor_timing_check
 from quadid.inspection.timing import channel_facts, timing_checks
 from quadid.mounting import in_body_axes
@@ -33,14 +36,11 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
     spans = flying_spans(turned, vehicle)
     facts = channel_facts(recording, spans)
     checks = timing_checks(recording, facts)
-    checks += [
-        gravity_check(turned, spans),
-        attitude_check(turned),
-        velocity_check(turned),
-        *position_checks(recording),
-    ]
-    if vehicle is not None:
-        checks += _against_vehicle(turned, vehicle, spans, lagged_motion(recording, vehicle, spans))
+    for stage in STAGES:  # each builds on the ones before it: what comes after an error is not asked
+        found = [check for check in stage(Log(turned, vehicle, spans, recording)) if check is not None]
+        checks += found
+        if any(check.verdict is CheckResult.ERROR for check in found):
+            break
     return Inspection(
         name=recording.name,
         format=recording.format,
@@ -57,15 +57,66 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
     )
 
 
-def _against_vehicle(recording: Recording, vehicle: Vehicle, spans: Spans, lagged: Lagged | str) -> list[Check]:
-    """What only a vehicle file lets check; mass and geometry are judged where the motors themselves are in order."""
-    speeds = rotor_speed_check(recording, vehicle, spans)
-    if speeds.verdict is CheckResult.ERROR:
-        return [speeds]
-    hover, order = hover_check(recording, vehicle, spans), motor_order_check(lagged, vehicle)
-    time = rotor_timing_check(recording, vehicle, spans)
-    checks = [speeds, hover, order, time]
-    if CheckResult.ERROR not in (hover.verdict, order.verdict, time.verdict):
-        mass = mass_check(recording, vehicle, spans, hover.numbers.get("b_from_hover"))
-        checks += [check for check in (mass, geometry_check(lagged, vehicle)) if check is not None]
-    return checks
+class Log(NamedTuple):
+    """What is checked: the recording in body axes, the vehicle, when it flies [s], and the recording as it was read."""
+
+    recording: Recording
+    vehicle: Vehicle | None
+    spans: Spans
+    read: Recording
+
+
+Stage = Callable[[Log], Sequence[Check | None]]
+
+
+def _kinematics(log: Log) -> list[Check]:
+    """Units and frames, without any rotor."""
+    return [
+        gravity_check(log.recording, log.spans), attitude_check(log.recording), velocity_check(log.recording),
+        *position_checks(log.read),
+    ]  # fmt: skip
+
+
+def _readings(log: Log) -> list[Check | None]:
+    """Rotors that read nothing, or always the same; the unit of their speeds."""
+    if log.vehicle is None:
+        return []
+    dead = readings_check(log.recording, log.vehicle, log.spans)
+    return [dead] if dead is not None else [hover_check(log.recording, log.vehicle, log.spans)]
+
+
+def _time_and_order(log: Log) -> list[Check]:
+    """When torque acts, and which motors make it: an order is only judged, and advised, of a signal in time."""
+    if log.vehicle is None:
+        return []
+    vehicle, lagged = log.vehicle, lagged_motion(log.read, log.vehicle, log.spans)
+    time = rotor_timing_check(log.recording, vehicle, log.spans)
+    if order := better_order(lagged, vehicle):
+        other = rotor_timing_check(log.recording, reordered(vehicle, order), log.spans)
+        own, its = (check.numbers.get("correlation", 0.0) for check in (time, other))
+        if other.verdict is CheckResult.OK and its > own:
+            return [motor_order_check(lagged, vehicle)]
+        if time.verdict is CheckResult.ERROR:
+            return [time]
+        return [
+            Check("motor_order", CheckResult.UNKNOWN, "no order of the motors explains the motion at one lag"),
+            time,
+        ]
+    return [time] if time.verdict is CheckResult.ERROR else [motor_order_check(lagged, vehicle), time]
+
+
+def _balance(log: Log) -> list[Check]:
+    """Rotors one by one."""
+    return [] if log.vehicle is None else [rotor_speed_check(log.recording, log.vehicle, log.spans)]
+
+
+def _vehicle_file(log: Log) -> list[Check | None]:
+    """Mass and rotor positions."""
+    if log.vehicle is None:
+        return []
+    b = hover_check(log.recording, log.vehicle, log.spans).numbers.get("b_from_hover")
+    mass = mass_check(log.recording, log.vehicle, log.spans, b)
+    return [mass, geometry_check(lagged_motion(log.read, log.vehicle, log.spans), log.vehicle)]
+
+
+STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_and_order, _balance, _vehicle_file)

@@ -15,6 +15,10 @@ Spans = tuple[tuple[float, float], ...]
 
 _LEAST = 0.5
 """Flying means at least this fraction of hover thrust …"""
+_FALLING = 0.8
+"""Who feels less than this share of his weight falls."""
+_OFF = 16.0
+"""A thrust coefficient that is wrong by more tells nothing of the weight."""
 _CARRIES = 0.9
 """… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
 _IDLE = 0.15
@@ -35,18 +39,24 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
     """Returns the spans [s] in which the vehicle flies; empty without evidence.
 
     Thrust and weight are those of the vehicle file where rotor speeds and a vehicle are known; else thrust grows with
-    the square of the command, and hover is the median of the powered part of the log.  A flying vehicle also feels its
-    thrust: where the accelerometer does not point along its usual direction for half a second, it lies somewhere.
+    the square of the command, and hover is what is felt as one g.  A vehicle that feels less than its weight falls, and
+    so flies, whatever its rotors do; one that feels it along an unusual direction for half a second lies somewhere.
     """
     channels = recording.channels
     rotors, _ = rotor_channel(recording, vehicle)
     if rotors is not None:
-        thrust, hover = _thrust(rotors, vehicle)
+        accel = channels.get("accel")
+        load = None if accel is None or len(accel.t) < 10 else _load(accel)
+        felt = None if load is None or accel is None else np.interp(rotors.t, accel.t, load)
+        thrust, hover = _thrust(rotors, vehicle, felt)
         if hover <= 0.0:
             return ()
         t, on = rotors.t, thrust > _LEAST * hover
-        if "accel" in channels and len(channels["accel"].t) > 10:
-            on &= np.interp(t, channels["accel"].t, _felt(channels["accel"])) > 0.5
+        if accel is not None and len(accel.t) > 10:
+            on &= np.interp(t, accel.t, _felt(accel)) > 0.5
+        if felt is not None and on.any():
+            inside = (t >= t[on][0]) & (t <= t[on][-1])
+            on |= inside & (felt < _FALLING)
         carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
         return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
@@ -82,8 +92,8 @@ def within(t: FloatArray, spans: Spans) -> BoolArray:
     return np.asarray(np.any([np.zeros(len(t), dtype=bool), *((t >= a) & (t <= b) for a, b in spans)], axis=0))
 
 
-def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, float]:
-    """Returns relative thrust and the value that hovers."""
+def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) -> tuple[FloatArray, float]:
+    """Returns relative thrust and the value that hovers; `felt` is the specific force [g], shape (n,)."""
     values = channel.values
     if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
         low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
@@ -93,12 +103,14 @@ def _thrust(channel: Channel, vehicle: Vehicle | None) -> tuple[FloatArray, floa
     if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
         return thrust, 0.0
     if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
-        low, high = vehicle.parameters["b"].limits
         modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
         highest = float(np.max(modelled))  # of losses that no rotor has it may be negative
         typical = float(np.median(modelled[modelled >= 0.25 * highest])) if highest > 0.0 else 0.0
-        if low / high < typical / hover < high / low:
+        if 1.0 / _OFF < typical / hover < _OFF:
             return modelled, hover
+    strong = thrust > 0.5 * np.quantile(thrust, 0.95)
+    if felt is not None and (strong := strong & (felt > 0.5)).any():
+        return thrust, float(np.median(thrust[strong] / felt[strong]))
     powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
     return thrust, float(np.median(powered)) if len(powered) else 0.0
 
@@ -107,6 +119,15 @@ def _beside_others(speeds: FloatArray) -> FloatArray:
     """Speeds with the others' median for a rotor that is ignored: it is dead, or its signal is; no ground carries."""
     usual = np.median(speeds, axis=1, keepdims=True)
     return np.asarray(np.where(speeds < _NOTHING * usual, usual, speeds))
+
+
+def _load(accel: Channel) -> FloatArray | None:
+    """Specific force [g] averaged over 0.2 s, shape (n,), whichever unit it is in; None where it is in none."""
+    length = np.linalg.norm(accel.values, axis=1)
+    middle = float(np.median(length))
+    unit = next((u for u in (GRAVITY, 1.0, 1e3) if 0.5 < middle / u < 4.0), None)
+    width = max(1, round(0.2 / sample_period(accel.t)))
+    return None if unit is None else np.asarray(moving_mean(length / unit, width))
 
 
 def _felt(accel: Channel) -> FloatArray:

@@ -25,6 +25,12 @@ _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
 _STEP = 0.1
 """Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_JUMP = 8.0
+"""An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
+_REVERSED = 0.7
+"""Correlation below the negative of which a vertical signal points up."""
+_RESTING = 50
+"""Samples on the ground that tell the length of gravity."""
 _AXES = ("x", "y", "z")
 
 
@@ -86,7 +92,7 @@ def _fit_without_jumps(source: FloatArray, target: FloatArray) -> AxisMap:
     if not np.isfinite(fit.scale):
         return fit
     miss = np.linalg.norm(target - fit.scale * source[:, fit.axes] * np.array(fit.signs), axis=1)
-    return fit_axes(*(rows[miss <= 8.0 * np.median(miss)] for rows in (source, target)))
+    return fit_axes(*(rows[miss <= _JUMP * np.median(miss)] for rows in (source, target)))
 
 
 def gravity_check(recording: Recording, spans: Spans) -> Check:
@@ -94,21 +100,27 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     accel = recording.channels.get("accel")
     if accel is None:
         return Check("gravity", CheckResult.UNKNOWN, "no accelerometer")
-    values = accel.values[within(accel.t, spans)] if spans else accel.values
+    inside = within(accel.t, spans) if spans else np.ones(len(accel.t), dtype=np.bool_)
+    values = accel.values[inside]
+    if not len(values):
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer sample in flight")
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
     steady = float(np.linalg.norm(np.median(values, axis=0)))
     check = partial(Check, "gravity", numbers={"length": length, "z": z})
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
-    for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
-        if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
-            fix = f"multiply acceleration by {factor:.6g}"
-            return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
-    if spans and steady < 0.3 * GRAVITY:
-        fix = "log specific force, not linear acceleration"
-        return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
-    if not 0.5 < length / GRAVITY < 2.0:
-        return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
+    if not _reads_gravity_at_rest(accel.values[~inside]):
+        for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
+            if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
+                fix = f"multiply acceleration by {factor:.6g}"
+                return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
+        if spans and steady < 0.3 * GRAVITY:
+            fix = "log specific force, not linear acceleration"
+            return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
+        if not 0.5 < length / GRAVITY < 2.0:
+            return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
+    if z > -0.5 * length and _attitude_explains(accel, recording.channels.get("attitude"), inside):
+        return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
     if not spans and abs(z) < 0.8 * length:
         return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log")
     if z > 0.5 * length:
@@ -117,6 +129,19 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     if z > -0.5 * length:
         return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
     return check(CheckResult.OK, message)
+
+
+def _reads_gravity_at_rest(values: FloatArray) -> bool:
+    """Whether specific force on the ground, shape (n, 3), has the length that it must have [m/s^2]."""
+    return len(values) >= _RESTING and abs(float(np.median(np.linalg.norm(values, axis=1))) / GRAVITY - 1.0) < 0.1
+
+
+def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
+    """Whether the attitude turns the specific force of the rows `inside` to one g upwards."""
+    if attitude is None or len(attitude.t) < 2:
+        return False
+    world = np.median(_in_world(accel, attitude)[inside], axis=0)
+    return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
 
 
 def attitude_check(recording: Recording) -> Check:
@@ -160,8 +185,8 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
     stride = max(1, round(_STEP / sample_period(t)))
-    measured, derived = _rates(gyro, t[::stride], q[::stride])
-    longer = _rates(gyro, t[:: 2 * stride], q[:: 2 * stride])[1]
+    measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
+    longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
     if len(longer) < 20:
         return longer[:0], longer[:0]
     total = np.var(derived, axis=0)
@@ -171,6 +196,15 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     if np.sum(motion) > 0.8 * np.sum(total):
         return measured, derived
     return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
+
+
+def _without_jumps(measured: FloatArray, derived: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
+    if not len(derived):
+        return measured, derived
+    turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
+    jumps = (turned > _JUMP * np.median(turned)) & (felt < 0.5 * _JUMP * np.median(felt))
+    return measured[~jumps], derived[~jumps]
 
 
 def _likely(reading: str, fit: AxisMap) -> float:
@@ -209,6 +243,17 @@ def velocity_check(recording: Recording) -> Check:
     if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
         return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity")
     gained, derived = _velocity_gains(accel, attitude, velocity)
+    level = _level_velocity(gained, derived)
+    if level.verdict is CheckResult.ERROR or len(gained) < 20 or not _upwards(gained[:, 2], derived[:, 2]):
+        return level
+    return Check(
+        "velocity_attitude", CheckResult.ERROR, "vertical velocity rises where the force pushes down: it points up",
+        "negate vz, and z if it points up too: the world is NED", {"vertical": -1.0},
+    )  # fmt: skip
+
+
+def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
+    """Horizontal axes of `velocity_check`."""
     if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
         return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
     fit = fit_axes(derived[:, :2], gained[:, :2])
@@ -219,6 +264,11 @@ def velocity_check(recording: Recording) -> Check:
         message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
     return check(CheckResult.OK, f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})")
+
+
+def _upwards(gained: FloatArray, derived: FloatArray) -> bool:
+    """Whether vertical changes (n,) are clearly the reverse of what force makes (n,)."""
+    return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -_REVERSED)
 
 
 def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:

@@ -10,7 +10,8 @@ from typing import Any
 from quadid.jsonable import jsonable
 
 FATAL = (
-    "gravity", "gyro_attitude", "velocity_attitude", "rotor_speed", "hover", "motor_order", "rotor_timing",
+    "gravity", "gyro_attitude", "velocity_attitude", "position_velocity", "rotor_speed", "hover", "motor_order",
+    "rotor_timing",
 )  # fmt: skip
 """Checks whose error means that nothing may be fitted to the log."""
 
@@ -134,9 +135,9 @@ class Inspection:
 
     @property
     def usable(self) -> bool:
-        """Whether at least one parameter can be identified and no check finds the data wrong."""
+        """Whether something flies, at least one parameter can be identified, and no check finds the data wrong."""
         wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
-        return any(outlook.possible for outlook in self.parameters) and not wrong
+        return bool(self.flying) and any(outlook.possible for outlook in self.parameters) and not wrong
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the inspection as JSON-ready data, schema ``quadid.inspect/1``; NaN and infinity become null."""

@@ -86,7 +86,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     if isinstance(lagged, str):
         return Check(name, CheckResult.UNKNOWN, lagged)
     arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
-    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion in lagged]
+    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged]
     share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
     if float(np.min(share)) < _CLEAR:
         axis = ("roll", "pitch")[int(np.argmin(share))]

@@ -18,6 +18,8 @@ STRETCH = 1.0
 """Changes are compared over this time [s]: slow enough for delays and low-passes of either channel not to count."""
 CLEAR = 0.98
 """Correlation above which two changes are the same motion, seen by two channels."""
+UPWARDS = 0.8
+"""Correlation below the negative of which one of two vertical changes has the wrong sign."""
 LEAST_MOTION = 0.1
 """Change of position [m], as standard deviation, below which its noise may decide."""
 SCALE = 0.03
@@ -55,6 +57,12 @@ def _compared(position: Channel, velocity: Channel) -> Check:
     for where, axes in _PAIRS:
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
+        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -UPWARDS:
+            return Check(
+                "position_velocity", CheckResult.ERROR,
+                f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
+                "negate z or vz: the world is NED, its z down", {"correlation": correlation},
+            )  # fmt: skip
         if np.max(np.std(p, axis=0)) < LEAST_MOTION or correlation < CLEAR:
             continue
         # Both have errors: the ratio of their sizes, not a regression of one on the other.

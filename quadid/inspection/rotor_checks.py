@@ -20,8 +20,8 @@ from quadid.window import Channel, Recording
 
 _BIN = 0.5
 """Means over this long [s] are compared: fast motion has passed by then."""
-_DEAD, _DEAD_SHARE = 0.1, 0.05
-"""A rotor below this share of the median speed for this share of the flight is dead; cut throttle is shorter."""
+_DEAD, _DEAD_SHARE, _IDLE_SHARE = 0.1, 0.05, 0.5
+"""A rotor below this share of the median speed for this share of the flight is dead; a command may rest longer."""
 _STUCK = 1.0
 """A rotor that holds one value this long [s] while the vehicle moves is stuck."""
 _IMBALANCE, _UNBALANCED = 0.72, 0.1
@@ -36,9 +36,33 @@ Bins = tuple[FloatArray, BoolArray]
 """Means (m, columns) and which bins hold samples (m,)."""
 
 
+_NAME = "rotor_speed"
+_FIX = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
+_COMMANDED = "these are commands: a damaged rotor is driven harder, which `quadid health` measures; or they mean thrust"
+
+
+def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
+    """A rotor that reads nothing, or holds one value; None for none, and where none can be told."""
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError:
+        return None
+    inside = within(signal.t, spans)
+    if np.count_nonzero(inside) < 20:
+        return None
+    most = _IDLE_SHARE if _commanded(signal, recording) else _DEAD_SHARE
+    problem = _dead(signal.values[inside], most) or _stuck(signal, recording, inside)
+    return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
+
+
+def _commanded(signal: RotorSignal, recording: Recording) -> bool:
+    command = recording.channels.get("motor_command")
+    return command is not None and signal.source == command.source
+
+
 def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
-    name = "rotor_speed"
+    name = _NAME
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
@@ -48,15 +72,13 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     if len(edges) < 4 or np.count_nonzero(inside) < 20:
         return Check(name, CheckResult.UNKNOWN, "too little flight to compare the rotors")
     squares, known = _means(signal.t, signal.values**2, edges, spans)
-    problem = (
-        _dead(signal.values[inside])
-        or _stuck(signal, recording, inside)
-        or (_unbalanced(squares[known], vehicle) if known.any() else None)
-        or _against_thrust(recording, squares, known, edges, spans)
+    problem = (_unbalanced(squares[known], vehicle) if known.any() else None) or _against_thrust(
+        recording, squares, known, edges, spans
     )
-    fix = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
+    if problem is not None and _commanded(signal, recording):
+        return Check(name, CheckResult.WARNING, f"{problem[0]} ({signal.source})", _COMMANDED, problem[1])
     if problem is not None:
-        return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
+        return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
     return Check(name, CheckResult.OK, "the rotors agree with each other and with the thrust felt")
 
 
@@ -76,10 +98,15 @@ def _means(t: FloatArray, values: FloatArray, edges: FloatArray, spans: Spans) -
 Problem = tuple[str, dict[str, float]]
 
 
-def _dead(speeds: FloatArray) -> Problem | None:
+def _dead(speeds: FloatArray, most: float) -> Problem | None:
+    """A rotor that reads nothing for a share `most` of the time in which the others turn (else it is closed)."""
     turning = speeds[speeds > 0.0]
-    share = np.mean(speeds < _DEAD * np.median(turning), axis=0) if len(turning) else np.ones(speeds.shape[1])
-    if share.max() < _DEAD_SHARE:
+    if not len(turning):
+        return None
+    still = _DEAD * np.median(turning)
+    others = np.median(speeds, axis=1) > still
+    share = np.mean(speeds[others] < still, axis=0) if others.any() else np.zeros(speeds.shape[1])
+    if share.max() < most:
         return None
     rotor = int(np.argmax(share))
     return (

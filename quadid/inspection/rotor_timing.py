@@ -13,7 +13,7 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.inspection.airborne import Spans
 from quadid.inspection.findings import Check, CheckResult
-from quadid.resample import linear, moving_mean, sample_period
+from quadid.resample import linear, measured_period, moving_mean, sample_period
 from quadid.rotor_signal import INERTIA_RATE, RotorSignal, rotor_signal
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -49,7 +49,7 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
         signal = rotor_signal(recording, vehicle)
     except QuadidError as error:
         return Check(name, CheckResult.UNKNOWN, error.found)
-    slowest = max(sample_period(signal.t), sample_period(gyro.t))
+    slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
     if not slowest <= 1.0 / INERTIA_RATE:
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.

@@ -120,4 +120,10 @@ def _clock_check(recording: Recording, facts: tuple[ChannelFacts, ...]) -> Check
         return Check("clock", CheckResult.OK, "time rises steadily, no sample was dropped", numbers=numbers)
     parts = [f"{len(recording.breaks)} breaks (reboots or clock steps)"] if recording.breaks else []
     parts += [f"{count} samples dropped: {reason.replace('_', ' ')}" for reason, count in dropped.items()]
-    return Check("clock", CheckResult.WARNING, "; ".join(parts), "nothing is joined across breaks", numbers)
+    return Check(
+        "clock",
+        CheckResult.WARNING,
+        "; ".join(parts),
+        "nothing is joined across breaks" if recording.breaks else "",
+        numbers,
+    )

@@ -7,15 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from quadid.errors import LogError
 from quadid.resample import sample_period
 from quadid.rotation import continuous_sign
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 from quadid.window import Channel, Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.frames import unit_quaternions
 
+_AROUND = 5
+"""A rotor speed is compared with so many, itself among them."""
 _ABSURD = 1e9
 """No channel holds a number of this size in SI units; damage does."""
 _REASONS = {
@@ -24,6 +27,7 @@ _REASONS = {
     "not_finite": "not finite",
     "absurd": "beyond any physical value",
     "bad_stamp": "with a wild stamp",
+    "impossible_rotor_speed": "with a rotor speed far from those before and after it",
     "not_attitude": "that are no attitude (quaternion far from unit length)",
 }
 
@@ -37,6 +41,7 @@ class RawChannel(NamedTuple):
         values: shape (n, columns).
         source: topic, message or column names, for people.
         refused: samples whose stamp the clock refused.
+        spikes: readings that the reader dropped as such.
     """
 
     name: str
@@ -44,6 +49,7 @@ class RawChannel(NamedTuple):
     values: FloatArray
     source: str
     refused: int = 0
+    spikes: int = 0
 
 
 class Columns:
@@ -88,11 +94,26 @@ class Columns:
         return t, values.reshape(-1, self.width)
 
 
+def spikes(speeds: FloatArray) -> BoolArray:
+    """Tells readings, shape (n,), that no rotor turns at between those before and after: counts of 65535, zeros.
+
+    More than half off the median of five neighbours, which agree with each other, and far beyond what the signal does
+    elsewhere: a real jump has more than two rows.
+    """
+    if len(speeds) < _AROUND:
+        return np.zeros(len(speeds), dtype=np.bool_)
+    usual = median_filter(speeds, _AROUND, mode="nearest")
+    spread = median_filter(np.abs(speeds - usual), _AROUND, mode="nearest")
+    size = np.maximum(usual, np.median(speeds))
+    off = np.abs(speeds - usual)
+    return np.asarray((usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off)))
+
+
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
-    Dropped: values or times that are not finite or absurd, repeated stamps, samples running backwards, quaternions that
-    are none.
+    Dropped: values or times that are not finite or absurd, single impossible rotor speeds, repeated stamps, samples
+    running backwards, quaternions that are none.
     Returns None when nothing remains.
     """
     t, values = raw.t, raw.values
@@ -102,6 +123,11 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
     faults["absurd"] = int(np.count_nonzero(absurd))
     finite &= ~absurd
+    if raw.name == "rotor_speed":
+        known = np.flatnonzero(finite)
+        far = np.array([spikes(column) for column in values[known].T]).any(axis=0)
+        faults["impossible_rotor_speed"] = raw.spikes + int(np.count_nonzero(far))
+        finite[known[far]] = False
     if raw.name == "attitude":
         values, good = unit_quaternions(values)
         faults["not_attitude"] = int(np.count_nonzero(finite & ~good))

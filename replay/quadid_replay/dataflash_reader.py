@@ -16,7 +16,7 @@ import numpy as np
 from quadid.types import BoolArray, FloatArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
-from quadid_replay.columns import RawChannel, assemble, fastest_first
+from quadid_replay.columns import RawChannel, assemble, fastest_first, spikes
 from quadid_replay.dataflash_index import DataflashIndex, index_dataflash
 from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
 from quadid_replay.frames import from_euler
@@ -28,8 +28,10 @@ from quadid_replay.motors import (
     changed_within,
     esc_columns,
     frame_rotors,
+    in_pulses,
     merge_instances,
     motor_outputs,
+    no_multirotor,
 )  # fmt: skip
 
 _ATTITUDE = ("Roll", "Pitch", "Yaw")
@@ -37,7 +39,7 @@ _GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
 _RATES = ("R", "P", "Y")
 _QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
 _QUATERNION = ("Q1", "Q2", "Q3", "Q4")
-_VERSION = re.compile(r"V(\d+)\.(\d+)")
+_FIRMWARE = re.compile(r"(?:Ardu|APM:)(\w+) V(\d+)\.(\d+)")
 _OUTPUTS = ("RCOU", "RCO2", "RCO3")
 """Outputs 1 to 14, and those behind."""
 _OUTPUT = re.compile(r"Ch?(\d{1,2})")
@@ -79,9 +81,12 @@ def read_dataflash(path: Path) -> Recording:
         *_reference(index, times),
         *_states(index, times, parameters),
         *_battery(index, times),
-        *_outputs(index, times, parameters, notes),
-        *_esc(index, times, parameters, notes),
     ]
+    firmware = _firmware(index)
+    if other := no_multirotor(parameters, firmware=firmware[1] if firmware else ""):
+        notes.append(other)
+    else:
+        raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
     changed = changed_within(names, values)
     notes += [changed] if changed else []
     recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters)
@@ -139,13 +144,14 @@ def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
 
 
 def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
-    """Returns the rows of instance 0 (or the only one) with an accepted stamp; None when columns are missing."""
+    """Returns the rows of the first instance (or the only one) with accepted stamps; None when columns are missing."""
     if name not in times or not index.has(name, *columns):
         return None
     rows = np.isfinite(times[name])
-    for instance in ("I", "Instance", "C"):
+    for instance in ("I", "Instance", "Inst", "C"):
         if index.has(name, instance):
-            rows &= index.column(name, instance) == 0
+            number = index.column(name, instance)
+            rows &= number == np.min(number, initial=255)
     return _Source(name, times[name][rows], rows, int(np.count_nonzero(~np.isfinite(times[name]))))
 
 
@@ -262,18 +268,23 @@ def _outputs(
             pulses[here, output] = _stack(index, source, (column,))[there, 0]
     found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
     notes += [found.problem] if found.problem else []
-    motors = [] if found.problem else found.columns or active_outputs(pulses)
+    motors = [] if found.problem else found.columns or active_outputs(in_pulses(pulses)[0])
     lost = [k + 1 for k in motors if k not in place]
     if lost:
         notes.append(f"motors on outputs {lost}, of which the log holds no column: no output is used")
     if not motors or lost:
         return []
+    values, how = in_pulses(pulses[:, motors])
     label = " ".join([*dict.fromkeys(place[k][0] for k in motors), *(place[k][1] for k in motors)])
-    return [RawChannel("motor_command", first.t, pulses[:, motors], label, first.refused)]
+    return [RawChannel("motor_command", first.t, values, f"{label}{how and f' ({how})'}", first.refused)]
 
 
 def _frame(index: DataflashIndex) -> str:
     return next((text.split(":", 1)[1].strip() for text in _messages(index) if text.startswith("Frame:")), "")
+
+
+def _firmware(index: DataflashIndex) -> re.Match[str] | None:
+    return next((m for m in map(_FIRMWARE.search, _messages(index)) if m), None)
 
 
 def _messages(index: DataflashIndex) -> list[str]:
@@ -289,8 +300,8 @@ def _esc(
         return []
     instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
     turning = [bool(np.any(rpm[instance == k] != 0.0)) for k in range(ESCS)]
-    version = next((m for m in map(_VERSION.search, _messages(index)) if m), None)
-    told = (int(version[1]), int(version[2])) if version else None
+    version = _firmware(index)
+    told = (int(version[2]), int(version[3])) if version else None
     found = esc_columns(parameters, frame_rotors(_frame(index)), turning, "ESC", ardupilot=True, version=told)
     silent = [k for k in found.columns if not np.any(instance == k)]
     if silent and any(turning):
@@ -298,10 +309,14 @@ def _esc(
     if found.problem:
         notes.append(found.problem)
         return []
-    series = []
+    series, dropped = [], 0
     for motor in found.columns:
         rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)
         rising = np.concatenate([[True], np.diff(t[rows]) > 0.0])[: int(rows.sum())]
-        series.append((t[rows][rising], rpm[rows][rising] * RPM))
+        speeds = rpm[rows][rising] * RPM
+        far = spikes(speeds)  # before others are interpolated to
+        dropped += int(np.count_nonzero(far))
+        series.append((t[rows][rising][~far], speeds[~far]))
     at, values = merge_instances(series)
-    return [RawChannel("rotor_speed", at, np.abs(values), f"ESC RPM of {len(found.columns)} motors")]
+    label = f"ESC RPM of {len(found.columns)} motors"
+    return [RawChannel("rotor_speed", at, np.abs(values), label, spikes=dropped)]

@@ -29,7 +29,17 @@ _OLD_ESCS = (4, 4)
 """The last ArduPilot that counts ESCs from 0, whatever outputs they are on."""
 _TRICOPTER, _TAIL = (0, 1, 3), 6
 """ArduPilot's tricopter has motors 1, 2 and 4; its motor 7 is the servo of the tail."""
-_PX4_TYPES = {2: 4, 13: 6, 14: 8, 15: 3}  # MAV_TYPE: quadrotor, hexarotor, octorotor, tricopter
+MULTIROTORS = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
+"""MAV_TYPE of multirotors: how many rotors they have."""
+_OTHER_FRAMES = {6: "helicopter", 8: "single copter", 9: "coax copter", 11: "helicopter", 13: "helicopter"}
+"""FRAME_CLASS of ArduCopter that is no multirotor."""
+_OTHER_AIRFRAMES = {1: "plane", 2: "VTOL", 3: "tiltrotor", 4: "tailsitter", 5: "rover", 6: "rover", 10: "helicopter",
+                    11: "helicopter", 12: "helicopter", 13: "rover", 14: "spacecraft"}  # fmt: skip
+"""CA_AIRFRAME of PX4 that is no multirotor."""
+_ONESHOT125 = 8.0
+"""ESCs that take an eighth of a pulse width."""
+DSHOT, UAVCAN = 1999.0, 8191.0
+"""Full command of these protocols, as PX4 logs it."""
 _NAMED = 4
 
 
@@ -192,7 +202,7 @@ def motor_columns(functions: Sequence[int]) -> list[int]:
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
     count = _whole(parameters, "CA_ROTOR_COUNT")
-    return count if 0 < count <= MOST_ROTORS else _PX4_TYPES.get(_whole(parameters, "MAV_TYPE"), 0)
+    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole(parameters, "MAV_TYPE"), 0)
 
 
 def _driven(name: str, value: float) -> tuple[int, int | None]:
@@ -207,6 +217,36 @@ def _whole(parameters: Mapping[str, float], name: str) -> int:
     """A parameter as a whole number; 0, which tells nothing, where it is absent or damaged beyond any number."""
     value = parameters.get(name, 0.0)
     return int(value) if abs(value) < _LARGEST_WHOLE else 0
+
+
+def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: str = "") -> str:
+    """Says why a vehicle's outputs are not all rotors: it is a plane, a VTOL, a helicopter …; empty for a multirotor.
+
+    Args:
+        parameters: of the autopilot, by name.
+        mav_type: MAV_TYPE of its heartbeats; 0 for unknown.
+        firmware: of ArduPilot, such as Copter or Plane; empty for unknown.
+    """
+    kind = mav_type or _whole(parameters, "MAV_TYPE")
+    airframe = _OTHER_AIRFRAMES.get(_whole(parameters, "CA_AIRFRAME"))
+    frame = _OTHER_FRAMES.get(_whole(parameters, "FRAME_CLASS"))
+    which = (
+        f"MAV_TYPE {kind}" if kind and kind not in MULTIROTORS
+        else f"Ardu{firmware}" if firmware not in ("", "Copter")
+        else f"CA_AIRFRAME {airframe}" if airframe
+        else f"FRAME_CLASS {frame}" if frame
+        else "Q_ENABLE 1" if parameters.get("Q_ENABLE") == 1.0
+        else ""
+    )  # fmt: skip
+    return which and f"the vehicle calls itself {which}, no multirotor: its outputs are not used"
+
+
+def in_pulses(outputs: FloatArray) -> tuple[FloatArray, str]:
+    """Outputs (n, k) as pulse widths [us]: OneShot125's are an eighth; and what was done, for people."""
+    turning = outputs[outputs > 0.0]
+    if len(turning) and np.all(np.abs(np.quantile(turning, [0.05, 0.95]) * _ONESHOT125 - 1500.0) < 800.0):
+        return outputs * _ONESHOT125, "OneShot125, times 8"
+    return outputs, ""
 
 
 def active_outputs(pulses: FloatArray) -> list[int]:

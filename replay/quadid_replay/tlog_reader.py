@@ -16,13 +16,20 @@ from quadid_replay.esc_messages import extend_dialect
 from quadid_replay.frame_numbers import two_rows
 from quadid_replay.mavlink_decode import decode, intact
 from quadid_replay.mavlink_frames import Frames, read_frames
-from quadid_replay.motors import active_outputs, esc_columns, motor_outputs, px4_rotor_count
+from quadid_replay.motors import (
+    MULTIROTORS,
+    active_outputs,
+    esc_columns,
+    in_pulses,
+    motor_outputs,
+    no_multirotor,
+    px4_rotor_count,
+)
 from quadid_replay.tlog_messages import PREFERENCE, READERS, STATE_MESSAGES
 from quadid_replay.tlog_vehicle import Told, VehicleLog, vehicle_log
 
 _DIALECT = extend_dialect(ardupilotmega)
 _WANTED = {n: m for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS or m.msgname in STATE_MESSAGES}
-_ROTORCRAFT = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}
 _MOST_BACKWARDS = 10
 """Boot time that falls more often: no vehicle boots that often."""
 _MOST_SENDERS = 32
@@ -114,10 +121,10 @@ def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
 
 def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
     """Rotor speeds and outputs, each of the motors in their order."""
-    if vehicle.kind and vehicle.kind not in _ROTORCRAFT:
-        notes.append(f"the vehicle calls itself MAV_TYPE {vehicle.kind}, no multirotor: its outputs are not used")
+    if other := no_multirotor(vehicle.parameters, vehicle.kind):
+        notes.append(other)
         return []
-    rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or _ROTORCRAFT.get(vehicle.kind, 0)
+    rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or MULTIROTORS.get(vehicle.kind, 0)
     notes += [vehicle.changed] if vehicle.changed else []
     raw: list[RawChannel] = []
     for (signal, source), (t, values, refused) in vehicle.signals.items():
@@ -131,9 +138,10 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
             values = values[:, : told.max(initial=-1) + 1]
             found = motor_outputs(vehicle.parameters, rotors, values.shape[1], source, vehicle.ardupilot)
             notes += [found.problem] if found.problem else []
+            values, how = in_pulses(values) if signal == "servo" else (values, "")
             guessed = active_outputs(values) if signal == "servo" and not found.problem else []
             motors = found.columns or guessed
-            which = " ".join(str(i + 1) for i in motors) if signal == "servo" else "(normalized)"
+            which = " ".join(str(i + 1) for i in motors) + how if signal == "servo" else "(normalized)"
             if motors:
                 raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}", refused))
     order: Iterable[RawChannel] = sorted(raw, key=lambda r: "ACTUATOR" not in r.source)

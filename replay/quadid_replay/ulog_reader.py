@@ -24,12 +24,16 @@ from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.flight_modes import PX4, mode_changes
 from quadid_replay.frames import to_euler
 from quadid_replay.motors import (
+    DSHOT,
     MOST_ROTORS,
     PX4_BANKS,
     RPM,
+    UAVCAN,
     active_outputs,
     esc_columns,
+    in_pulses,
     motor_columns,
+    no_multirotor,
     px4_motor_outputs,
     px4_rotor_count,
 )  # fmt: skip
@@ -42,6 +46,8 @@ _TOPICS = frozenset((
     "esc_status", "vehicle_status", "vehicle_torque_setpoint", "vehicle_thrust_setpoint",
 ))  # fmt: skip
 _XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
+_UAVCAN_OUTPUTS = 3
+"""UAVCAN_ENABLE from which motors are on it."""
 _FEWEST_COMPARED = 20
 """Logged rows of motors that must show how the vehicle allocates."""
 _ALLOCATED_ALIKE = 0.005
@@ -73,9 +79,12 @@ def read_ulog(path: Path) -> Recording:
         *_simple(log, "velocity", "vehicle_local_position", ("vx", "vy", "vz"), "v_xy_valid"),
         *_simple(log, "position", "vehicle_local_position", ("x", "y", "z"), "xy_valid"),
         *_battery(log),
-        *fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0),
-        *_esc(log, notes),
     ]
+    if other := no_multirotor(log.parameters):
+        notes.append(other)
+    else:
+        raw += fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0)
+        raw += _esc(log, notes)
     recording = assemble(path.name, "ulog", raw, log.clock, notes, log.parameters)
     return replace(recording, modes=_modes(log))
 
@@ -254,21 +263,30 @@ def _motors_agree(log: _Log, moment: IntArray, thrust: FloatArray) -> bool:
 
 
 def _actuator_outputs(log: _Log) -> list[RawChannel]:
-    """Pulse widths; of the banks MAIN and AUX and several instances, the first whose motor columns look like pulses."""
+    """What goes to the ESCs; of the banks and several instances the first whose motor columns look like it.
+
+    Pulse widths, but with DShot or UAVCAN numbers up to their full command.
+    """
     count = px4_rotor_count(log.parameters)
+    full = DSHOT if log.parameters.get("DSHOT_CONFIG", 0.0) > 0.0 else None
+    if log.parameters.get("UAVCAN_ENABLE", 0.0) >= _UAVCAN_OUTPUTS:
+        full = UAVCAN
     for instance in range(4):
         key = ("actuator_outputs", instance)
         columns = tuple(f"output[{i}]" for i in range(16))
         if not _has(log, key, *columns):
             continue
-        values = _stack(log.topics[key], columns)
+        values, how = in_pulses(_stack(log.topics[key], columns))
+        pulses = values
+        if full is not None and np.max(values) <= full:  # made to look like pulses, to find those that vary
+            values, how, pulses = values / full, f"of {full:g}", 1000.0 + 1000.0 / full * values
         for bank in PX4_BANKS:
             motors = px4_motor_outputs(log.parameters, bank)
-            if motors and len(active_outputs(values[:, motors])) == len(motors):
-                return [_raw(log, "motor_command", key, values[:, motors], "timestamp", f"us, {bank}")]
-        motors = active_outputs(values)
+            if motors and len(active_outputs(pulses[:, motors])) == len(motors):
+                return [_raw(log, "motor_command", key, values[:, motors], "timestamp", f"{how or 'us'}, {bank}")]
+        motors = active_outputs(pulses)
         if motors and (not count or len(motors) >= count):
-            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], "timestamp", "us")]
+            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], "timestamp", how or "us")]
     return []
 
 

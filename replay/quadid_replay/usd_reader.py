@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IntArray
 from quadid.window import Recording
 from quadid_replay.clocks import LogClock
 from quadid_replay.columns import RawChannel, assemble
@@ -100,10 +100,14 @@ def read_usd(path: Path) -> Recording:
     clock = LogClock()
     raw: list[RawChannel] = []
     left: list[str] = []
-    for title, table in records.tables.items():
-        if title != "fixedFrequency" and not any(_holds(table, s) for s in SOURCES):
-            continue  # an event, such as a change of mode
-        t, accepted = clock.times(table["t"].astype(np.float64) * 1e-6)
+    tables = {  # the others are events, such as a change of mode
+        title: table for title, table in records.tables.items()
+        if title == "fixedFrequency" or any(_holds(table, s) for s in SOURCES)
+    }  # fmt: skip
+    times = _on_one_clock(tables, records.places, clock)
+    for title, table in tables.items():
+        t = times[title]
+        accepted = np.isfinite(t)
         rows, refused = table[accepted], len(t) - int(np.count_nonzero(accepted))
         used = {"id", "t"}
         for source in SOURCES:
@@ -122,6 +126,19 @@ def read_usd(path: Path) -> Recording:
         )
     notes = [*records.notes, *_partial(left)]
     return assemble(path.name, "usdlog", raw, clock, notes)
+
+
+def _on_one_clock(
+    tables: Mapping[str, NDArray[np.void]], places: Mapping[str, IntArray], clock: LogClock
+) -> dict[str, FloatArray]:
+    """Recording times [s] of each table's records: all stamps run through one clock, in file order."""
+    if not tables:
+        return {}
+    order = np.argsort(np.concatenate([places[title] for title in tables]))
+    mapped = np.empty(len(order))
+    mapped[order] = clock.times(np.concatenate([table["t"] for table in tables.values()])[order] * 1e-6)[0]
+    ends = np.cumsum([len(table) for table in tables.values()])
+    return dict(zip(tables, np.split(mapped, ends[:-1]), strict=True))
 
 
 def _holds(table: NDArray[np.void], source: Source) -> bool:

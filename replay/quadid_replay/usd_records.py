@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid.types import IntArray
 
 MOST_TYPES, MOST_VARIABLES, LONGEST_NAME = 256, 512, 128
 _NUMBERS = dict(zip("bBhHiIqQfd", ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"), strict=True))
@@ -30,10 +31,12 @@ class UsdRecords:
 
     Attributes:
         tables: records by event type's name: structured arrays with ``t`` [µs] and the variables by their full name.
+        places: where in the file each of these records stands.
         notes: what is wrong with the file, in sentences.
     """
 
     tables: dict[str, NDArray[np.void]] = field(default_factory=dict)
+    places: dict[str, IntArray] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -43,6 +46,7 @@ class _Declared:
     def __init__(self, name: str, layout: np.dtype[np.void]) -> None:
         self.name, self.layout = name, layout
         self.parts: list[NDArray[np.void]] = []
+        self.places: list[IntArray] = []
 
 
 def collect_usd_records(data: bytes, name: str) -> UsdRecords:
@@ -70,10 +74,12 @@ def collect_usd_records(data: bytes, name: str) -> UsdRecords:
         if len(run) == 0:
             break
         declared.parts.append(run)
+        declared.places.append(at + declared.layout.itemsize * np.arange(len(run), dtype=np.int64))
         at += len(run) * declared.layout.itemsize
     if at < end:
         found.notes.append(f"{end - at} bytes at the end belong to no record")
     found.tables = {d.name: np.concatenate(d.parts) for d in types.values() if d.parts}
+    found.places = {d.name: np.concatenate(d.places) for d in types.values() if d.parts}
     return found
 
 

@@ -22,6 +22,11 @@ from quadid_replay.airframes import Frame, frame_of
 _MASS, _ARM, _MAX_SPEED = 1.5, 0.25, 900.0
 _BLADE = 0.5
 """Propeller radius over arm, for first guesses."""
+_RADIUS = (0.55, 1.0)
+"""Propeller radius over the largest that does not touch its neighbour's."""
+_THRUST = (0.006, 0.03)
+"""Thrust over air density, disc area and squared tip speed, of propellers made for it."""
+_AIR = 1.2
 
 
 class _Command(NamedTuple):
@@ -65,7 +70,8 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
         f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
         *_rotor_lines(frame, arm),
         f"command: {command.line}",
-        *_guesses(frame, weight, b),
+        *_guesses(frame, weight, b, _possible_thrust(frame) if channel is not None and _known_size(frame, arm) and
+                  channel.name == "rotor_speed" else None),
         *_effects(recording),
         *(f"# {note}" for note in notes),
         *_remarks(recording),
@@ -110,12 +116,32 @@ def _hover_thrust(recording: Recording, channel: Channel | None, command: _Comma
     return mass * GRAVITY / squares
 
 
-def _guesses(frame: Frame, mass: float, b: float) -> list[str]:
+def _known_size(frame: Frame, arm: float | None) -> bool:
+    return arm is not None or not frame.scaled
+
+
+def _possible_thrust(frame: Frame) -> tuple[float, float]:
+    """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have: of its size, not of the logged speeds,
+    which they are to judge.
+    """
+    place = np.array([(r.x, r.y) for r in frame.rotors])
+    apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)
+    radius = 0.5 * float(np.min(apart[apart > 0.1 * np.max(apart)]))  # those of one axle are none
+    low, high = (c * _AIR * np.pi * (share * radius) ** 4 for c, share in zip(_THRUST, _RADIUS, strict=True))
+    return low, high
+
+
+def _bounded(b: float, low: float, high: float) -> str:
+    bounds = f"[{0.995 * low:.3g}, {1.005 * high:.3g}]"
+    return f"  b: {{initial: {min(max(b, low), high):.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
+
+
+def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] | None) -> list[str]:
     arm = float(np.mean([np.hypot(r.x, r.y) for r in frame.rotors]))
     inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
     return [
         "parameters:             # first guesses: docs/new-vehicle.md",
-        f"  b: {b:.3g}",
+        f"  b: {b:.3g}" if possible is None else _bounded(b, *possible),
         f"  d: {{initial: {b * blade / 6.0:.3g}, bounds: [{b * blade / 60.0:.3g}, {b * blade / 0.6:.3g}]}}",
         f"  J_xx: {inertia:.3g}",
         f"  J_yy: {inertia:.3g}",

@@ -231,7 +231,7 @@ MISTAKES = (
     Mistake(
         "health of a flight that did not fly",
         lambda p: ("health", p.still(), "--baseline", p.log, "--vehicle", "pelican"),
-        "not a flight",
+        "steady flight",
         3,
     ),
     Mistake("no vehicle given", lambda p: ("identify", p.log), "--vehicle"),
