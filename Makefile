@@ -80,7 +80,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: findings autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) studies.truth --out docs/results
 
@@ -92,6 +92,10 @@ cases: venv ## the independent simulated cases, diagnosed
 
 foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression and networks (half an hour)
 	$(STUDY) studies.foreign --out docs/results
+
+DATA ?= $(or $(QUADID_DATA),../shared/data)
+findings: venv ## every input on which the product failed once: answers now, right or wrong (a minute; DATA=DIR)
+	$(STUDY) studies.findings --data $(DATA)
 
 peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.tools' recipe, Kalman filters; hours)
 	$(STUDY) studies.peers --out docs/results

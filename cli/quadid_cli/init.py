@@ -37,5 +37,6 @@ def init(
     console = terminal.console(quiet=json == "-")
     console.print(f"Written: {path}", soft_wrap=True)
     if done.result["fill_in"]:
-        console.print(f"To fill in: {', '.join(done.result['fill_in'])}", soft_wrap=True)
+        blanks = ", ".join(done.result["fill_in"])
+        console.print(f"To fill in: {blanks} (then delete the words FILL IN)", soft_wrap=True)
     console.print(f"Next: quadid inspect LOG --vehicle {path.name}", soft_wrap=True)

@@ -155,7 +155,8 @@ def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
     value = _rounded(p.value)
     measured = p.status is Status.IDENTIFIED or (p.status is Status.PRIOR_DOMINATED and p.measured_before)
     known = measured and math.isfinite(p.sigma) and p.sigma > 0.0
-    bounds = given.bounds and (min(given.bounds[0], value), max(given.bounds[1], value))
+    given_bounds = given.bounds if measured else given.limits  # what is not known does not move the next fit's box
+    bounds = given_bounds and (min(given_bounds[0], value), max(given_bounds[1], value))
     return ParameterPrior(initial=value, bounds=bounds, sigma=_rounded(p.sigma) if known else None)
 
 

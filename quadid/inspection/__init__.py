@@ -82,7 +82,9 @@ def _readings(log: Log) -> list[Check | None]:
     if log.vehicle is None:
         return []
     dead = readings_check(log.recording, log.vehicle, log.spans)
-    return [dead] if dead is not None else [hover_check(log.recording, log.vehicle, log.spans)]
+    if dead is not None and dead.verdict is CheckResult.ERROR:
+        return [dead]
+    return [dead, hover_check(log.recording, log.vehicle, log.spans)]
 
 
 def _time_and_order(log: Log) -> list[Check]:

@@ -67,6 +67,9 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         return check(
             CheckResult.ERROR, slip, f"multiply rotor speeds by {factors}, or use the vehicle file of this log"
         )
+    root = ThrustModel.stated(vehicle).total(np.sqrt(np.abs(speeds)))
+    if low <= guess.initial * vehicle.mass * GRAVITY / max(float(np.mean(root)), 1e-300) <= high:
+        return check(CheckResult.ERROR, f"{message}: speeds seem to be squared", "take their square roots")
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
     return check(CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)

@@ -22,6 +22,8 @@ _BIN = 0.5
 """Means over this long [s] are compared: fast motion has passed by then."""
 _DEAD, _DEAD_SHARE, _IDLE_SHARE = 0.1, 0.05, 0.5
 """A rotor below this share of the median speed for this share of the flight is dead; a command may rest longer."""
+_LEVELS = 40
+"""Rotors that read fewer different values may be too coarse."""
 _STUCK = 1.0
 """A rotor that holds one value this long [s] while the vehicle moves is stuck."""
 _IMBALANCE, _UNBALANCED = 0.72, 0.1
@@ -36,13 +38,14 @@ Bins = tuple[FloatArray, BoolArray]
 """Means (m, columns) and which bins hold samples (m,)."""
 
 
+Problem = tuple[str, dict[str, float]]
 _NAME = "rotor_speed"
 _FIX = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
 _COMMANDED = "these are commands: a damaged rotor is driven harder, which `quadid health` measures; or they mean thrust"
 
 
 def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
-    """A rotor that reads nothing, or holds one value; None for none, and where none can be told."""
+    """A rotor that reads nothing or holds one value, all that read the same, coarse steps; None for none of these."""
     try:
         signal = rotor_signal(recording, vehicle)
     except QuadidError:
@@ -51,8 +54,29 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     if np.count_nonzero(inside) < 20:
         return None
     most = _IDLE_SHARE if _commanded(signal, recording) else _DEAD_SHARE
-    problem = _dead(signal.values[inside], most) or _stuck(signal, recording, inside)
+    values = signal.values[inside]
+    step = _coarse(values)
+    if step:
+        message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
+        return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
+    problem = _dead(values, most) or _same(values) or _stuck(signal, recording, inside)
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
+
+
+def _coarse(speeds: FloatArray) -> float:
+    """Step [rad/s] between the few values that rotors read; 0 where it is finer than half their spread."""
+    levels = [np.unique(column) for column in speeds.T]
+    if max(map(len, levels)) > _LEVELS or min(map(len, levels)) < 3:
+        return 0.0
+    step = float(np.median(np.concatenate([np.diff(values) for values in levels])))
+    return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
+
+
+def _same(speeds: FloatArray) -> Problem | None:
+    """Columns that are one: their differences, which turn the vehicle, are lost."""
+    if speeds.shape[1] < 3 or np.ptp(speeds) == 0.0 or np.any(speeds != speeds[:, :1]):
+        return None
+    return "all rotor columns are the same: one was written for all", {"columns": float(speeds.shape[1])}
 
 
 def _commanded(signal: RotorSignal, recording: Recording) -> bool:
@@ -93,9 +117,6 @@ def _means(t: FloatArray, values: FloatArray, edges: FloatArray, spans: Spans) -
     sums = [np.bincount(row, column, minlength=len(edges) + 1)[1:-1] for column in values.T]
     inside = np.any([(edges[:-1] >= a) & (edges[1:] <= b) for a, b in spans], axis=0)
     return np.column_stack(sums) / np.maximum(count, 1)[:, None], np.asarray(inside & (count > 2))
-
-
-Problem = tuple[str, dict[str, float]]
 
 
 def _dead(speeds: FloatArray, most: float) -> Problem | None:

@@ -32,6 +32,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 EULER = ("phi", "theta", "psi")
 _ROTOR = {"rotor_speed": re.compile(r"w([1-9]\d?)"), "motor_command": re.compile(r"u([1-9]\d?)")}
+_MOTOR_LIKE = re.compile(r"(?:pwm|motor|mot|esc|rpm|cmd|servo|out|m)_?([1-9]\d?)", re.IGNORECASE)
 _SLOWEST_ROW, _FEW_ROWS = 0.9, 20
 """Slower rows [s] say nothing about a flight; of fewer rows nothing is told."""
 _LINES = 4096
@@ -54,7 +55,11 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     table, notes = _table(path, len(names), delimiter)
     if len(table) == 0:
         raise _no_rows(path, names, delimiter)
-    if ignored:
+    motors = [m for name in ignored if (m := _MOTOR_LIKE.fullmatch(name))]
+    if motors:
+        given = ",".join(f"{m[0]}=u{m[1]}" for m in motors[:8])
+        notes.append(f"columns that look like motors are not used: --columns {plain(given)} (w1 … for speeds [rad/s])")
+    elif ignored:
         notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
     _check_seconds(table[:, names.index("t")], path.name)
     clock = LogClock()

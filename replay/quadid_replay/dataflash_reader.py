@@ -144,14 +144,14 @@ def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
 
 
 def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
-    """Returns the rows of the first instance (or the only one) with accepted stamps; None when columns are missing."""
+    """Returns the rows of instance 0 (of batteries the first) with an accepted stamp; None when columns are missing."""
     if name not in times or not index.has(name, *columns):
         return None
     rows = np.isfinite(times[name])
     for instance in ("I", "Instance", "Inst", "C"):
         if index.has(name, instance):
             number = index.column(name, instance)
-            rows &= number == np.min(number, initial=255)
+            rows &= number == (np.min(number, initial=255) if name == "BAT" else 0)
     return _Source(name, times[name][rows], rows, int(np.count_nonzero(~np.isfinite(times[name]))))
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
-import json
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
-from studies.findings.rows import FINDINGS, Answer, Finding
+from studies.findings.rows import FINDINGS, Finding
+from studies.findings.run import answer_of
 
 
 def main() -> int:
@@ -44,24 +41,6 @@ def judged(finding: Finding, data: Path) -> tuple[bool, str, str]:
         return bool(finding.right(answer)), line.replace("|", "/"), finding.numbers(answer).replace("|", "/")
     except (KeyError, TypeError):  # the answer lacks what is looked for
         return False, line.replace("|", "/"), ""
-
-
-def answer_of(arguments: Sequence[str | Path]) -> Answer:
-    """Exit code, words and JSON of a command, run as a user does."""
-    from quadid_cli.main import app_main
-
-    said, kept = io.StringIO(), sys.argv
-    with tempfile.TemporaryDirectory() as folder:
-        result = Path(folder, "answer.json")
-        wants = [] if arguments[0] == "init" else ["--json", str(result)]
-        sys.argv = ["quadid", *map(str, arguments), *wants]
-        try:
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                code = app_main()
-        finally:
-            sys.argv = kept
-        data = json.loads(result.read_text(encoding="utf-8")) if result.exists() else {}
-    return code, " ".join(said.getvalue().split()), data
 
 
 if __name__ == "__main__":

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import csv
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-Answer = tuple[int, str, Mapping[str, Any]]
-"""Exit code, what was said (stdout and stderr), and the JSON."""
+from studies.findings.run import Answer, answer_of
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,6 @@ def initialised(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
     """Inspects a log with the vehicle file that `init` makes of it."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
-        from studies.findings.__main__ import answer_of
-
         answer_of(["init", "made", "--from", folder / log, "--mass", "1.3", "--arm", "0.21", "--out", out])
         return ["inspect", folder / log, "--vehicle", out / "made.yaml"]
 
@@ -103,9 +102,6 @@ def script(log: str, vehicle: str) -> Callable[[Path, Path], Sequence[str | Path
     """Runs the folder's `mk.py`, and inspects what it writes."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
-        import subprocess
-        import sys
-
         shutil.copy(folder / "mk.py", out)
         subprocess.run([sys.executable, "mk.py"], cwd=out, check=True)
         return ["inspect", out / log, *_vehicle(folder, vehicle)]

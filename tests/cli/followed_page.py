@@ -37,5 +37,5 @@ def follow(page: Path, quadid: Cli, fill_in: Callable[[str], str]) -> dict[str, 
         told[name] = run.data
         if name == "init":
             file = Path("my_quad.yaml")
-            file.write_text(fill_in(file.read_text(encoding="utf-8")), encoding="utf-8")
+            file.write_text(fill_in(file.read_text(encoding="utf-8")).replace("FILL IN", ""), encoding="utf-8")
     return told

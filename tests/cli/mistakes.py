@@ -103,6 +103,30 @@ class Place:
         rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
         return self.vehicle(rotors=[{**r, "position": [factor * x for x in r["position"]]} for r in rotors])
 
+    def spins(self) -> Path:
+        """A Pelican file whose rotors all turn the other way."""
+        rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
+        return self.vehicle(rotors=[{**r, "spin": -r["spin"]} for r in rotors])
+
+    def template(self) -> Path:
+        """A vehicle file as `quadid init` writes it."""
+        text = Vehicle.shipped("pelican").to_yaml()
+        return self.bytes("vehicle.yaml", text.replace("mass: 1.3", "mass: 1.3  # FILL IN: weigh it").encode())
+
+    def of_rotors(self, change: Callable[[Rows], Rows]) -> Path:
+        """The flight with rotor speeds changed."""
+        names, rows = self.table()
+        places = [names.index(f"w{k}") for k in (1, 2, 3, 4)]
+        rows[:, places] = change(rows[:, places])
+        return self.write(names, rows)
+
+    def late(self, columns: str, count: int) -> Path:
+        """The flight with some columns so many rows later."""
+        names, rows = self.table()
+        places = [names.index(n) for n in columns.split()]
+        rows[count:, places] = rows[:-count, places].copy()
+        return self.write(names, rows)
+
     def degrees(self) -> Path:
         """The flight with Euler angles in degrees in place of quaternions."""
         names, rows = self.table()
@@ -205,6 +229,19 @@ MISTAKES = (
     Mistake("arms in millimetres", of(lambda p: p.arms(1000.0)), "arm|mm|position"),
     Mistake("arms ten times too short", of(lambda p: p.arms(0.1)), "rotors 0.021 m"),
     Mistake("arms in centimetres", of(lambda p: p.arms(100.0)), "centimetres"),
+    Mistake("vertical velocity upwards", fit(lambda p: p.scaled("vz", -1.0)), "points up"),
+    Mistake("height in place of z", fit(lambda p: p.scaled("z", -1.0)), "points up"),
+    Mistake("spins reversed", of(lambda p: p.spins()), "negate the spins"),
+    Mistake("rotor speeds 60 ms late", fit(lambda p: p.late("w1 w2 w3 w4", 3)), "lags its effect"),
+    Mistake("one rotor column four times", fit(lambda p: p.moved("w2 w3 w4", "w1 w1 w1")), "the same"),
+    Mistake("squared rotor speeds", fit(lambda p: p.of_rotors(np.square)), "squared"),
+    Mistake("rotor speeds in steps", fit(lambda p: p.of_rotors(lambda w: 50.0 * np.round(w / 50.0))), "steps of 50", 0),
+    Mistake(
+        "motor columns called pwm1",
+        fit(lambda p: p.named(w1="pwm1", w2="pwm2", w3="pwm3", w4="pwm4")),
+        "pwm1=u1",
+    ),
+    Mistake("a template that was not filled in", of(lambda p: p.template()), "FILL IN"),
     Mistake("no mass", of(lambda p: p.vehicle(mass=None)), "no 'mass'"),
     Mistake("tabs in a vehicle file", of(lambda p: p.bytes("vehicle.yaml", b"name: x\n\tmass: 1\n")), "line 2"),
     Mistake("a vehicle file of another size", of(lambda p: "crazyflie"), "vehicle file of this log"),

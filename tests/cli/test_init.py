@@ -18,6 +18,8 @@ def test_a_template_is_a_vehicle_and_says_what_to_fill_in(inside: Cli, tmp_path:
     vehicle = Vehicle.from_yaml(Path(run.data["file"]).read_text(encoding="utf-8"))
     assert (vehicle.name, vehicle.mass) == ("my quad", 0.9)
     assert run.data["fill_in"] == ["rotors"]
+    refused = one_line(inside("identify", "any.csv", "--vehicle", run.data["file"]), 2)
+    assert "rotors is a guess of `quadid init`" in refused
     assert "is there already" in one_line(inside("init", "my quad", "--out", tmp_path), 2)
 
 

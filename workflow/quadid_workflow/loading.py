@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
     from quadid.window import Recording, Window
 
+_FILL_IN = "FILL IN"
+"""Marks the guesses of `quadid init`."""
 GRID = 50.0
 """Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
@@ -97,7 +99,15 @@ def load_vehicle(name: str) -> Vehicle:
     except OSError as error:
         raise VehicleError(f"{name} cannot be read ({error.strerror})", fix="check its permissions") from error
     try:
-        return Vehicle.from_yaml(data.decode("utf-8"), path.name)
+        text = data.decode("utf-8")
+        blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if _FILL_IN in line]
+        if blanks:
+            raise VehicleError(
+                f"{name}: {' and '.join(blanks)} {'is a guess' if len(blanks) == 1 else 'are guesses'} of "
+                f"`quadid init`, marked {_FILL_IN}", "measured values",
+                f"write your vehicle's and delete the words {_FILL_IN}",
+            )  # fmt: skip
+        return Vehicle.from_yaml(text, path.name)
     except UnicodeDecodeError as error:
         raise VehicleError(f"{name}: not text", "a YAML file", "if this is the log, pass it as LOG") from error
 

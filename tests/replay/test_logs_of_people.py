@@ -1,0 +1,188 @@
+"""Logs as people have them: flights with closed throttle and punches, single impossible readings, other outputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quadid_replay import open_log
+from quadid_replay.airframes import frame_of
+from quadid_replay.columns import RawChannel, clean_channel
+from quadid_replay.motors import in_pulses, motor_columns, no_multirotor
+from quadid_replay.vehicle_from_log import vehicle_text
+
+import quadid
+from quadid.inspection import Check, CheckResult, inspect
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+from quadid.window import Channel, Recording
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A Pelican of 30 s with velocity and position."""
+    path = tmp_path_factory.mktemp("flight") / "flight.csv"
+    quadid.simulate(seconds=30.0, seed=5, extras=("velocity", "position")).save(path)
+    return open_log(path)
+
+
+def with_channel(recording: Recording, name: str, values: FloatArray) -> Recording:
+    channel = recording.channels[name]
+    changed = Channel(name, channel.t, values, channel.source)
+    return replace(recording, channels={**recording.channels, name: changed})
+
+
+def verdict(recording: Recording, name: str, vehicle: Vehicle | None = None) -> Check:
+    found = inspect(recording, vehicle or Vehicle.shipped("pelican"))
+    return next(c for c in found.checks if c.name == name)
+
+
+def names(recording: Recording, vehicle: Vehicle | None = None) -> list[str]:
+    """Of the checks that were made."""
+    return [c.name for c in inspect(recording, vehicle or Vehicle.shipped("pelican")).checks]
+
+
+def test_commands_that_are_zero_together_are_a_closed_throttle(data_dir: Path) -> None:
+    folder = data_dir / "arpl"
+    vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
+    recording = open_log(folder / "log15.csv")
+    commands = recording.channels["motor_command"].values.copy()
+    (first, last), *_ = inspect(recording, vehicle).flying
+    t = recording.channels["motor_command"].t
+    for k in range(12):
+        at = first + (k + 0.5) * (last - first) / 12.0
+        commands[(t > at) & (t < at + 0.01 * (last - first))] = 0.0
+    found = inspect(with_channel(recording, "motor_command", commands), vehicle)
+    assert not any("dead" in c.message for c in found.checks)
+
+
+def test_one_rotor_that_reads_nothing_is_dead(flight: Recording) -> None:
+    speeds = flight.channels["rotor_speed"].values.copy()
+    speeds[200:500, 2] = 0.0
+    found = verdict(with_channel(flight, "rotor_speed", speeds), "rotor_speed")
+    assert "rotor 3 reads nothing" in found.message
+
+
+@pytest.mark.parametrize("wrong", [65535.0 * 2.0 * np.pi / 60.0, 0.0])
+def test_single_impossible_readings_are_dropped_and_counted(flight: Recording, wrong: float) -> None:
+    channel = flight.channels["rotor_speed"]
+    speeds = channel.values.copy()
+    speeds[50::100, 1] = wrong
+    cleaned = clean_channel(RawChannel("rotor_speed", channel.t, speeds, "made"))
+    assert cleaned is not None
+    assert cleaned.faults == {"impossible_rotor_speed": 15}
+    np.testing.assert_array_equal(cleaned.values, np.delete(channel.values, np.s_[50::100], axis=0))
+
+
+def test_a_signal_that_moves_keeps_every_reading(flight: Recording) -> None:
+    for name in ("crash", "noise", "start"):
+        rng, n = np.random.default_rng(0), 400
+        speeds = {
+            "crash": np.where(np.arange(n) < 200, 400.0, 0.0), "noise": 400.0 + 200.0 * rng.standard_normal(n),
+            "start": np.clip(np.arange(n) - 100.0, 0.0, 200.0),
+        }[name][:, None] * np.ones(4)  # fmt: skip
+        cleaned = clean_channel(RawChannel("rotor_speed", 0.02 * np.arange(n), speeds, "made"))
+        assert cleaned is not None
+        assert len(cleaned.t) == n, name
+
+
+def test_punches_and_falls_are_part_of_the_flight() -> None:
+    """Hover at a quarter of full command with climbs at 0.6 and falls at idle, between two rests on the ground."""
+    t = 0.02 * np.arange(2000)
+    command = np.full(len(t), 0.25)
+    command[(t % 8.0 > 6.5)] = 0.6
+    command[(t % 8.0 > 4.0) & (t % 8.0 < 5.5)] = 0.02
+    ground = (t < 4.0) | (t > 36.0)
+    command[ground] = 0.0
+    rng = np.random.default_rng(1)
+    force = np.where(ground, -9.81, -9.81 * (command / 0.25) ** 2)
+    accel = np.column_stack([0.1 * rng.standard_normal((len(t), 2)), force + 0.1 * rng.standard_normal(len(t))])
+    made = {
+        "gyro": Channel("gyro", t, 0.1 * rng.standard_normal((len(t), 3)), "made"),
+        "accel": Channel("accel", t, accel, "made"),
+        "motor_command": Channel("motor_command", t, np.tile(command[:, None], 4), "made"),
+    }
+    found = inspect(Recording("made", "csv", made))
+    ((begin, end),) = found.flying
+    assert begin == pytest.approx(4.0, abs=0.3)
+    assert end == pytest.approx(36.0, abs=0.3)
+    assert next(c for c in found.checks if c.name == "gravity").verdict is CheckResult.OK
+
+
+def test_vertical_signs(flight: Recording) -> None:
+    up = flight.channels["velocity"].values * [1.0, 1.0, -1.0]
+    assert "points up" in verdict(with_channel(flight, "velocity", up), "velocity_attitude").message
+    high = flight.channels["position"].values * [1.0, 1.0, -1.0]
+    assert "points up" in verdict(with_channel(flight, "position", high), "position_velocity").message
+
+
+def test_after_an_error_nothing_later_is_asked(flight: Recording) -> None:
+    degrees = with_channel(flight, "gyro", np.degrees(flight.channels["gyro"].values))
+    assert not {"hover", "motor_order", "rotor_timing", "geometry"} & {*names(degrees)}
+    swapped = with_channel(flight, "rotor_speed", flight.channels["rotor_speed"].values[:, [1, 0, 2, 3]])
+    made = names(swapped)
+    assert "rotor_speed" not in made
+    assert verdict(swapped, "motor_order").fix.endswith("columns 2, 1, 3, 4")
+
+
+def test_a_late_rotor_signal_is_no_other_order(flight: Recording) -> None:
+    speeds = flight.channels["rotor_speed"]
+    late = Channel("rotor_speed", speeds.t + 0.06, speeds.values, speeds.source)
+    made = replace(flight, channels={**flight.channels, "rotor_speed": late})
+    assert "reorder" not in " ".join(c.fix for c in inspect(made, Vehicle.shipped("pelican")).checks)
+    assert verdict(made, "rotor_timing").verdict is CheckResult.ERROR
+
+
+def test_held_readings_count_at_the_rate_at_which_they_change(flight: Recording) -> None:
+    speeds = flight.channels["rotor_speed"].values
+    held = with_channel(flight, "rotor_speed", speeds[np.arange(len(speeds)) // 5 * 5])
+    assert "10 Hz is too slow" in verdict(held, "motor_order").message
+
+
+@pytest.mark.parametrize("factor", [0.1, 7.0, 60.0 / (2.0 * np.pi)])
+def test_init_bounds_the_thrust_coefficient_by_the_size_of_the_frame(data_dir: Path, factor: float) -> None:
+    """Its value once came from the very speeds that it had to judge: any scale was right."""
+    log = open_log(data_dir / "ardupilot_sitl" / "x.bin")
+    wrong = with_channel(log, "rotor_speed", factor * log.channels["rotor_speed"].values)
+    made = Vehicle.from_yaml(vehicle_text(wrong, "mine", mass=3.0, arm=0.35))
+    said = verdict(wrong, "hover", made)
+    assert said.verdict in (CheckResult.ERROR, CheckResult.WARNING)
+    assert "rotor speeds" in said.fix
+    right = Vehicle.from_yaml(vehicle_text(log, "mine", mass=3.0, arm=0.35))
+    assert verdict(log, "hover", right).verdict is CheckResult.OK
+
+
+def test_betaflight_says_which_way_its_propellers_turn() -> None:
+    spins = [
+        [r.spin for r in frame.rotors] for told in (0.0, 1.0)
+        if (frame := frame_of({"yaw_motors_reversed": told}, 0.1)) is not None
+    ]  # fmt: skip
+    assert spins == [[-1, 1, 1, -1], [1, -1, -1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "kind", "firmware", "word"),
+    [
+        ({}, 1, "", "MAV_TYPE 1"), ({"MAV_TYPE": 22.0}, 0, "", "MAV_TYPE 22"), ({}, 0, "Plane", "ArduPlane"),
+        ({"CA_AIRFRAME": 2.0}, 0, "", "VTOL"), ({"FRAME_CLASS": 6.0}, 2, "Copter", "helicopter"),
+        ({"Q_ENABLE": 1.0}, 0, "", "Q_ENABLE"), ({"MAV_TYPE": 2.0, "CA_AIRFRAME": 0.0}, 0, "", ""),
+        ({"FRAME_CLASS": 1.0}, 13, "Copter", ""), ({}, 0, "", ""),
+    ],
+)  # fmt: skip
+def test_what_is_no_multirotor(parameters: dict[str, float], kind: int, firmware: str, word: str) -> None:
+    said = no_multirotor(parameters, kind, firmware)
+    assert (word in said) if word else said == ""
+
+
+def test_eighths_of_pulses() -> None:
+    pulses = np.array([[0.0, 1000.0, 1500.0, 1900.0]] * 30)
+    np.testing.assert_array_equal(in_pulses(pulses)[0], pulses)
+    np.testing.assert_array_equal(in_pulses(pulses / 8.0)[0], pulses)
+
+
+def test_motors_by_function() -> None:
+    assert motor_columns([103, 0, 101, 102]) == [2, 3, 0]
+    assert motor_columns([101, 103]) == []
+    assert motor_columns([0, 0]) == []
