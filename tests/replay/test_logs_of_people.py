@@ -83,17 +83,17 @@ def test_a_signal_that_moves_keeps_every_reading(flight: Recording) -> None:
             "crash": np.where(np.arange(n) < 200, 400.0, 0.0), "noise": 400.0 + 200.0 * rng.standard_normal(n),
             "start": np.clip(np.arange(n) - 100.0, 0.0, 200.0),
         }[name][:, None] * np.ones(4)  # fmt: skip
-        cleaned = clean_channel(RawChannel("rotor_speed", 0.02 * np.arange(n), speeds, "made"))
+        cleaned = clean_channel(RawChannel("rotor_speed", np.linspace(0.0, 0.02 * (n - 1), n), speeds, "made"))
         assert cleaned is not None
         assert len(cleaned.t) == n, name
 
 
 def test_punches_and_falls_are_part_of_the_flight() -> None:
     """Hover at a quarter of full command with climbs at 0.6 and falls at idle, between two rests on the ground."""
-    t = 0.02 * np.arange(2000)
+    t = np.linspace(0.0, 39.98, 2000)
     command = np.full(len(t), 0.25)
     command[(t % 8.0 > 6.5)] = 0.6
-    command[(t % 8.0 > 4.0) & (t % 8.0 < 5.5)] = 0.02
+    command[(t % 8.0 > 5.0) & (t % 8.0 < 6.0)] = 0.02
     ground = (t < 4.0) | (t > 36.0)
     command[ground] = 0.0
     rng = np.random.default_rng(1)
