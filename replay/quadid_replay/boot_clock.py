@@ -9,7 +9,7 @@ after the other, and a slow or shared link draws them out: each of them shows ho
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
@@ -21,11 +21,8 @@ MOST_WAITING = 4096
 """Messages without a stamp that wait for one; more are given up."""
 
 
-class Placed(NamedTuple, Generic[T]):
-    """An item and its time [s] on the boot clock; None where nothing tells it."""
-
-    item: T
-    time: float | None
+Placed: TypeAlias = tuple[T, float | None]
+"""An item and its time [s] on the boot clock; None where nothing tells it."""
 
 
 class BootClock(Generic[T]):
@@ -49,10 +46,10 @@ class BootClock(Generic[T]):
         if self.newest is not None and self.newest - FARTHEST <= time <= self.newest:
             if time >= self.newest - MOMENT:
                 self._newest_received = received
-            return [Placed(item, time)]
-        placed = self._release(time)
+            return [(item, time)]
+        placed = self._release(time) if self._waiting else []
         self.newest, self._newest_received = time, received
-        return [*placed, Placed(item, time)]
+        return [*placed, (item, time)]
 
     def unstamped(self, item: T, received: float) -> list[Placed[T]]:
         """Takes a message without a stamp, which came after `received` [s]; returns those that waited too long."""
@@ -65,7 +62,7 @@ class BootClock(Generic[T]):
         return self._release(None)
 
     def _release(self, following: float | None) -> list[Placed[T]]:
-        placed = [Placed(item, self._between(later, following)) for item, later in self._waiting]
+        placed: list[Placed[T]] = [(item, self._between(later, following)) for item, later in self._waiting]
         self._waiting.clear()
         return placed
 

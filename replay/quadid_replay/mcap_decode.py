@@ -1,8 +1,8 @@
-"""From the messages of an MCAP to columns of numbers: a batch at a time where nothing but numbers changes.
+"""From the messages of an MCAP to columns of numbers.
 
-Messages are taken in batches.  Where a topic keeps its layout throughout a batch (`cdr_blocks.BlockReader`), its
-numbers are read column by column, otherwise message by message, which is slower and gives the same numbers bit for bit;
-so it is with stamps and the clock they follow.
+Messages are taken in batches.  Those of a topic that keeps its layout (`cdr_blocks.BlockReader`) are read at once,
+column by column; where it changes within a batch, each half is read by itself, down to a single message, which the
+library decodes and the layout is learnt from.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ Message = tuple[int, int, bytes]
 """Channel id, log time [ns], payload."""
 ColumnsOf = dict[tuple[int, str], Columns]
 
-FIRST_BATCH, LARGEST_BATCH = 64, 8192
-"""Messages in the first batch, from which layouts are learnt; each further one holds twice as many, up to the most."""
-BATCH_BYTES = 8 << 20
-"""A batch ends when its payloads have this many bytes."""
+BATCH, BATCH_BYTES = 8192, 8 << 20
+"""Messages in a batch at most, and bytes of their payloads at which it ends."""
 _EPOCH_NS = 10**17
 """Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
 _OTHER_CLOCK = 3600.0
@@ -128,13 +126,13 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) 
 
 def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
     batch: list[Message] = []
-    most, size = FIRST_BATCH, 0
+    size = 0
     for message in messages:
         batch.append(message)
         size += len(message[2])
-        if len(batch) >= most or size >= BATCH_BYTES:
+        if len(batch) >= BATCH or size >= BATCH_BYTES:
             yield batch
-            batch, size, most = [], 0, min(2 * most, LARGEST_BATCH)
+            batch, size = [], 0
     if batch:
         yield batch
 
@@ -155,10 +153,7 @@ def _add_batch(batch: list[Message], sources: Mapping[int, Source], columns: Col
     parts: list[_Part] = []
     for number in dict.fromkeys(numbers.tolist()):
         source, rows = sources[number], np.flatnonzero(numbers == number)
-        data = [batch[row][2] for row in rows]
-        parts += _read_at_once(number, source, rows, data, stamped) or _read_each(
-            number, source, rows, data, stamped, decoded
-        )
+        parts += _read(number, source, rows, [batch[row][2] for row in rows], stamped, decoded)
     groups = ["header" if sources[number].layout is not None else "px4" for number in numbers[decoded].tolist()]
     times = np.full(len(batch), np.nan)
     if groups:
@@ -176,31 +171,25 @@ def _add_batch(batch: list[Message], sources: Mapping[int, Source], columns: Col
     return failed
 
 
-def _read_at_once(number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray) -> list[_Part]:
-    """Reads all messages of a topic by columns; nothing where that would not be the same as one by one."""
+def _read(
+    number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray, decoded: BoolArray
+) -> list[_Part]:
+    """Reads messages of a topic, the `rows` of a batch; `decoded` becomes False where that is not possible."""
     read = source.layout.read_many(data) if source.layout is not None else None
     signals = None if read is None else source.columns.pick(read.blocks, read.extra)
-    if read is None or signals is None:
-        return []
-    stamped[rows, 0], stamped[rows, 1] = read.seconds, read.nanoseconds
-    return [_Part((number, name), order, rows, values) for order, (name, values) in enumerate(signals)]
-
-
-def _read_each(
-    number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray,
-    decoded: BoolArray,
-) -> list[_Part]:  # fmt: skip
-    """Reads the messages of a topic one by one; `decoded` becomes False where that was not possible."""
-    parts = []
-    for row, one in zip(rows, data, strict=True):
+    if read is not None and signals is not None:
+        stamped[rows, 0], stamped[rows, 1] = read.seconds, read.nanoseconds
+    elif len(rows) > 1:
+        half = len(rows) // 2
+        first = _read(number, source, rows[:half], data[:half], stamped, decoded)
+        return first + _read(number, source, rows[half:], data[half:], stamped, decoded)
+    else:
         try:
-            message = source.read(one)
-            signals = source.kind.signals(message.blocks, message.extra)
-            samples = [(name, np.array(values, dtype=np.float64)[None]) for name, values in signals]
-            stamped[row] = message.seconds, message.nanoseconds
+            message = source.read(data[0])
+            told = source.kind.signals(message.blocks, message.extra)
+            signals = [(name, np.array(values, dtype=np.float64)[None]) for name, values in told]
+            stamped[rows] = message.seconds, message.nanoseconds
         except UNDECODABLE:
-            decoded[row] = False
-            continue
-        here = np.array([row])
-        parts += [_Part((number, name), order, here, sample) for order, (name, sample) in enumerate(samples)]
-    return parts
+            decoded[rows] = False
+            return []
+    return [_Part((number, name), order, rows, values) for order, (name, values) in enumerate(signals)]

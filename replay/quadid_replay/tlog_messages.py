@@ -171,9 +171,9 @@ def boot_stamp(raw: float, servo: bool, newest: float | None) -> float | None:
         servo: it is SERVO_OUTPUT_RAW, whose counter has 32 bits.
         newest: newest stamp known of this vehicle [s].
     """
-    if math.isnan(raw):
+    if raw != raw:
         return None
-    if newest is None:
+    if newest is None or (raw != 0.0 and not servo):
         return raw
     boot = WrapCounter(SERVO_TURN).unwrap_near(raw, newest) if servo else raw
     return None if raw == 0.0 and abs(boot - newest) > ZERO_IS_BOOT else boot

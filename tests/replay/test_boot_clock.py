@@ -48,17 +48,17 @@ def test_arrival_tells_the_phase_between_rare_stamps_but_never_leaves_them() -> 
 def test_without_a_stamp_near_there_is_no_time() -> None:
     clock: BootClock[str] = BootClock()
     assert clock.unstamped("before any", 0.0) == []
-    assert clock.stamped("first", 5.0, 1.0) == [Placed("before any", None), Placed("first", 5.0)]
+    assert clock.stamped("first", 5.0, 1.0) == [("before any", None), ("first", 5.0)]
     clock.unstamped("near", 1.5)
     clock.unstamped("far", 1.0 + FARTHEST + 0.1)
-    assert clock.finish() == [Placed("near", 5.5), Placed("far", None)]
+    assert clock.finish() == [("near", 5.5), ("far", None)]
 
 
 def test_a_reboot_starts_anew() -> None:
     clock: BootClock[str] = BootClock()
     clock.stamped("old", 100.0, 0.0)
     clock.unstamped("last", 0.01)
-    assert clock.stamped("new", 2.0, 20.0) == [Placed("last", 100.01), Placed("new", 2.0)]
+    assert clock.stamped("new", 2.0, 20.0) == [("last", 100.01), ("new", 2.0)]
     clock.unstamped("next", 20.01)
     item, time = clock.stamped("after", 2.02, 20.02)[0]
     assert item == "next"
@@ -69,8 +69,8 @@ def test_an_older_stamp_between_is_disorder() -> None:
     clock: BootClock[str] = BootClock()
     clock.stamped("target", 1.006, 0.0)
     clock.unstamped("esc", 0.0)
-    assert clock.stamped("servo", 1.0, 0.001) == [Placed("servo", 1.0)]
-    assert clock.stamped("attitude", 1.02, 0.002)[0] == Placed("esc", 1.006)
+    assert clock.stamped("servo", 1.0, 0.001) == [("servo", 1.0)]
+    assert clock.stamped("attitude", 1.02, 0.002)[0] == ("esc", 1.006)
 
 
 def test_a_link_that_draws_out_the_messages_of_one_moment_does_not_delay_the_last_of_them() -> None:

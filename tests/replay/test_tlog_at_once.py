@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 import pytest
-from quadid_replay import boot_clock, mavlink_frames, tlog_times
+from quadid_replay import mavlink_frames
 from quadid_replay.frames import from_euler
 from quadid_replay.mavlink_frames import read_frames
-from quadid_replay.tlog_messages import SERVO_TURN
-from quadid_replay.tlog_times import Stamps, at_once, one_by_one
 from quadid_replay.tlog_vehicle import _rounds
 
 from tests.replay.test_tlog import Tlog, attitude, heartbeat, raw_imu, servo
@@ -99,43 +96,6 @@ def test_the_same_frames_are_found_through_damage(tmp_path: Path, monkeypatch: p
         assert [frames.frame(k) for k in range(len(frames.start))] == [data[a + 8 : a + n] for a, n in found]
         times = [int.from_bytes(data[a : a + 8], "big") * 1e-6 for a, _ in found]
         assert frames.received.tolist() == times
-
-
-def stamps(rng: Any) -> Stamps:
-    """Messages with and without stamps, turning counters, stamps of another clock, zeros, reboots, disorder."""
-    count = int(rng.integers(0, 60))
-    begin = rng.choice([0.0, 0.5, 100.0, SERVO_TURN - 0.1, 2 * SERVO_TURN])
-    t = begin + np.cumsum(rng.choice([0.0, 0.001, 0.02, 0.3], count) * rng.random(count))
-    if rng.random() < 0.3:
-        t = t + rng.choice([0.0, 0.05, -0.05, 0.9, -1.2], count, p=[0.6, 0.15, 0.15, 0.05, 0.05])
-    t = np.round(t, 3)
-    kind = rng.choice(4, count, p=rng.dirichlet([1.0, 1.0, 1.0, 1.0]))
-    boot, other = np.where(kind == 0, np.nan, t), np.where(kind == 2, t, np.nan)
-    boot[kind == 1] = np.round(boot[kind == 1] % SERVO_TURN, 6)
-    if rng.random() < 0.5:
-        boot[kind == 2] = np.nan
-    if rng.random() < 0.2:
-        other[rng.random(count) < 0.3] = np.nan
-        boot[rng.random(count) < 0.1] = 0.0
-    if rng.random() < 0.1:
-        boot[count // 2 :] -= rng.choice([0.9, 1.0, 1.1, 50.0])
-    received = 1.7e9 + t + rng.exponential(0.1, count) * rng.choice([0.0, 1.0, 5.0])
-    return Stamps(received, boot, other, kind == 1)
-
-
-def test_times_are_those_of_messages_played_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, taken = np.random.default_rng(5), 0
-    for case in range(1500):
-        for module in (boot_clock, tlog_times):
-            monkeypatch.setattr(module, "MOST_WAITING", 3 if case % 10 == 0 else 4096)
-        given = stamps(rng)
-        found, played = at_once(given), one_by_one(given)
-        taken += found is not None
-        if found is not None:
-            assert found.waited == played.waited
-            for ours, theirs in zip(found, played, strict=True):
-                np.testing.assert_array_equal(ours, theirs)
-    assert taken > 700
 
 
 def test_attitudes_turned_together_are_those_turned_alone() -> None:
