@@ -7,13 +7,15 @@
     found.vehicle.save("mine.yaml")
 
 Every check, status, refusal and warning of the commands is made here too: the commands call these functions.
-Nothing heavy is imported before it is used.
+Nothing heavy is imported before it is used; nothing is imported or run from the folder the program stands in.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from quadid.working_folder import guard
 
 if TYPE_CHECKING:
     from quadid_workflow.diagnose import diagnose as diagnose
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from quadid.parameters import ParameterSet as ParameterSet
     from quadid.vehicle import Vehicle as Vehicle
 
+guard()
 __version__ = "0.1.0"
 
 _PUBLIC = {

@@ -13,7 +13,6 @@ import sys
 from typing import Annotated, Any
 
 import typer
-from quadid_node.working_folder import refusal
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
@@ -145,9 +144,10 @@ def app_main() -> int:
     if sys.stdout is None:
         print("quadid: stdout is closed; fix: send it to a file, or to /dev/null", file=sys.stderr)
         return 2
-    refused = refusal()
-    if refused is not None:
-        print(f"quadid: {refused}", file=sys.stderr)
+    try:
+        importlib.import_module("quadid")  # refuses a folder that would run foreign code
+    except ImportError as error:
+        print(f"quadid: {error}", file=sys.stderr)
         return 2
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")

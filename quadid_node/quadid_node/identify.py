@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sys
 
-from quadid.errors import QuadidError
 from quadid_node.stopping import Stop, end_middleware
 from quadid_node.transport import without_shared_memory
-from quadid_node.working_folder import refusal
 
 SPIN_SECONDS = 0.2
 """Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
@@ -16,9 +15,10 @@ SPIN_SECONDS = 0.2
 
 def main(args: list[str] | None = None) -> int:
     """Runs the node; returns the exit code: 0 done, 2 bad parameters, or a folder to run nothing in."""
-    refused = refusal()
-    if refused is not None:
-        print(f"identify: {refused}", file=sys.stderr)  # noqa: T201 - a command's last word
+    try:
+        importlib.import_module("quadid")  # refuses a folder that would run foreign code
+    except ImportError as error:
+        print(f"identify: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
     code = _run(args, Stop(nothing_open=True))
     end_middleware()
@@ -32,6 +32,7 @@ def _run(args: list[str] | None, stop: Stop) -> int:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
 
+    from quadid.errors import QuadidError
     from quadid_node.node import IdentifyNode
 
     stop.opens()

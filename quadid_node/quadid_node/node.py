@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from quadid_workflow.loading import load_vehicle
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
@@ -35,7 +36,6 @@ from quadid_node.node_parameters import (
     check_change,
     descriptor,
     read_settings,
-    read_vehicle,
     vehicle_id,
 )
 from quadid_node.polling import PollingNode
@@ -167,7 +167,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _configure(self) -> None:
         values = {p.name: as_declared(p, self.get_parameter(p.name).value) for p in PARAMETERS}
-        vehicle, settings = read_vehicle(values["vehicle"]), read_settings(values)
+        vehicle, settings = load_vehicle(values["vehicle"]), read_settings(values)
         preset = source(values["source"])
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from quadid_workflow.files import read_regular
-
-from quadid.errors import QuadidError, VehicleError
+from quadid.errors import QuadidError
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.settings import session_settings
@@ -81,17 +78,6 @@ def read_settings(values: dict[str, Any]) -> SessionSettings:
     gate = {n.replace("gate.", "gate_"): v for n, v in values.items() if n.startswith("gate.")}
     plain = {n: values[n] for n in ("window", "refit", "rate", "memory", "diagnose", "seed")}
     return session_settings(approval=values["approval"], **plain, **gate)
-
-
-def read_vehicle(name: str) -> Vehicle:
-    """The shipped vehicle of that name, or a vehicle file; raises VehicleError."""
-    path = Path(name)
-    if path.suffix.lower() not in (".yaml", ".yml") and "/" not in name:
-        return Vehicle.shipped(name)
-    try:
-        return Vehicle.from_yaml(read_regular(path).decode("utf-8"), path.name)
-    except (OSError, UnicodeDecodeError) as error:
-        raise VehicleError(f"vehicle file {name} cannot be read ({error})", "a shipped name or a YAML file") from error
 
 
 def vehicle_id(given: str, namespace: str, vehicle: Vehicle) -> str:

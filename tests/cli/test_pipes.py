@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 from quadid_node.mavlink_wire import read_key
-from quadid_node.node_parameters import read_vehicle
+from quadid_node.store import Store
+from quadid_node.store_file import read_history
+from quadid_node.zenoh_session import config_of
 from quadid_replay import open_log
 from quadid_workflow.loading import load_vehicle
 from quadid_workflow.simulate import read_manoeuvre
@@ -17,10 +19,12 @@ from quadid.errors import QuadidError
 
 READERS: dict[str, Callable[[Path], object]] = {
     "vehicle file": lambda path: load_vehicle(str(path)),
-    "vehicle file of a service": lambda path: read_vehicle(str(path)),
     "manoeuvre": read_manoeuvre,
     "signing key": read_key,
     "log": open_log,
+    "history that is shown": lambda path: read_history(path, "pelican"),
+    "history that is written": lambda path: Store(path, "pelican"),
+    "configuration of Zenoh": lambda path: config_of(str(path)),
 }
 
 
@@ -28,5 +32,5 @@ READERS: dict[str, Callable[[Path], object]] = {
 def test_what_is_no_file_is_refused(what: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.yaml")
     for path in (tmp_path / "pipe.yaml", Path("/dev/zero"), tmp_path):
-        with pytest.raises(QuadidError, match="regular file|[Ii]s a directory"):
+        with pytest.raises(QuadidError, match="regular file|[Ii]s a directory|no history|no Zenoh"):
             READERS[what](path)

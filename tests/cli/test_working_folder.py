@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -40,3 +41,69 @@ def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happene
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "ran").exists()
     happened(25, "numpy.py, yaml.py, typer.py and json.py in the folder we stand in: not run")
+
+
+PLANTED = ("html", "multiprocessing", "runpy", "numpy", "distributed", "json", "pickle", "socket", "sitecustomize")
+"""Modules that children of libraries import: one in the working folder would run in the place of Python's own."""
+
+
+@pytest.fixture
+def planted(tmp_path: Path) -> Path:
+    """A folder that a stranger packed; `ran` appears in it when one of its modules is imported."""
+    folder = tmp_path / "planted"
+    folder.mkdir()
+    for name in PLANTED:
+        (folder / f"{name}.py").write_text(f"open({str(folder / 'ran')!r}, 'a').write(__name__)\nraise ImportError\n")
+    return folder
+
+
+def test_fleet_in_a_folder_with_modules_runs_none_of_them(planted: Path, happened: Happened) -> None:
+    (planted / "flight.csv").write_text("t,p,q,r,w1,w2,w3,w4\n0,0,0,0,1,1,1,1\n")
+    command: list[str | Path] = [QUADID, "fleet", ".", "--vehicle", "pelican", "--workers", "1", "--out", "out"]
+    done = subprocess.run(command, cwd=planted, capture_output=True, text=True, check=False)
+    assert not (planted / "ran").exists()
+    assert (planted / "out").is_dir(), done.stderr
+    happened(25, f"`quadid fleet .` in a folder with {', '.join(PLANTED)}: its workers run none of them")
+
+
+START = """
+import multiprocessing
+import quadid
+from multiprocessing import shared_memory
+
+if __name__ == "__main__":
+    for method in ("spawn", "forkserver"):
+        with multiprocessing.get_context(method).Pool(1) as pool:
+            assert pool.map(abs, [-1]) == [1]
+    shared_memory.SharedMemory(create=True, size=8).unlink()  # starts the resource tracker
+"""
+
+
+@pytest.mark.parametrize("path", [None, ":/nowhere", "/nowhere:"])
+def test_processes_of_libraries_do_not_import_from_it_either(planted: Path, path: str | None) -> None:
+    script = planted.parent / "elsewhere" / "script.py"
+    script.parent.mkdir()
+    script.write_text(START)
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONSAFEPATH", "PYTHONPATH")}
+    # Python itself looks into the folder for an empty entry of PYTHONPATH: so it is set once it runs.
+    if path is not None:
+        script.write_text(f"import os\nos.environ['PYTHONPATH'] = {path!r}\n{START}")
+    done = subprocess.run(
+        [sys.executable, script], cwd=planted, capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (planted / "ran").exists()
+
+
+@pytest.mark.parametrize("lines", ["import quadid", "import quadid.vehicle", "import os, quadid_workflow.loading"])
+def test_a_library_refuses_settings_of_numba_too(tmp_path: Path, lines: str) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
+    done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "ImportError: .numba_config.yaml in this folder" in done.stderr
+
+
+def test_also_those_of_a_folder_that_it_changes_to(tmp_path: Path) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
+    lines = f"import os, quadid\nos.chdir({str(tmp_path)!r})\nimport quadid.model.kernel"
+    done = subprocess.run([sys.executable, "-c", lines], cwd="/", capture_output=True, text=True, check=False)
+    assert "ImportError: .numba_config.yaml in this folder" in done.stderr

@@ -1,0 +1,45 @@
+"""The folder that a program runs in may have been packed by a stranger: nothing in it is run.
+
+Looked at before anything else is imported, and with nothing but the standard library.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+from typing import Any
+
+NUMBA_SETTINGS = Path(".numba_config.yaml")
+"""numba reads this file of the folder we stand in, and takes machine code from where it says."""
+
+
+def refuse() -> None:
+    """Raises ImportError in a folder whose settings of numba would change what is computed."""
+    if NUMBA_SETTINGS.exists():
+        what = f"{NUMBA_SETTINGS} in this folder would change what is computed, and run code from where it says"
+        raise ImportError(f"{what}; fix: change to another folder, or remove it", name="quadid")
+
+
+def guard() -> None:
+    """Refuses such a folder, now and when numba is imported; no Python that this process starts imports from its own.
+
+    Libraries start Python too (the fork servers and resource trackers of `multiprocessing`, of which Dask makes use):
+    ``python -c`` and ``python -m`` look into the working folder first, unless PYTHONSAFEPATH is set.
+    """
+    refuse()
+    os.environ["PYTHONSAFEPATH"] = os.environ.get("PYTHONSAFEPATH") or "1"
+    searched = os.environ.get("PYTHONPATH", "")
+    if "" in searched.split(os.pathsep) and searched:  # an empty entry is the working folder
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, searched.split(os.pathsep)))
+    if not any(isinstance(finder, _BeforeNumba) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _BeforeNumba())
+
+
+class _BeforeNumba(MetaPathFinder):
+    """Looks at the folder once more: the program may have changed to another one since."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        if name == "numba":
+            refuse()
