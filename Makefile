@@ -41,8 +41,8 @@ $(DEV): pyproject.toml $(RUNTIME)
 	$(PIP) install --editable ".[dev]"
 	@touch $@
 
-# Last, because these wheels make every start of this Python re-execute itself.
-$(ROS): pyproject.toml $(DEV)
+# These wheels make every start of this Python re-execute itself; beside `dev`, they come after it.
+$(ROS): pyproject.toml $(RUNTIME) | $(if $(filter messages,$(MAKECMDGOALS)),,$(DEV))
 	$(PIP) install --editable ".[ros]"
 	@$(BIN)/python -m pip freeze | grep -i '^ros-' >$@.new; cmp -s $@.new $(ROS_VERSIONS) || cp $@.new $(ROS_VERSIONS); rm $@.new
 	@touch $@
@@ -61,7 +61,7 @@ node: ## the node alone: NumPy 1.26 as beside ROS 2 Jazzy, no plots, Dask or pya
 
 venv: $(RUNTIME) ## .venv with the quadid command
 dev: $(DEV) ## ... and what developers use: linters, types, tests
-messages: $(MESSAGES) ## ... and ROS 2 Jazzy with quadid_msgs
+messages: $(MESSAGES) ## .venv with the quadid command, ROS 2 Jazzy and quadid_msgs, without what developers use
 
 # --- use
 

@@ -28,8 +28,12 @@ def test_every_ros_package_that_is_imported_is_named() -> None:
             roots |= {name.split(".")[0] for name in names}
     used = {name for name in roots if name.endswith(ROS) or name.startswith(LIBRARIES)}
     assert {"rclpy", "launch_ros"} <= used
+    used |= {"bond"}  # imported by its name, where it is installed
     missing = used - depends("exec_depend")
     assert not missing, f"package.xml: name {sorted(missing)} as exec_depend"
+    debian = {name.removeprefix("python3-") for name in depends("exec_depend") if name.startswith("python3-")}
+    assert debian <= roots, "Debian's packages that the node does not import, or has in another version"
+    assert "pydantic" not in debian, "Ubuntu 24.04 has version 1.10, which is too old: pip brings it"
 
 
 @pytest.mark.parametrize("file", sorted(PACKAGE.glob("launch/*.launch.py")), ids=lambda file: file.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -89,3 +90,17 @@ def test_whole_workspace_builds(tmp_path: Path, repository: Path) -> None:
     messages = tmp_path / "install" / "quadid_msgs"
     assert (messages / "share/ament_index/resource_index/rosidl_interfaces/quadid_msgs").is_file()
     assert (messages / "share/quadid_msgs/msg/ParameterSet.json").is_file()  # carries the type hash
+
+
+@pytest.mark.parametrize(("target", "wanted"), [("messages", False), ("test-slow", True)])
+def test_who_wants_the_messages_needs_no_linters(target: str, wanted: bool, tmp_path: Path, repository: Path) -> None:
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("no make")
+    command = [make, "--dry-run", target, f"VENV={tmp_path / 'venv'}", f"PYTHON={sys.executable}"]
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL")}
+    done = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, check=True)
+    assert ".[ros]" in done.stdout
+    assert (".[dev]" in done.stdout) is wanted
+    if wanted:
+        assert done.stdout.index(".[dev]") < done.stdout.index(".[ros]")
