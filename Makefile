@@ -207,7 +207,7 @@ sbom: venv ## NOTICE with the licences of what is installed with quadid, and dis
 pins: $(QUALITY) ## exact versions with hashes of what the container installs, into docker/requirements.txt
 	$(BIN)/uv pip compile --quiet --no-config --upgrade --generate-hashes --python-version 3.12 \
 		--python-platform x86_64-unknown-linux-gnu --no-emit-index-url --no-emit-find-links \
-		--custom-compile-command "make pins" --output-file docker/requirements.txt pyproject.toml docker/build.in
+		--custom-compile-command "make pins" --output-file docker/requirements.txt quadid_node/requirements.txt docker/build.in
 
 test-slow: $(MESSAGES) ## the tests that take minutes each
 	$(BIN)/pytest -m slow

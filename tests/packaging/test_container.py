@@ -31,7 +31,8 @@ def services(repository: Path) -> dict[str, Any]:
 def test_everything_copied_exists_and_passes_the_ignore_file(dockerfile: str, repository: Path) -> None:
     lines = (repository / "docker" / "Dockerfile.dockerignore").read_text(encoding="utf-8").splitlines()
     allowed = [line[1:] for line in lines if line.startswith("!")]
-    copied = [source for line in re.findall(r"^COPY (.+)$", dockerfile, re.MULTILINE) for source in line.split()[:-1]]
+    lines_of_files = re.findall(r"^COPY (?!--from)(.+)$", dockerfile, re.MULTILINE)
+    copied = [source for line in lines_of_files for source in line.split()[:-1]]
     assert copied
     for source in copied:
         assert (repository / source).exists(), source
@@ -46,13 +47,31 @@ def test_the_packages_of_the_wheel_are_all_copied(dockerfile: str, repository: P
 
 
 def test_the_base_image_is_named_by_its_digest(dockerfile: str) -> None:
-    (base,) = re.findall(r"^FROM (.+)$", dockerfile, re.MULTILINE)
-    assert re.fullmatch(r"ros:jazzy-ros-base@sha256:[0-9a-f]{64}", base)
+    built, run = re.findall(r"^FROM (\S+)", dockerfile, re.MULTILINE)
+    assert built == run
+    assert re.fullmatch(r"ros:jazzy-ros-base@sha256:[0-9a-f]{64}", run)
+
+
+def test_what_only_builds_stays_in_the_first_stage(dockerfile: str, repository: Path) -> None:
+    """No compiler, Dask, pyarrow or plots in the image; kernels are compiled where they run, into the volume."""
+    _, last = dockerfile.split(" AS build", 1)[1].split("\nFROM ")
+    assert "build-essential" not in last
+    assert "pip install" not in last
+    assert "--break-system-packages" not in dockerfile
+    assert "quadid warmup" not in dockerfile
+    (volume,) = re.findall(r'^VOLUME \["(.+)"\]$', dockerfile, re.MULTILINE)
+    (kernels,) = re.findall(r"^ENV NUMBA_CACHE_DIR=(\S+)$", dockerfile, re.MULTILINE)
+    assert kernels.startswith(f"{volume}/")
+    pins = (repository / "docker" / "requirements.txt").read_text(encoding="utf-8")
+    for heavy in ("dask", "distributed", "pyarrow", "pandas", "plotly", "matplotlib"):
+        assert not re.search(rf"^{heavy}==", pins, re.MULTILINE), heavy
 
 
 def test_everything_of_the_package_index_is_pinned_with_hashes(dockerfile: str, repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))
-    wanted = [Requirement(line) for line in (*project["project"]["dependencies"], *project["build-system"]["requires"])]
+    node = (repository / "quadid_node" / "requirements.txt").read_text(encoding="utf-8").splitlines()
+    needed = (*(line for line in node if line[:1] not in ("", "#")), *project["build-system"]["requires"])
+    wanted = [Requirement(line) for line in needed]
     text = (repository / "docker" / "requirements.txt").read_text(encoding="utf-8").replace("\\\n", " ")
     pinned = dict(re.findall(r"^([\w.-]+)==(\S+) .*--hash=sha256:[0-9a-f]{64}", text, re.MULTILINE))
     assert len(pinned) == len(re.findall(r"^\w", text, re.MULTILINE)), "a line without version or hash"

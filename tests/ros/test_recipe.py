@@ -1,4 +1,4 @@
-"""The environment that docs/using-with-ros.md beside Debian's Python packages, made line by line."""
+"""The environment that docs/using-with-ros.md makes beside the Python packages of Debian, line by line."""
 
 from __future__ import annotations
 
