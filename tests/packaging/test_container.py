@@ -63,6 +63,7 @@ def test_what_only_builds_stays_in_the_first_stage(dockerfile: str, repository: 
     (kernels,) = re.findall(r"^ENV NUMBA_CACHE_DIR=(\S+)$", dockerfile, re.MULTILINE)
     assert kernels.startswith(f"{volume}/")
     pins = (repository / "docker" / "requirements.txt").read_text(encoding="utf-8")
+    assert "\nnumpy==1.26.4 " in pins, "as apt has it: ROS' messages are compiled with it"
     for heavy in ("dask", "distributed", "pyarrow", "pandas", "plotly", "matplotlib"):
         assert not re.search(rf"^{heavy}==", pins, re.MULTILINE), heavy
 
