@@ -27,6 +27,8 @@ _STEP = 0.1
 """Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
+_FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
+"""Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
 _REVERSED = 0.7
 """Correlation below the negative of which a vertical signal points up."""
 _RESTING = 50
@@ -175,7 +177,25 @@ def gyro_check(recording: Recording) -> Check:
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    return _judge_rates(*best)
+    late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
+    return late or _judge_rates(*best)
+
+
+def _apart(gyro: Channel, attitude: Channel, now: float) -> Check | None:
+    """An error where the gyro follows the attitude clearly better at another time; `now` is R^2 at its own."""
+    found = []
+    for lag in np.arange(-_FARTHEST, _FARTHEST + 1e-9, _LAG):
+        rows = _moving_rates(Channel("gyro", gyro.t - lag, gyro.values), attitude.t, attitude.values)
+        found.append((fit_axes(*rows).r2 if len(rows[0]) >= 20 else 0.0, float(lag)))
+    r2, lag = max(found)
+    if abs(lag) < _TOO_LATE or r2 < _CLEAR or r2 - now < 0.5 * (1.0 - now):
+        return None
+    which = ("gyro", "attitude") if lag > 0.0 else ("attitude", "gyro")
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        f"{which[0]} comes {1e3 * abs(lag):.0f} ms after the {which[1]} (R^2 {r2:.2f} there, {now:.2f} as stamped)",
+        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}", {"lag_s": lag, "r2": r2},
+    )  # fmt: skip
 
 
 def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:

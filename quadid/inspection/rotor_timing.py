@@ -27,8 +27,10 @@ _SLOW = 0.4
 """Motion slower than this [s] is left out, as in `motor_checks`."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
-_WANDER, _LATE, _EARLY = 0.012, 0.015, 0.2
-"""Limits [s]: spread of the lag over the flight, torque after its effect, and before it."""
+_WANDER, _EARLY = 0.012, 0.2
+"""Limits [s] of the spread of the lag over the flight, and of torque before its effect."""
+_LATE, _TOO_LATE = 0.015, 0.025
+"""Torque after its effect [s] that is named, and that is refused."""
 
 
 class _Peak(NamedTuple):
@@ -78,6 +80,11 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
     fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
     if high - low > _WANDER:
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
+    if -_TOO_LATE < lag < -_LATE:
+        smoothed = f"{message}: rotor speeds are late, or the states were smoothed without a delay"
+        return Check(
+            name, CheckResult.WARNING, smoothed, "log raw states; `rotor_telemetry_delay` models a delay", numbers
+        )
     if lag < -_LATE:
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
     if lag > _EARLY:

@@ -233,6 +233,8 @@ MISTAKES = (
     Mistake("height in place of z", fit(lambda p: p.scaled("z", -1.0)), "points up"),
     Mistake("spins reversed", of(lambda p: p.spins()), "negate the spins"),
     Mistake("rotor speeds 60 ms late", fit(lambda p: p.late("w1 w2 w3 w4", 3)), "lags its effect"),
+    Mistake("gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 160 ms after the attitude"),
+    Mistake("attitude 160 ms late", fit(lambda p: p.late("qw qx qy qz", 8)), "attitude comes 160 ms after the gyro"),
     Mistake("one rotor column four times", fit(lambda p: p.moved("w2 w3 w4", "w1 w1 w1")), "the same"),
     Mistake("squared rotor speeds", fit(lambda p: p.of_rotors(np.square)), "squared"),
     Mistake("rotor speeds in steps", fit(lambda p: p.of_rotors(lambda w: 50.0 * np.round(w / 50.0))), "steps of 50", 0),
