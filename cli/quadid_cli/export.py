@@ -38,7 +38,7 @@ def export(
     name: Annotated[
         str | None, typer.Option("--id", metavar="NAME", help="Whose sets of the history; default the vehicle's.")
     ] = None,
-    anyway: Annotated[bool, typer.Option("--anyway", help="Export values of a fit that nothing proves, too.")] = False,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Export values unproven or out of date, too.")] = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
@@ -54,12 +54,12 @@ def export(
         return
     if vehicle is None:
         raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
-    described, source = load_vehicle(vehicle), Path(vehicle).name
+    described, source, doubt = load_vehicle(vehicle), Path(vehicle).name, ""
     if history is not None:
-        described, source = _accepted(described, history, name or described.name)
+        described, source, doubt = _in_force(described, history, name or described.name)
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
-    done = exported(described, form, source=source, anyway=anyway)
+    done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
     folder = output.out_folder(out)
     for path in (folder / file for file in done.texts):
         if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
@@ -86,18 +86,17 @@ def listed(json: str | None) -> None:
     console.print("\nEvery form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names.")
 
 
-def _accepted(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:
-    """The vehicle with the values that a service put in force last, and where they come from."""
-    from quadid_node.codec import set_from_dict
+def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:
+    """The vehicle with the values that a service put in force last, where they come from, and what speaks against."""
+    from quadid_node.restored_set import read_in_force
     from quadid_node.store_file import StoreError, read_history
 
     from quadid.identify.result import with_values
 
-    found = read_history(history, name)
-    accepted = [item for item in found["sets"] if item["state"] in ("accepted", "rolled_back")]
-    if not accepted:
-        names = ", ".join(entry["name"] for entry in found["vehicles"]) or "none"
-        raise StoreError(f"no set of '{name}' was ever in force in {history}", f"one of: {names}", "give --id")
-    last = set_from_dict(accepted[-1])
-    fitted = with_values(vehicle, last.parameters).model_copy(update={"proof": None})
-    return fitted, f"{history.name}, set {last.sequence} of {name}"
+    found = read_in_force(history, name, vehicle)
+    if found.item is None:
+        names = ", ".join(entry["name"] for entry in read_history(history, name, sets=0)["vehicles"]) or "none"
+        unread = f": {found.why_none}" if found.why_none else ""
+        raise StoreError(f"no set of '{name}' was ever in force in {history}{unread}", f"one of: {names}", "give --id")
+    fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+    return fitted, f"{history.name}, set {found.item.sequence} of {name}", found.doubt

@@ -35,6 +35,7 @@ def history(
     json: JsonTarget = None,
 ) -> None:
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
+    from quadid_node.restored_set import read_in_force
     from quadid_node.store import default_path
     from quadid_node.store_file import StoreError, read_history
     from quadid_workflow.loading import load_vehicle
@@ -43,17 +44,23 @@ def history(
     from quadid_cli import output
 
     output.check_file(json, "--json")
-    path, name = file or default_path(), vehicle
+    path, name, described = file or default_path(), vehicle, None
     found = read_history(path, name, candidates, events)
     names = [entry["name"] for entry in found["vehicles"]]
-    if vehicle not in names:
-        try:
-            name = load_vehicle(vehicle).name
-        except VehicleError as error:
+    try:
+        described = load_vehicle(vehicle)
+    except VehicleError as error:
+        if vehicle not in names:
             there = ", ".join(names) or "none"
             raise StoreError(f"{error.found}, and no vehicle of {path}", f"there: {there}") from error
+    if described is not None and vehicle not in names:
+        name = described.name
         found = read_history(path, name, candidates, events)
-    result = {"schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), **found}
+    last = read_in_force(path, name, described)
+    force = None if last.item is None else {"sequence": last.item.sequence, "doubt": last.doubt}
+    result = {
+        "schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), "in_force": force, **found,
+    }  # fmt: skip
     output.write_json(result, json)
     show(result, quiet=json == "-")
 
@@ -71,7 +78,12 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         story = _story(result["sets"], f"Parameter sets of {result['vehicle']}")
         print_tables(console, [story, _values(result["sets"])])
         for item in result["sets"]:
-            console.print(f"set {item['sequence']}: {item['reason']}")
+            old = f"; out of date: {item['outdated']}" if item.get("outdated") else ""
+            console.print(f"set {item['sequence']}: {item['reason']}{old}")
+        force = result["in_force"]
+        if force is not None:
+            doubt = f", {force['doubt']}" if force["doubt"] else ""
+            console.print(f"last in force: set {force['sequence']}{doubt}")
     for item in result["candidates"]:
         console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}")
     for item in result["events"]:

@@ -114,9 +114,10 @@ def table(found: Mapping[str, Any]) -> Table:
         status = _mapping(health.get("status"))
         color = "green" if kinds["alive"] else "red"
         state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
+        old = f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
         out.add_row(
             Text(_plain(name), style=color), Text(state if kinds["alive"] else "gone"),
-            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}")), Text(_parameters(force)),
+            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + old), Text(_parameters(force)),
             Text(_findings(kinds.get("diagnosis", {}))), Text(_feeds(health)),
         )  # fmt: skip
     return out

@@ -13,8 +13,8 @@ import os
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,9 +25,9 @@ from quadid.online.gate import GateSettings
 from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet
 from quadid.vehicle import Vehicle
-from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
+from quadid_node.codec import diagnosis_to_dict, set_to_dict
 from quadid_node.history_writer import HistoryWriter, Row
-from quadid_node.restored_set import why_none
+from quadid_node.restored_set import StoredSet, in_force, stored
 from quadid_node.store_file import UNREADABLE, StoreError, connect, is_damage, make_tables, set_aside
 from quadid_node.store_lock import HistoryLock, real, text
 
@@ -137,13 +137,9 @@ class Store:
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
 
         def newest(which: str) -> OnlineSet | None:
-            return self._set(db, which, lambda found, number: why_none(found, number, gate, vehicle))
+            return self._taken_up(stored(db, self.vehicle, which, gate, vehicle))
 
-        last = newest("state IN ('accepted', 'rolled_back') ORDER BY rowid DESC")
-        if last is not None:
-            told = newest("state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC")
-            told = told or last
-            last = replace(last, outdated=told.outdated, outdated_code=told.outdated_code)
+        last = self._taken_up(in_force(db, self.vehicle, gate, vehicle))
         approved = newest("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
         first = newest("state = 'accepted' ORDER BY rowid")
         for item in (first, approved, last):
@@ -180,21 +176,12 @@ class Store:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
         return tuple(out)
 
-    def _set(self, db: sqlite3.Connection, which: str, why_none: Callable[[OnlineSet, int], str]) -> OnlineSet | None:
-        """The first such set; one that no fresh estimate could be is left out, and said."""
-        found, query = None, f"SELECT data, sequence FROM sets WHERE vehicle = ? AND {which} LIMIT 1"
-        row = db.execute(query, (self.vehicle,)).fetchone()
-        if row is None:
-            return None
-        try:
-            found = set_from_dict(json.loads(row[0]))
-            why = why_none(found, row[1])
-        except UNREADABLE as error:
-            why = f"{type(error).__name__}: {str(error)[:120]}"
-        if why:
-            self.notes.append(f"a set of the history is no set and is not taken up again ({why})")
-            return None
-        return found
+    def _taken_up(self, found: StoredSet) -> OnlineSet | None:
+        """The set; one that no fresh estimate could be is left out, and said."""
+        if not found.why_none:
+            return found.item
+        self.notes.append(f"a set of the history is no set and is not taken up again ({found.why_none})")
+        return None
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""

@@ -62,6 +62,18 @@ def read_history(
     Raises:
         StoreError: no such file, or not a history.
     """
+    with opened(path) as db:
+        return {
+            "sets": _newest(db, "SELECT wall, data", "sets", vehicle, sets),
+            "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),
+            "events": _newest(db, "SELECT wall, t, level, kind, text", "events", vehicle, events),
+            "vehicles": [{"name": n} for (n,) in db.execute(_NAMES)],
+        }
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """A history to read, checked; raises StoreError where it is none, or what is done with it fails."""
     if not path.is_file():
         raise StoreError(f"no history {path}", "a history that a service has written", "use --history")
     try:
@@ -70,12 +82,7 @@ def read_history(
             for table in _SHOWN:  # rows that share pages would make a small file large
                 if db.execute(f"PRAGMA quick_check({table})").fetchone()[0] != "ok":
                     raise sqlite3.DatabaseError("malformed: its pages do not add up")
-            return {
-                "sets": _newest(db, "SELECT wall, data", "sets", vehicle, sets),
-                "candidates": _newest(db, "SELECT wall, data", "candidates", vehicle, candidates),
-                "events": _newest(db, "SELECT wall, t, level, kind, text", "events", vehicle, events),
-                "vehicles": [{"name": n} for (n,) in db.execute(_NAMES)],
-            }
+            yield db
     except (sqlite3.Error, *UNREADABLE) as error:
         raise StoreError(
             f"{path} cannot be read ({error})", "a history that a service has written", "use --history"

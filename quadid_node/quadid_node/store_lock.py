@@ -42,12 +42,9 @@ def text(vehicle: str) -> str:
 def real(path: Path) -> Path:
     """The file that a path leads to; raises StoreError where no file can have that name."""
     try:
-        found = Path(os.path.realpath(path))
+        return Path(os.path.realpath(path))
     except ValueError as error:
         raise StoreError(f"{str(path)!r} names no file ({error})", "a path", "give another --history") from error
-    if found.exists() and not found.is_file():
-        raise StoreError(f"{path} is no regular file", "a history, or a new name", "give another --history")
-    return found
 
 
 class HistoryLock:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from quadid_node.mavlink_wire import read_key
-from quadid_node.store import Store
 from quadid_node.store_file import read_history
 from quadid_node.zenoh_session import config_of
 from quadid_replay import open_log
@@ -23,7 +22,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "signing key": read_key,
     "log": open_log,
     "history that is shown": lambda path: read_history(path, "pelican"),
-    "history that is written": lambda path: Store(path, "pelican"),
     "configuration of Zenoh": lambda path: config_of(str(path)),
 }
 

@@ -16,6 +16,7 @@ from quadid_node.store import Store
 from quadid_replay import write_mcap
 from quadid_replay.mcap_records import McapFile
 
+from quadid.online.records import OnlineSet, SetState
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
@@ -160,3 +161,62 @@ def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(
     assert other.code == 2
     assert "one of: quad1" in other.err
     assert "--history" in run("export", "--vehicle", "pelican", "--id", "quad1").err
+
+
+def history_of(path: Path, *items: OnlineSet) -> Path:
+    store = Store(path, "pelican")
+    for number, item in enumerate(items, 1):
+        store.numbered(replace(item, sequence=number, approved_by=item.approved_by or "auto"))
+    store.close()
+    return path
+
+
+GOOD = replace(online_set(TRUE), mass=1.3)
+MAD = replace(online_set({**TRUE, "b": 1e3}), mass=1.3)
+DOUBTFUL = {
+    "withdrawn": ((GOOD, replace(GOOD, outdated="thrust stepped by -17.9 %")), "out of date: thrust stepped"),
+    "withdrawn by a stale row": (
+        (GOOD, replace(GOOD, state=SetState.STALE, outdated="thrust stepped")), "out of date: thrust stepped"),
+    "not confirmed since a restart": ((GOOD, replace(GOOD, state=SetState.STALE)), "stale: no flight has confirmed it"),
+    "of another mass": ((replace(GOOD, mass=1.35),), "a mass of 1.35 kg, the vehicle file has 1.3 kg"),
+    "of a mass that is none": ((replace(GOOD, mass=130.0),), "a mass of 130 kg, the vehicle has 1.3 kg"),
+    "no plausible one": ((GOOD, MAD), "no set that a fit makes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(DOUBTFUL))
+def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
+    case: str, tmp_path: Path, run: Callable[..., Ran]
+) -> None:
+    items, why = DOUBTFUL[case]
+    path = history_of(tmp_path / "h.sqlite", *items)
+    out = tmp_path / "out"
+    where = ("--vehicle", "pelican", "--history", str(path), "--out", str(out))
+    refused = run("export", *where)
+    assert refused.code == 2
+    assert why in refused.err
+    assert "--anyway" in refused.err
+    assert not list(out.glob("*"))
+    done = run("export", *where, "--anyway", "--json", "-")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
+    assert why in told["warnings"][-1]
+    first = Path(told["files"][0]).read_text(encoding="utf-8").splitlines()[0]
+    assert first.startswith("# NOT PROVEN: ")
+    assert why in first
+    shown = run("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
+    assert why in json.loads(shown.out)["in_force"]["doubt"]
+    # The service takes up none of these as it is: one rule for all who read a history.
+    store = Store(path, "pelican")
+    item = store.restore(vehicle=Vehicle.shipped("pelican")).item
+    store.close()
+    assert item is None or item.outdated or case == "not confirmed since a restart"
+
+
+def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, run: Callable[..., Ran]) -> None:
+    path = history_of(tmp_path / "h.sqlite", replace(GOOD, outdated="thrust stepped"), GOOD)
+    done = run("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
+    assert done.code == 0, done.err
+    assert not [text for text in json.loads(done.out)["warnings"] if "set 2" in text]
+    shown = run("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
+    assert json.loads(shown.out)["in_force"] == {"sequence": 2, "doubt": ""}

@@ -41,35 +41,39 @@ class UnprovenError(QuadidError):
 
 
 def export(
-    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, anyway: bool = False
-) -> Exported:
+    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, doubt: str = "",
+    anyway: bool = False,
+) -> Exported:  # fmt: skip
     """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
         format: one of `quadid_report.programs.FORMATS`.
         source: where the values come from, for the file; default the vehicle's file or name.
-        anyway: write the values of a fit that is not proven; the file says so at its top.
+        doubt: what speaks against the values, beside the proof in the vehicle file.
+        anyway: write the values of a fit that is not proven, or in doubt; the file says so at its top.
 
     Raises:
         ParameterError: an unknown format.
-        UnprovenError: the values are those of a fit that nothing proves.
+        UnprovenError: the values are those of a fit that nothing proves, or in doubt.
         VehicleError: no such vehicle.
     """
     from quadid_report.programs import export as written_as
 
     described = as_vehicle(vehicle)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
-    if described.proof is not None and described.proof.lacking and not anyway:
-        raise UnprovenError(
-            f"{origin} is not proven: {described.proof.lacking}", "values that predict an unseen flight",
-            "`quadid identify LOG --validate OTHER`, or `quadid diagnose`; insist with --anyway",
-        )  # fmt: skip
-    texts = {f"{file_name(described.name)}{end}": text for end, text in written_as(described, format, origin).items()}
+    lacking = doubt or (f"not proven: {described.proof.lacking}" if described.proof and described.proof.lacking else "")
+    if lacking and not anyway:
+        proven = "values that predict an unseen flight", "`quadid identify LOG --validate OTHER`, or `quadid diagnose`"
+        wanted, fix = ("a set that is in force", "fly on until the service publishes another") if doubt else proven
+        raise UnprovenError(f"{origin} is {lacking}", wanted, f"{fix}; insist with --anyway")
+    written = written_as(described, format, origin, doubt)
+    texts = {f"{file_name(described.name)}{end}": text for end, text in written.items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
     warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight was fitted"] if guessed else []
     if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
+    warnings += [f"{origin} is {doubt}"] if doubt else []
     result = {
         "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
     }  # fmt: skip

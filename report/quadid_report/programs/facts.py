@@ -47,10 +47,12 @@ class Facts:
     Attributes:
         vehicle: the vehicle file.
         source: its name, for headers.
+        doubt: what speaks against its values beside their proof, for headers.
     """
 
     vehicle: Vehicle
     source: str
+    doubt: str = ""
     tensor = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
     """Entries of an inertia tensor as SDF and URDF call them."""
 
@@ -180,6 +182,8 @@ class Facts:
     def unproven(self) -> str:
         """Why nothing shows that the values predict; empty where something does."""
         proof = self.vehicle.proof
+        if self.doubt:
+            return self.doubt
         if proof is not None:
             return proof.lacking
         guessed = any(p.sigma is None for p in self.vehicle.parameters.values())

@@ -79,13 +79,14 @@ FORMS: dict[str, Form] = {
 FORMATS = tuple(FORMS)
 
 
-def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
+def export(vehicle: Vehicle, form: str, source: str, doubt: str = "") -> dict[str, str]:
     """Writes a vehicle in the form of another program.
 
     Args:
         vehicle: with its fitted values as initial values.
         form: one of `FORMATS`.
         source: what the vehicle was read from, for the header.
+        doubt: what speaks against the values, for the header.
 
     Returns:
         Text by the ending of the file name it belongs in.
@@ -95,7 +96,7 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
     """
     if form not in FORMS:
         raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
-    facts, asked = Facts(vehicle, source), FORMS[form]
+    facts, asked = Facts(vehicle, source, doubt), FORMS[form]
     own = asked.particulars(facts)
     header = facts.header(tuple(name for name in asked.carried if name not in own.get("lost", ())))
     values = {**own, "f": facts, "v": vehicle, "rotors": facts.rotors, "header": header}
