@@ -1,7 +1,7 @@
 """Frames of a telemetry log: receive times and MAVLink 1 or 2 frames, found all at once, through damage.
 
 A tlog has neither index nor end mark.  After a damaged place the next frame is the next one that looks like one and is
-followed by another.
+followed by another.  Messages, fields and checksums are pymavlink's; its reader takes ten times as long.
 """
 
 from __future__ import annotations

@@ -85,6 +85,12 @@ class _Process:
                 self._stop()
                 socket.send_fds(self._start(), [b"\0"], [answer.fileno()])
 
+    def start(self) -> None:
+        """Starts the process, where there is none, without waiting for it: who calls has other things to import."""
+        with self._lock:
+            if self._control is None:
+                self._start()
+
     def stop(self) -> None:
         """Ends the process and all that it reads; the next log starts another."""
         with self._lock:
@@ -122,7 +128,7 @@ def _environment() -> dict[str, str]:
 
 
 _PROCESS = _Process()
-stop = _PROCESS.stop
+start, stop = _PROCESS.start, _PROCESS.stop
 atexit.register(stop)
 os.register_at_fork(after_in_child=_PROCESS.forget)
 

@@ -2,6 +2,8 @@
 
 Databases written before ROS 2 Iron hold no message definitions; those of `quadid_replay.schemas` stand in, and a type
 that is not there is named.  Compressed databases are refused with the command that unpacks them.
+
+Read with sqlite3: the library rosbags takes folders only, and sorts whole payloads in SQLite, shared pages included.
 """
 
 from __future__ import annotations

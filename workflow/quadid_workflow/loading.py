@@ -138,6 +138,9 @@ def load(
         VehicleError: no such vehicle.
         NotIdentifiableError: no rotor signal that means anything.
     """
+    from quadid_replay.reading import start as start_reading
+
+    start_reading()
     described = as_vehicle(vehicle)
     cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
     recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
