@@ -75,6 +75,8 @@ class Track(NamedTuple):
         mass: [kg].
         rotors: number of rotors.
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
+        beyond: what a larger model adds: to rate, rotation vector and velocity at the end of each step, to gyro,
+            attitude and accelerometer at its begin, shape (n, 18); no rows: nothing.  See `whole_model`.
     """
 
     t: FloatArray
@@ -86,6 +88,7 @@ class Track(NamedTuple):
     mass: float
     rotors: int
     still: float
+    beyond: FloatArray
 
 
 class Gains(NamedTuple):
@@ -282,6 +285,25 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     x[6] = r + sixth * (c1 + 2.0 * (c2 + c3) + c4)
     for i in range(9):
         x[FO + 1 + i] *= keep[i]
+
+
+@nb.njit(**_FAST)
+def _go_beyond(track: Track, k: int, room: FloatArray, x: FloatArray) -> None:
+    """Adds what a larger model makes of step k; `room` (N,) is overwritten."""
+    if len(track.beyond) > 0:
+        room[:] = 0.0
+        for i in range(3):
+            room[OM + i], room[TH + i] = track.beyond[k, i], track.beyond[k, 3 + i]
+            room[VE + i] = track.beyond[k, 6 + i]
+        _correct(room, x)
+
+
+@nb.njit(**_FAST)
+def _read_beyond(track: Track, k: int, nu: FloatArray) -> None:
+    """Takes what a larger model makes of gyro, attitude and accelerometer off the innovations of row k."""
+    if len(track.beyond) > 0:
+        for m in range(VELOCITY):
+            nu[m] -= track.beyond[k, 9 + m]
 
 
 @nb.njit(**_FAST)
@@ -539,6 +561,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         # Update by all that was measured now, Eq. 6.
         _accel_slope(c, g.table[k], air, x, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
+        _read_beyond(track, k, nu)
         dx[:] = 0.0
         for m in range(M):
             if not _is_measured(track, k, m, air):
@@ -589,6 +612,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         _advance(c, g.table[k], h, keep, air, after)
         _transition(c, g.table[k], h, keep, air, x, after, F, turn)
         x[:] = after
+        _go_beyond(track, k, dx, x)
         _sandwich(F, P, FP, False)
         for i in range(9):
             _kick(h, air, i, turn, G)
@@ -629,6 +653,39 @@ def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> Non
 
 
 @nb.njit(**_FAST)
+def single_steps(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
+    """Each mean one step on without random forces, shape (n, N_MEAN); the last stays.
+
+    Args:
+        track: the flight.
+        p: physics, shape (N_PHYSICS,).
+        means: shape (n, N_MEAN).
+    """
+    air = track.still > 0.0 or track.seen[:, 3].any()
+    c, keep, table, after = _constants(p, track), np.ones(9), moments(track, p[DELAY]), means.copy()
+    for k in range(len(means)):
+        after[k, FO + 1 :] = 0.0
+        if k + 1 < len(means):
+            _advance(c, table[k], track.t[k + 1] - track.t[k], keep, air, after[k])
+    return after
+
+
+@nb.njit(**_FAST)
+def specific_force(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
+    """What an accelerometer reads at these means without random forces, shape (n, 3)."""
+    air = track.still > 0.0 or track.seen[:, 3].any()
+    c, table, out = _constants(p, track), moments(track, p[DELAY]), np.zeros((len(means), 3))
+    for k in range(len(means)):
+        out[k, 2] = -c[0] * table[k, 2 * MOMENTS]
+        if air:
+            x = means[k]
+            out[k, 0], out[k, 1], out[k, 2], _, _, _ = _force(
+                c, table[k, 2 * MOMENTS], table[k, 2 * MOMENTS + 5], x[0], x[1], x[2], x[3], x[7], x[8], x[9]
+            )
+    return out
+
+
+@nb.njit(**_FAST)
 def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray) -> float:
     """Innovations of other physics under the gains of a filter pass, whitened, and the sum of their squares.
 
@@ -648,6 +705,7 @@ def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatA
     total, before = 0.0, -1.0
     for k in range(n):
         _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
+        _read_beyond(track, k, nu)
         dx[:] = 0.0
         for m in range(M):
             if g.S[k, m] == 0.0:
@@ -669,6 +727,7 @@ def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatA
                 _keep(psi, h, keep)
                 before = h
             _advance(c, table[k], h, keep, air, x)
+            _go_beyond(track, k, dx, x)
     return total
 
 

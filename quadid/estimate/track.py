@@ -88,7 +88,7 @@ def _track(
             y[at, first:last], seen[at, group] = values, True
     piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
     still = STILL if air and not seen[:, 3].any() else 0.0
-    return Track(t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still)
+    return Track(t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still, np.empty((0, 18)))
 
 
 def _pieces(

@@ -21,26 +21,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from quadid_replay.opening import open_log
 
-from quadid.estimate import kalman as k
-from quadid.estimate.fit import Estimate, estimate
+from quadid.estimate.fit import estimate
 from quadid.estimate.missing import missing
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
 from quadid.grid import grid_recording
-from quadid.identify.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
-from quadid.window import Window
-from studies.filter_error import loop
+from studies.filter_error.jobs import SECONDS, errors, exact, fast_loop, of_window
 from studies.page import put_section
 from studies.truth import poor_guess
 
-SECONDS = 60.0
-GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
-"""Forces of 0.6 m/s^2, moments of 1 rad/s^2: a quarter of the control moment of these flights."""
 EFFECTS = (
     "rotor_drag.k_x", "rotor_drag.k_y", "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x",
     "cg_offset.y", "command_delay.delay",
@@ -58,32 +52,6 @@ KNOWN = {
     "crazyflie_rpm": "b 3.70e-8", "nanodrone": "b 3.72e-8; its low-passed states yield a wrong J",
     "iris": "b 5.84e-6, J_xx, J_yy 0.0291; commands at 10 Hz",
 }  # fmt: skip
-
-
-def of_window(window: Window, vehicle: Vehicle, swarm: int = 0, seed: int = 0) -> Estimate:
-    """The new estimate of one window."""
-    return estimate(Problem.of([from_window(window, vehicle)], vehicle), seed, iterations=swarm)
-
-
-def errors(found: Estimate, truth: Sequence[float]) -> FloatArray:
-    """Log errors of the six and their stated standard deviations, shape (2, 6)."""
-    pairs = [found.value(name) for name in NOMINAL_NAMES]
-    return np.array([[np.log(v / t) for (v, _), t in zip(pairs, truth, strict=True)], [s for _, s in pairs]])
-
-
-def exact(job: tuple[int, bool]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """One flight of a drawn Pelican: ours, today's fit, and the random forces found, as shares of their prior."""
-    seed, gusty = job
-    craft = Vehicle.shipped("pelican")
-    truth = draw_truth(craft, seed)
-    numbers = truth.as_dict()
-    window = fly(craft, truth, SECONDS, seed, outside=GUSTS if gusty else {}).window
-    vehicle = poor_guess(craft, numbers, seed)
-    found = of_window(window, vehicle)
-    today = fit([window], vehicle, FitOptions(iterations=0, seed=seed))
-    old = np.array([np.log(today.theta[:6] / list(numbers.values())), today.uncertainty.sigma])
-    sizes = found.psi[k.SIGMA : k.SIGMA + 4]
-    return errors(found, list(numbers.values())), old, sizes
 
 
 def table(rows: Sequence[tuple[str, FloatArray]]) -> list[str]:
@@ -144,17 +112,6 @@ def guesses(count: int) -> str:
         f"One flight of 30 s, {count} guesses with every value off by up to a factor 4, a seed each: "
         f"{100 * same:.0f} % end within 0.2 standard deviations of the median in all six; farthest {apart.max():.2f}."
     )
-
-
-def fast_loop(job: tuple[int, int, float, float]) -> FloatArray:
-    """One flight of the fast loop: errors of ours and today's fit, shape (2, 2, 6)."""
-    seed, every, share, speed = job
-    vehicle = Vehicle.shipped("pelican")
-    window = loop.fly(vehicle, SECONDS, seed, every=every, share=share, speed=speed)
-    truth = vehicle.initial.tolist()
-    today = fit([window], vehicle, FitOptions(iterations=0, seed=seed))
-    old = np.array([np.log(today.theta[:6] / truth), today.uncertainty.sigma])
-    return np.array([errors(of_window(window, vehicle), truth), old])
 
 
 def feedback(flights: int, processes: int) -> str:
@@ -242,7 +199,7 @@ def main() -> None:
         "exact": ("Simulated flights, exact model", lambda g: simulated(False, g.flights, g.processes)),
         "gusty": ("The same in gusts", lambda g: simulated(True, g.flights, g.processes)),
         "guesses": ("Guesses far off", lambda g: guesses(max(g.flights // 3, 3))),
-        "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 3), g.processes)),
+        "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 4), g.processes)),
         "recorded": ("Recorded vehicles", lambda g: recorded(g.data)),
         "speed": ("Speed", lambda g: speed()),
     }

@@ -7,10 +7,12 @@ import pytest
 
 from quadid.estimate import kalman as k
 from quadid.estimate.track import from_window
-from quadid.flight import draw_truth, fly
+from quadid.estimate.whole_model import WholeModel
+from quadid.flight import Flight, draw_truth, fly
 from quadid.model.layout import Layout
 from quadid.model.simulate import simulate
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from tests.estimate.linear import NOISE, PELICAN, batch, dense_filter, physics, tiny_flight
 
 GAUSS = np.zeros(4)
@@ -78,23 +80,58 @@ def test_a_replay_of_the_same_physics_gives_the_same_innovations() -> None:
     assert total == pytest.approx(float(np.sum(out**2)))
 
 
+EFFECTS = {
+    "rotor_drag": {"k_x": 0.3, "k_y": 0.4, "central": 1.0}, "cg_offset": {"x": 0.004, "y": -0.003},
+    "rate_damping": {"l_p": 0.5, "m_q": 0.8, "n_r": 0.2},
+}  # fmt: skip
+MORE = {
+    **EFFECTS, "motor_lag": {"tau": 0.03}, "weak_rotor": {"rotor": 2.0, "loss": 0.02},
+    "parasitic_drag": {"c": 0.05}, "gyro_scale": {"x": 0.02, "y": 0.0, "z": -0.03}, "imu_lever_arm": {"x": 0.05},
+}  # fmt: skip
+
+
+def blind(flight: Flight, vehicle: Vehicle) -> k.Track:
+    """The flight without measurements after the first."""
+    track = from_window(flight.window, vehicle)
+    seen = np.zeros_like(track.seen)
+    seen[0, 3] = True
+    return track._replace(seen=seen)
+
+
+def still(p: FloatArray, track: k.Track) -> k.Gains:
+    """A filter pass without random forces."""
+    noise = NOISE.copy()
+    noise[k.SIGMA : k.TIME] = 0.0
+    gains: k.Gains = k.kalman(track, p, noise, GAUSS, True)[1]
+    return gains
+
+
 def test_motion_is_the_simulations() -> None:
-    """The means move as `quadid.model` says, effects included; the filter only adds what was measured."""
-    effects = {
-        "rotor_drag": {"k_x": 0.3, "k_y": 0.4, "central": 1.0}, "cg_offset": {"x": 0.004, "y": -0.003},
-        "rate_damping": {"l_p": 0.5, "m_q": 0.8, "n_r": 0.2},
-    }  # fmt: skip
-    vehicle = PELICAN.model_copy(update={"effects": effects})
+    """The means move as `quadid.model` says, the filter's own effects included."""
+    vehicle = PELICAN.model_copy(update={"effects": EFFECTS})
     flight = fly(vehicle, seconds=4.0, seed=2)
-    speed, dt = np.asarray(flight.window.rotor_speed), flight.window.dt
-    wanted = simulate(vehicle, speed, dt, theta=Layout(vehicle).initial(vehicle))
+    wanted = simulate(vehicle, np.asarray(flight.window.rotor_speed), flight.window.dt)
     p = physics()
     p[:6] = vehicle.initial
     p[k.DRAG : k.DRAG + 2], p[k.CG : k.CG + 2] = (0.3, 0.4), (0.004, -0.003)
     p[k.DAMP : k.DAMP + 3] = 0.5, 0.8, 0.2
-    seen = np.zeros((len(speed), 4), dtype=np.bool_)
-    seen[0, 3] = True
-    blind = from_window(flight.window, vehicle)._replace(seen=seen)
-    _, g = k.kalman(blind, p, np.concatenate([NOISE[:12], np.zeros(6), NOISE[18:]]), GAUSS, True)
-    np.testing.assert_allclose(g.mean[1:, 4:7], wanted.rate[:-1], atol=2e-3 * float(np.std(wanted.rate)))
-    np.testing.assert_allclose(g.mean[1:, k.VE + 1 : k.VE + 4], wanted.velocity[:-1], atol=2e-2)
+    mean = still(p, blind(flight, vehicle)).mean
+    np.testing.assert_allclose(mean[1:, 4:7], wanted.rate[:-1], atol=1e-4)
+    np.testing.assert_allclose(mean[1:, k.VE + 1 : k.VE + 4], wanted.velocity[:-1], atol=1e-3)
+
+
+def test_any_other_model_moves_the_means_as_it_says() -> None:
+    vehicle = PELICAN.model_copy(update={"effects": MORE})
+    flight = fly(vehicle, seconds=4.0, seed=2)
+    speed, dt = np.asarray(flight.window.rotor_speed), flight.window.dt
+    wanted = simulate(vehicle, speed, dt)
+    p = physics()
+    p[:6] = vehicle.initial
+    whole = WholeModel(flight.window, vehicle, Layout(vehicle).initial(vehicle))
+    track = blind(flight, vehicle)
+    for _ in range(5):
+        track = track._replace(beyond=whole.beyond(track, p, still(p, track).mean))
+    mean = still(p, track).mean[1:60]
+    np.testing.assert_allclose(mean[:, k.VE + 1 : k.VE + 4], wanted.velocity[:59], atol=1e-5)
+    sensed = mean[:, 4:7] + track.beyond[1:60, 9:12]
+    np.testing.assert_allclose(sensed, wanted.rate[:59], atol=1e-9)
