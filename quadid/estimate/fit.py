@@ -12,14 +12,18 @@ from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import Problem
 from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 
 BOLD = 1.5
 """Longest step of a logarithm: less than a factor of five."""
+SWARM_SECONDS, NEAR_SECONDS = 20.0, 60.0
+"""Of all flights together, what the swarm searches and what the first steps look at [s]."""
 NEAR, MOST = 4, 40
 """Steps with random forces held large, and most steps after that."""
 ENOUGH = 0.1
 """Gain in -2 ln L that no step is worth taking for."""
+ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
+"""Which noise numbers a step may change."""
 CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
 PATIENCE = 8
@@ -68,20 +72,24 @@ def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: i
         particles: its size.
         iterations: of it; without any the search starts from the guess.
     """
-    z, psi = problem.start(), problem.first_noise()
+    part = problem.liveliest(SWARM_SECONDS)
+    z, psi = part.start(), part.first_noise()
     # 1. Search with random forces held large, so that no flight diverges from a bad guess.
     if iterations > 0:
-        z = swarm_search(problem, z, psi, particles, iterations, seed)
-    z, _, _, _ = scoring(problem, z, psi, NEAR, noise=False)
+        z = swarm_search(part, z, psi, particles, iterations, seed)
+    z, _, _, _ = scoring(part, z, psi, NEAR, NO_NOISE)
     problem, z = problem.based_on(z)
-    # 2. Let them shrink: noise and physics together, until the likelihood stays.
-    z, psi, value, gains = scoring(problem, z, psi, MOST)
+    # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
+    part = problem.liveliest(NEAR_SECONDS)
+    if part is not problem:
+        z, psi, _, _ = scoring(part, z, psi, MOST, ALL_NOISE)
+    z, psi, value, gains = scoring(problem, z, psi, MOST, ALL_NOISE)
     information, _, left = problem.normal_equations(z, psi, gains)
     # 3. Where innovations have outliers, their density has tails.
     tail = tails(left)
     if np.any(tail > 0.0):
         problem = replace(problem, tail=tail)
-        z, psi, value, gains = scoring(problem, z, psi, MOST)
+        z, psi, value, gains = scoring(problem, z, psi, MOST, ALL_NOISE)
         information, _, left = problem.normal_equations(z, psi, gains)
     # 4. Intervals from the information of this likelihood.
     return Estimate(problem, z, psi, np.asarray(np.linalg.inv(information)), value, tuple(left))
@@ -126,13 +134,13 @@ def swarm_search(
 
 
 def scoring(
-    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: bool = True
+    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: BoolArray
 ) -> tuple[FloatArray, FloatArray, float, list[Gains]]:
     """Fisher scoring of physics and noise, whose information has no common part.
 
-    Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms by the exact
-    score of the full filter.  Gains are renewed after every step; one that does not help is damped
-    (Levenberg-Marquardt).
+    Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
+    `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step; one that does
+    not help is damped (Levenberg-Marquardt).
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there.
@@ -143,12 +151,12 @@ def scoring(
     for _ in range(turns):
         information, gradient, _ = problem.normal_equations(z, psi, gains)
         log, slope, free = np.log(psi), np.zeros(len(psi)), np.zeros(len(psi), dtype=np.bool_)
-        if noise:
+        if noise.any():
             slope = problem.score(z, psi, gains) * psi
             if np.max(np.abs(log - at)) > STALE:
                 curvature, at = 2.0 * problem.noise_information(z, psi) + np.diag(problem.noise_curvature(psi)), log
             # What rests on a bound and would go beyond stays there.
-            free = ~(((log <= low) & (slope > 0.0)) | ((log >= high) & (slope < 0.0)))
+            free = noise & ~(((log <= low) & (slope > 0.0)) | ((log >= high) & (slope < 0.0)))
         for _ in range(PATIENCE):
             step, bold = _damped(information, gradient, damping), np.zeros(len(psi))
             bold[free] = _damped(curvature[np.ix_(free, free)], slope[free], damping)

@@ -75,8 +75,8 @@ class Track(NamedTuple):
         mass: [kg].
         rotors: number of rotors.
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
-        beyond: what a larger model adds: to rate, rotation vector and velocity at the end of each step, to gyro,
-            attitude and accelerometer at its begin, shape (n, 18); no rows: nothing.  See `whole_model`.
+        beyond: what a larger model adds: to rate, rotation vector and velocity at the end of each step, to the
+            measurements at its begin, shape (n, 9 + M); no rows: nothing.  See `whole_model`.
     """
 
     t: FloatArray
@@ -300,9 +300,9 @@ def _go_beyond(track: Track, k: int, room: FloatArray, x: FloatArray) -> None:
 
 @nb.njit(**_FAST)
 def _read_beyond(track: Track, k: int, nu: FloatArray) -> None:
-    """Takes what a larger model makes of gyro, attitude and accelerometer off the innovations of row k."""
+    """Takes what a larger model makes of each measurement off the innovations of row k."""
     if len(track.beyond) > 0:
-        for m in range(VELOCITY):
+        for m in range(M):
             nu[m] -= track.beyond[k, 9 + m]
 
 

@@ -1,19 +1,41 @@
-"""The missing force and moment: what acted on the vehicle and its model does not produce, with bands."""
+"""The missing force and moment: what acted on a vehicle and its model does not produce, with bands.
+
+A random force is estimated beside the model by the smoother of `quadid.estimate.kalman`; a constant moment and the
+sensors' biases belong to each flight and are not missing.  Models are compared at the sensor noise and the correlation
+times of one of them; how large the random forces are beside each is estimated anew, or a right model would be said to
+miss what a wrong one does.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from quadid.chi_square import Z95
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import Estimate
+from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring
+from quadid.estimate.problem import Problem
+from quadid.estimate.track import from_window
+from quadid.estimate.whole_model import WholeModel
+from quadid.model.layout import Layout
 from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+from quadid.window import Window
+
+ROUNDS = 2
+"""Filter passes between which effects are simulated anew along the filtered states."""
+RESIZING = 10
+"""Most steps to the size of the random forces."""
+_SIZES = (np.arange(k.N_NOISE) >= k.SIGMA) & (np.arange(k.N_NOISE) < k.SIGMA + 4)
+TRIMMING = 3
+"""Steps that trim moment and biases of a flight take: the likelihood is nearly a parabola in them."""
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Of one flight, body axes.
+    """Of one stretch of flight, body axes.
 
     Attributes:
         t: times [s], shape (n,).
@@ -21,7 +43,9 @@ class Missing:
         force_sigma: its standard deviation, shape (n, 3).
         moment: smoothed random moment [N m], shape (n, 3).
         moment_sigma: its standard deviation, shape (n, 3).
-        control: root mean square of the rotors' moment about its mean [N m], shape (3,).
+        control: rotor moments [N m] at each time, shape (n, 3).
+        weight: [N].
+        times: correlation times of the random force and moment [s], shape (6,).
     """
 
     t: FloatArray
@@ -30,36 +54,104 @@ class Missing:
     moment: FloatArray
     moment_sigma: FloatArray
     control: FloatArray
-
-    @property
-    def force_rms(self) -> FloatArray:
-        """Root mean square force [N], shape (3,): what is expected of it, its uncertainty included."""
-        return np.asarray(np.sqrt(np.mean(self.force**2 + self.force_sigma**2, axis=0)))
-
-    @property
-    def moment_rms(self) -> FloatArray:
-        """Root mean square moment [N m], shape (3,)."""
-        return np.asarray(np.sqrt(np.mean(self.moment**2 + self.moment_sigma**2, axis=0)))
+    weight: float
+    times: FloatArray
 
 
-def missing(found: Estimate) -> list[Missing]:
-    """Smoothed random force and moment of every flight (Bryson & Frazier; see `quadid.estimate.kalman`)."""
+def smoothed(found: Estimate) -> list[Missing]:
+    """Missing force and moment of every flight of an estimate."""
+    return _smoothed(found.problem, found.z, found.psi)
+
+
+def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]:
     out = []
-    _, gains = found.problem.passes(found.z, found.psi)
-    for j, (track, g) in enumerate(zip(found.problem.tracks, gains, strict=True)):
-        p = found.problem.physics(found.z, j)
-        _, mean, variance = k.backward(track, p, found.psi, g, True)
-        sigma, inertia = np.sqrt(np.maximum(variance, 0.0)), p[k.JX : k.JX + 3]
-        moment = 0.5 * (g.table[:-1, 1:4] + g.table[:-1, k.MOMENTS + 1 : k.MOMENTS + 4])
-        arms = np.std(moment, axis=0)[[1, 0, 2]] * [p[k.B], p[k.B], p[k.D]]
+    _, gains = problem.passes(z, psi)
+    for j, (track, g) in enumerate(zip(problem.tracks, gains, strict=True)):
+        p = problem.physics(z, j)
+        _, mean, variance = k.backward(track, p, psi, g, True)
+        sigma = np.sqrt(np.maximum(variance, 0.0))
+        scale = np.concatenate([np.full(3, track.mass), p[k.JX : k.JX + 3]])
+        square = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])
+        control = square[:, [1, 0, 2]] * [-p[k.B], p[k.B], p[k.D]]
+        acted, spread = scale * mean[:, :6], scale * sigma[:, :6]
         out.append(
             Missing(
                 track.t,
-                track.mass * mean[:, :3],
-                track.mass * sigma[:, :3],
-                inertia * mean[:, 3:6],
-                inertia * sigma[:, 3:6],
-                arms,
+                acted[:, :3],
+                spread[:, :3],
+                acted[:, 3:],
+                spread[:, 3:],
+                control,
+                track.mass * GRAVITY,
+                psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
             )  # fmt: skip
         )
     return out
+
+
+class Vehicles:
+    """Flights on which models of one vehicle are compared by what they miss.
+
+    Attributes:
+        psi: noise numbers, those of the first model on the flights that it was fitted to.
+    """
+
+    def __init__(self, windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray) -> None:
+        """Estimates the noise numbers beside a parameter vector of `quadid.model`, from its liveliest minute."""
+        self.vehicle = vehicle
+        problem, z = self._settled(windows, theta, None)
+        _, self.psi, _, _ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
+
+    def missing(self, windows: Sequence[Window], theta: FloatArray) -> list[Missing]:
+        """What a parameter vector misses on these flights, which need not be those of the noise."""
+        problem, z = self._settled(windows, theta, self.psi)
+        part = problem.liveliest(NEAR_SECONDS)
+        _, psi, _, _ = scoring(part, z, self.psi, RESIZING, _SIZES)
+        return _smoothed(problem, z, psi)
+
+    def _settled(
+        self, windows: Sequence[Window], theta: FloatArray, psi: FloatArray | None
+    ) -> tuple[Problem, FloatArray]:
+        """The problem with fixed physics, effects simulated along its filtered states, and trim and biases."""
+        neutral = Layout(self.vehicle).neutral()
+        plain = bool(np.all(theta[6:] == neutral[6:]))
+        tracks = [from_window(w, self.vehicle, air=not plain) for w in windows]
+        problem = Problem.fixed(tracks, self.vehicle, theta[:6])
+        z, noise = problem.start(), problem.first_noise() if psi is None else psi
+        if not plain:
+            models = [WholeModel(w, self.vehicle, theta) for w in windows]
+            for _ in range(ROUNDS):
+                _, gains = problem.passes(z, noise)
+                problem = problem.beside([m.beyond(t, problem.physics(z, j), g.mean) for j, (m, t, g) in
+                                          enumerate(zip(models, problem.tracks, gains, strict=True))])  # fmt: skip
+        z, _, _, _ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
+        return problem, z
+
+
+def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:
+    """Root mean square over flights, sensor noise taken off, and its 95 % interval, shapes (3,) and (2, 3).
+
+    The mean square is that of the smoothed value and its variance; the interval that of as many independent values as
+    there are pairs of correlation times.
+    """
+    value = np.concatenate([m.force if force else m.moment for m in parts])
+    sigma = np.concatenate([m.force_sigma if force else m.moment_sigma for m in parts])
+    square = np.mean(value**2 + sigma**2, axis=0)
+    seconds = sum(float(m.t[-1] - m.t[0]) for m in parts)
+    times = parts[0].times[:3] if force else parts[0].times[3:]
+    independent = np.maximum(0.5 * seconds / times, 1.0)
+    spread = Z95 * np.sqrt(np.mean(4.0 * value**2 * sigma**2 + 2.0 * sigma**4, axis=0) / independent)
+    interval = np.sqrt(np.maximum([square - spread, square + spread], 0.0))
+    return np.sqrt(square), interval
+
+
+def removed(before: Sequence[Missing], after: Sequence[Missing]) -> float:
+    """Share of the squared missing force and moment that a larger model takes away.
+
+    Each axis counts in units of what the smaller model misses there: weight and rotor moment.
+    """
+    shares = []
+    for parts in (before, after):
+        weight, control = parts[0].weight, np.concatenate([m.control for m in parts]).std(axis=0)
+        shares.append(np.sum((size(parts, True)[0] / weight) ** 2) + np.sum((size(parts, False)[0] / control) ** 2))
+    return float(1.0 - shares[1] / shares[0])

@@ -64,6 +64,21 @@ def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
     return np.asarray(np.std(arms / p[k.JX : k.JX + 3], axis=0) + 1e-3)
 
 
+def _liveliest(track: Track, share: float) -> Track:
+    """The stretch of a flight, as long as a share of its rows, with the largest rates."""
+    n = len(track.t)
+    rows = max(int(share * n), min(n, 2 * STRETCH))
+    square = np.concatenate([[0.0], np.cumsum(np.sum(track.y[:, :3] ** 2, axis=1) * track.seen[:, 0])])
+    first = int(np.argmax(square[rows:] - square[: n + 1 - rows]))
+    return cut(track, first, first + rows)
+
+
+def cut(track: Track, first: int, last: int) -> Track:
+    """Rows `first` to before `last`; rotor speeds are kept whole."""
+    rows = slice(first, last)
+    return track._replace(t=track.t[rows], y=track.y[rows], seen=track.seen[rows], beyond=track.beyond[rows])
+
+
 def floor_of(tracks: Sequence[Track]) -> FloatArray:
     """Least white noise of every scalar measurement, shape (M,): the step of its numbers / sqrt 12."""
     out = np.full(k.M, 1e-5)
@@ -87,6 +102,7 @@ class Problem:
         names: free entries of `PLACES`; those of `PER_FLIGHT` once for every flight.
         base: physics vector of what is not free, shape (N_PHYSICS,).
         tail: see `kalman.kalman`.
+        control: see `control_moment`; unit of what is random.
     """
 
     tracks: tuple[Track, ...]
@@ -94,6 +110,7 @@ class Problem:
     names: tuple[str, ...]
     base: FloatArray
     tail: FloatArray
+    control: FloatArray
 
     @classmethod
     def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), tail: float = 0.0) -> Problem:
@@ -101,17 +118,35 @@ class Problem:
         base = np.zeros(k.N_PHYSICS)
         base[:6] = vehicle.initial
         upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
-        return cls(tuple(tracks), vehicle, (*NOMINAL_NAMES, *TRIMMED, *upright, *names), base, np.full(4, tail))
+        free, control = (*NOMINAL_NAMES, *TRIMMED, *upright, *names), control_moment(tracks, base)
+        return cls(tuple(tracks), vehicle, free, base, np.full(4, tail), control)
+
+    @classmethod
+    def fixed(cls, tracks: Sequence[Track], vehicle: Vehicle, six: FloatArray) -> Problem:
+        """Trim moment and biases free, the six as given."""
+        problem = cls.of(tracks, vehicle)
+        base = problem.base.copy()
+        base[:6] = six
+        free = tuple(n for n in problem.names if n not in NOMINAL_NAMES)
+        return replace(problem, base=base, names=free, control=control_moment(tracks, base))
+
+    def beside(self, beyond: Sequence[FloatArray]) -> Problem:
+        """The problem with what a larger model adds on each flight, see `Track.beyond`."""
+        tracks = [track._replace(beyond=rows) for track, rows in zip(self.tracks, beyond, strict=True)]
+        return replace(self, tracks=tuple(tracks))
 
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
         """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
-        new = replace(self, base=self.physics(z, 0))
+        base = self.physics(z, 0)
+        new = replace(self, base=base, control=control_moment(self.tracks, base))
         return new, np.asarray(z * self.size / new.size)
 
-    @cached_property
-    def control(self) -> FloatArray:
-        """See `control_moment`."""
-        return control_moment(self.tracks, self.base)
+    def liveliest(self, seconds: float) -> Problem:
+        """The same flights, of each its share of `seconds` in which it turns most: to be near, before all of them."""
+        total = sum(float(track.t[-1] - track.t[0]) for track in self.tracks)
+        if total <= 1.2 * seconds:
+            return self
+        return replace(self, tracks=tuple(_liveliest(track, seconds / total) for track in self.tracks))
 
     @cached_property
     def entries(self) -> tuple[tuple[str, int, int], ...]:
@@ -238,9 +273,9 @@ class Problem:
         """
         out = np.zeros((k.N_NOISE, k.N_NOISE))
         for j, track in enumerate(self.tracks):
-            n = len(track.t)
-            first = max((n - STRETCH) // 2, 0)
-            part = track._replace(**{a: getattr(track, a)[first : first + STRETCH] for a in ("t", "y", "seen")})
+            n, rows = len(track.t), max(STRETCH // len(self.tracks), 4 * SETTLED)
+            first = max((n - rows) // 2, 0)
+            part = cut(track, first, first + rows)
             p = self.physics(z, j)
 
             def innovations(i: int, part: Track = part, p: FloatArray = p) -> tuple[FloatArray, FloatArray]:

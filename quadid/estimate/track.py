@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.estimate.kalman import MOMENTS, Track
+from quadid.estimate.kalman import MOMENTS, M, Track
 from quadid.mounting import in_body_axes
 from quadid.resample import copied, sample_period
 from quadid.rotor_signal import rotor_signal
@@ -88,7 +88,9 @@ def _track(
             y[at, first:last], seen[at, group] = values, True
     piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
     still = STILL if air and not seen[:, 3].any() else 0.0
-    return Track(t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still, np.empty((0, 18)))
+    return Track(
+        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still, np.empty((0, 9 + M))
+    )
 
 
 def _pieces(

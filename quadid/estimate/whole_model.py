@@ -66,13 +66,14 @@ class WholeModel:
         there[:, 0] = 1.0
         there[rows, :4], there[rows, 4:7], there[rows, 7:10] = _quaternion(moved[:, 3:6]), moved[:, :3], moved[:, 9:12]
         own = k.single_steps(track, p, means)[:-2]
-        out = np.zeros((n, 18))
+        out = np.zeros((n, 9 + k.M))
         out[rows - 1, :3] = moved[:, :3] - own[:, 4:7]
         out[rows - 1, 3:6] = turn(own[:, :4], there[rows, :4])
         out[rows - 1, 6:9] = moved[:, 9:12] - own[:, 7:10]
         out[rows, 9:12] = read[:, :3] - moved[:, :3]
         out[rows, 12:15] = turn(there[rows, :4], _quaternion(read[:, 3:6]))
         out[rows, 15:18] = read[:, 6:9] - k.specific_force(track, p, there)[rows]
+        out[rows, 18:21] = read[:, 9:12] - moved[:, 9:12]
         return out
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from quadid_replay.opening import open_log
 
 from quadid.estimate.fit import estimate
-from quadid.estimate.missing import missing
+from quadid.estimate.missing import size, smoothed
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
@@ -150,9 +150,9 @@ def recorded(data: Path) -> str:
             tracks += [from_window(w, vehicle, air=True) for w in windows] or [from_recording(log, vehicle, air=True)]
         found = estimate(Problem.of(tracks, vehicle, EFFECTS), iterations=0)
         delay, late = found.value("command_delay.delay")
-        acted = missing(found)
-        force = np.mean([m.force_rms for m in acted], axis=0) / (vehicle.mass * 9.80665)
-        moment = np.mean([m.moment_rms[:2] / m.control[:2] for m in acted], axis=0)
+        acted = smoothed(found)
+        force = size(acted, force=True)[0] / acted[0].weight
+        moment = size(acted, force=False)[0] / np.concatenate([m.control for m in acted]).std(axis=0)
         six = {n: found.value(n) for n in ("b", "J_xx", "J_yy")}
         lines.append(
             f"| `{folder}` {', '.join(f.removesuffix('.csv') for f in files)} | {rate or 'own'} | "

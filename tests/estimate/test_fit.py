@@ -9,10 +9,11 @@ import pytest
 
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import Estimate, estimate, tails
-from quadid.estimate.missing import missing
+from quadid.estimate.missing import Vehicles, removed, size, smoothed
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
-from quadid.flight import draw_truth, fly
+from quadid.flight import TruthParameters, draw_truth, fly
+from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid.vehicle_parts import ParameterPrior
@@ -62,8 +63,30 @@ def test_guesses_off_by_up_to_four_end_at_the_same_optimum() -> None:
 
 def test_gusts_are_found_in_newtons() -> None:
     found, _ = estimated(3, gusty=True)
-    (one,) = missing(found)
+    parts = smoothed(found)
     # 0.6 m/s^2 along north and east, half of it down; 1 rad/s^2 about x and y.
-    assert one.force_rms[:2] == pytest.approx(PELICAN.mass * np.array([0.6, 0.6]), rel=0.3)
+    force, interval = size(parts, force=True)
+    assert force[:2] == pytest.approx(PELICAN.mass * np.array([0.6, 0.6]), rel=0.3)
+    assert np.all((interval[0] < force) & (force < interval[1]))
     inertia = [found.value(n)[0] for n in NOMINAL_NAMES[2:4]]
-    assert one.moment_rms[:2] == pytest.approx(inertia, rel=0.3)
+    assert size(parts, force=False)[0][:2] == pytest.approx(inertia, rel=0.3)
+
+
+HIDDEN = {"cg_offset": {"x": 0.01, "y": 0.0}, "rotor_drag": {"k_x": 0.4, "k_y": 0.4}}
+
+
+def test_the_model_with_the_cause_misses_less_on_another_flight() -> None:
+    """Drag pulls against the velocity; on a flight that was not fitted the right model explains nearly all of it."""
+    windows = [fly(PELICAN, None, 30.0, seed, effects=HIDDEN, extras=("velocity",)).window for seed in (1, 2)]
+    layout = Layout(PELICAN)
+    nominal = layout.initial(PELICAN)
+    nominal[:6] = list(TruthParameters.of(PELICAN).as_dict().values())
+    whole, half = nominal.copy(), nominal.copy()
+    layout.write_effects(whole, HIDDEN)
+    layout.write_effects(half, {"rotor_drag": {"k_x": 0.4, "k_y": 0.0}})
+    flights = Vehicles(windows[:1], PELICAN, nominal)
+    before, after, between = (flights.missing(windows[1:], theta) for theta in (nominal, whole, half))
+    assert removed(before, after) > 0.95
+    assert 0.1 < removed(before, between) < 0.95
+    # What is missing without it: drag of 0.4 1/s at a few m/s.
+    assert np.all(size(before, force=True)[0][:2] > 0.01 * before[0].weight)
