@@ -26,7 +26,7 @@ def demo(
 
     output.check_file(json, "--json")
     folder = output.out_folder(out)
-    with terminal.progress(("simulation", "statistics", "flight")) as advance:
+    with terminal.progress(("simulation", "statistics", "estimate", "flight")) as advance:
         shown = work.run(work.QUICK_SECONDS if quick else work.SECONDS, seed, folder, advance)
     page = folder / "report.html"
     result = work.summary(shown, str(page))

@@ -76,6 +76,8 @@ def conclude(
     print_tables(console, done.tables())
     if done.verdict is not None:
         print_verdict(console, done.verdict)
+    if done.result.get("missing"):
+        console.print(done.result["missing"]["statement"], soft_wrap=True)
     for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
         if done.result.get(key):
             console.print(f"{label}: {done.result[key]}", soft_wrap=True)

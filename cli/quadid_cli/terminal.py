@@ -44,7 +44,7 @@ def warn(messages: tuple[str, ...] | list[str]) -> None:
 
 
 @contextmanager
-def progress(compiled: Sequence[str] = ("simulation", "statistics")) -> Iterator[Advance]:
+def progress(compiled: Sequence[str] = ("simulation", "statistics", "estimate")) -> Iterator[Advance]:
     """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
 
     Args:

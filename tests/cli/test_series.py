@@ -28,7 +28,25 @@ def result(quadid: Cli, flights: Flights, tmp_path_factory: pytest.TempPathFacto
 
 def test_one_file_a_log_and_form(result: dict[str, Any]) -> None:
     names = [f"{log}.simulated.{kind}" for log in ("train.mcap", "unseen.csv") for kind in ("csv", "mcap")]
-    assert [Path(path).name for path in result["series"]] == names
+    missing = ["train.mcap.missing.csv", "unseen.csv.missing.csv"]
+    assert [Path(path).name for path in result["series"]] == [*names, *missing]
+
+
+def test_what_is_missing_stands_in_newtons_with_its_bands(result: dict[str, Any]) -> None:
+    """Of exact flights nearly nothing is missing; the file over time says what the result says of them."""
+    missing = result["missing"]
+    assert [s["role"] for s in missing["sets"]] == ["train", "validate"]
+    assert missing["force"]["of"] == pytest.approx(1.3 * 9.80665)
+    assert (missing["force"]["unit"], missing["moment"]["of_what"]) == ("N", "rms control moment")
+    for axis in "xyz":
+        assert missing["force"]["nominal"][axis] < 0.01 * missing["force"]["of"]
+        assert missing["moment"]["nominal"][axis] < 0.1 * missing["moment"]["of"][axis]
+        low, high = missing["moment"]["nominal_ci95"][axis]
+        assert low <= missing["moment"]["nominal"][axis] <= high
+    names, rows = table(Path(result["series"][-2]))
+    force, sigma = (rows[:, names.index(f"nominal/{name}_x")] for name in ("force", "force_sigma"))
+    stated = missing["sets"][0]["force"]["nominal"]["x"]
+    assert np.sqrt(np.mean(force**2 + sigma**2)) == pytest.approx(stated, rel=1e-4)
 
 
 def test_the_csv_holds_the_stated_errors(result: dict[str, Any]) -> None:

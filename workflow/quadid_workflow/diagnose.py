@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from quadid_workflow.files import file_name
 from quadid_workflow.identify import origin_remark, out_of_reach, proven
 from quadid_workflow.logs import Given, settled
+from quadid_workflow.missing import MissingForces, missing_forces
 from quadid_workflow.outcome import NUMBER_COLUMNS, number_rows
 from quadid_workflow.progress import Advance, silent
 from quadid_workflow.reporting import LIBRARY, Fitted, provenance, quality
@@ -52,6 +53,7 @@ class Diagnosed(Fitted):
     logs: list[Log]
     nominal: Vehicle
     search: Search
+    forces: MissingForces | None = None
 
     @property
     def vehicle(self) -> Vehicle:
@@ -196,7 +198,23 @@ def diagnose(
         {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
         for s in sets
     ]
-    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection)
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta})
+    result["missing"] = None if forces is None else forces.result()
+    for entry in result["findings"]:
+        names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]
+        less = _neutral(fit.vehicle, model.theta, names)
+        entry["gain"]["missing_removed"] = None if forces is None else forces.taken(less)
+    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces)
+
+
+def _neutral(vehicle: Vehicle, theta: FloatArray, names: Sequence[str]) -> FloatArray:
+    """A parameter vector without some effects."""
+    from quadid.model.layout import Layout
+
+    layout, out = Layout(vehicle), theta.copy()
+    for entry in (layout.entry(name) for name in names):
+        out[entry.index] = entry.neutral
+    return out
 
 
 def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:

@@ -12,6 +12,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid_workflow.files import file_name
 from quadid_workflow.logs import Given, settled
+from quadid_workflow.missing import MissingForces, missing_forces
 from quadid_workflow.progress import Advance, silent
 from quadid_workflow.reporting import LIBRARY, Fitted, known, provenance, quality, told
 from quadid_workflow.searching import OPTIMIZERS, check_optimizer, check_seed, search
@@ -44,6 +45,7 @@ class Identified(Fitted):
     fit: Fit
     sets: list[ScoredSet]
     logs: list[Log]
+    forces: MissingForces | None = None
 
     @property
     def parameters(self) -> ParameterSet:
@@ -194,7 +196,9 @@ def identify(
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
     for entry, log in zip(result["sets"], (*train, *held), strict=True):
         entry["seconds"] = log.grid.seconds_used
-    done = Identified(result, fit, sets, [*train, *held])
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta})
+    result["missing"] = None if forces is None else forces.result()
+    done = Identified(result, fit, sets, [*train, *held], forces)
     result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)

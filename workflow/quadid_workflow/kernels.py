@@ -122,6 +122,24 @@ def _statistics() -> None:
     ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
 
 
+def _estimate() -> None:
+    import numpy as np
+
+    from quadid.estimate import kalman
+    from quadid.estimate.problem import Problem
+    from quadid.estimate.track import from_window
+
+    vehicle, window = _hover()
+    track = from_window(window, vehicle)
+    problem = Problem.of([track], vehicle)
+    p, psi = problem.physics(problem.start(), 0), problem.first_noise()
+    _, gains = kalman.kalman(track, p, psi, problem.tail, True)
+    kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)))
+    kalman.backward(track, p, psi, gains, True)
+    kalman.single_steps(track, p, gains.mean)
+    kalman.specific_force(track, p, gains.mean)
+
+
 def _flight() -> None:
     from quadid.flight import fly
 
@@ -143,6 +161,14 @@ def _statistics_kernels() -> list[Any]:
     return [_reduce_on_disk, fly_closed_loop]
 
 
+def _estimate_kernels() -> list[Any]:
+    from quadid.estimate import kalman
+
+    return [
+        kalman.moments, kalman.kalman, kalman.replay, kalman.backward, kalman.single_steps, kalman.specific_force
+    ]  # fmt: skip
+
+
 def _flight_kernels() -> list[Any]:
     from quadid.flight.march import march
 
@@ -152,7 +178,8 @@ def _flight_kernels() -> list[Any]:
 PARTS = {
     "simulation": Part(_simulation, _simulation_kernels, 100),
     "statistics": Part(_statistics, _statistics_kernels, 100),
+    "estimate": Part(_estimate, _estimate_kernels, 30),
     "flight": Part(_flight, _flight_kernels, 30),
 }
-"""What an identification or a diagnosis needs, in two parts, and the flown vehicle of `quadid simulate`."""
-FIT = ("simulation", "statistics")
+"""What an identification or a diagnosis needs, in three parts, and the flown vehicle of `quadid simulate`."""
+FIT = ("simulation", "statistics", "estimate")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
     from quadid.window import Recording
     from quadid_workflow.loading import Log
+    from quadid_workflow.missing import MissingForces
 
 LIBRARY = "a call of the library"
 """Stands for the command line where there is none."""
@@ -47,10 +48,12 @@ class Fitted(Reported):
     Attributes:
         sets: scored logs, for pictures.
         logs: the same ones as loaded, training logs first.
+        forces: what the models miss on them; None where no gyro or accelerometer shows it.
     """
 
     sets: list[ScoredSet]
     logs: list[Log]
+    forces: MissingForces | None
 
     @property
     def train(self) -> list[Log]:
@@ -58,10 +61,11 @@ class Fitted(Reported):
         return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
 
     def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
-        """Writes measured outputs of every log, and those of both simulations, as mcap or csv."""
+        """Writes measured and simulated outputs of every log as mcap or csv, and what is missing as csv."""
         from quadid_workflow.series import save_series
 
-        return save_series(self.sets, self.logs, folder, kinds)
+        missing = [] if self.forces is None else self.forces.save(folder)
+        return [*save_series(self.sets, self.logs, folder, kinds), *missing]
 
 
 def known(vehicle: Vehicle) -> str:
