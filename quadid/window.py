@@ -49,6 +49,11 @@ class Sample:
     channel: str
     values: tuple[float, ...]
 
+    @property
+    def block(self) -> Block:
+        """The sample as a block."""
+        return Block(np.array([self.t]), ((self.channel, np.array([self.values])),))
+
 
 @dataclass(frozen=True)
 class Block:

@@ -1,4 +1,4 @@
-"""Samples of one channel of a live stream, sorted by time."""
+"""Samples of one channel of a live stream: those that wait in the order of arrival, and those sorted by time."""
 
 from __future__ import annotations
 
@@ -12,55 +12,47 @@ from quadid.window import Channel
 
 
 class ChannelBuffer:
-    """Samples of one channel, sorted by time.
+    """Samples of one channel.
 
     Attributes:
         t, values: those sorted in, shapes (n,) and (n, columns).
-        arrived: how many ever came.
-        waiting: how many of them are not sorted in yet.
+        waiting: how many are not sorted in yet.
+        taken: how many ever were, late ones and doubles included.
     """
 
     def __init__(self, columns: int) -> None:
         self.t = np.empty(0)
         self.values = np.empty((0, columns))
-        self.arrived = 0
-        self.waiting = 0
-        self._chunks: deque[tuple[FloatArray, FloatArray]] = deque()
-        self._single_t: list[float] = []
-        self._single: list[tuple[float, ...]] = []
+        self.waiting = self.taken = 0
+        self._chunks: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque()
 
-    def add(self, t: float, values: tuple[float, ...]) -> None:
-        """Takes a sample in the order of arrival."""
-        self._single_t.append(t)
-        self._single.append(values)
-        self.arrived += 1
-        self.waiting += 1
+    def add(self, reached: FloatArray, t: FloatArray, values: FloatArray) -> None:
+        """Takes samples in the order of arrival.
 
-    def extend(self, t: FloatArray, values: FloatArray) -> None:
-        """Takes samples in the order of arrival: times, shape (n,), and values, shape (n, columns)."""
-        self._gather()
-        self._chunks.append((t, values))
-        self.arrived += len(t)
-        self.waiting += len(t)
+        Args:
+            reached: time that the stream had reached before each [s], never falling, shape (n,).
+            t: times of the samples [s], shape (n,).
+            values: shape (n, columns).
+        """
+        if len(t):
+            self._chunks.append((reached, t, values))
+            self.waiting += len(t)
 
-    def restart(self, arrived: int) -> None:
-        """Drops the first `arrived` samples that ever came."""
-        self._take(arrived)
-        self.t, self.values = self.t[:0], self.values[:0]
+    def settle(self, oldest: float, before: float, since: float = -np.inf) -> tuple[int, int]:
+        """Sorts in what came before the stream reached `before` [s]; returns how many were too late, and doubles.
 
-    def settle(self, oldest: float, arrived: int) -> tuple[int, int]:
-        """Sorts in what is among the first `arrived` samples; returns how many of them were too late and doubles."""
-        chunks = self._take(arrived)
+        Args:
+            oldest: earlier samples [s] are too late.
+            before: see above.
+            since: what came before the stream had passed this [s] belongs to an earlier stretch, and is not late.
+        """
+        chunks = self._take(before)
         if not chunks:
             return 0, 0
-        late = 0
-        for k, (t, values) in enumerate(chunks):
-            in_time = t >= oldest
-            if not in_time.all():
-                late += len(t) - int(np.count_nonzero(in_time))
-                chunks[k] = t[in_time], values[in_time]
-        t = np.concatenate([self.t, *(t for t, _ in chunks)])
-        values = np.concatenate([self.values, *(v for _, v in chunks)])
+        reached, t, values = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+        in_time = t >= oldest
+        late = int(np.count_nonzero(~in_time & (reached > since)))
+        t, values = np.concatenate([self.t, t[in_time]]), np.concatenate([self.values, values[in_time]])
         doubles = 0
         if np.any(t[1:] <= t[:-1]):
             order = np.argsort(t, kind="stable")
@@ -71,36 +63,27 @@ class ChannelBuffer:
         self.t, self.values = t, values
         return late, doubles
 
-    def _take(self, arrived: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Takes what waits of the first `arrived` samples that ever came."""
-        self._gather()
-        count = self.waiting - (self.arrived - arrived)
-        self.waiting -= max(count, 0)
+    def _take(self, before: float) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         out = []
-        while count > 0:
-            t, values = self._chunks.popleft()
-            if len(t) > count:
-                self._chunks.appendleft((t[count:], values[count:]))
-                t, values = t[:count], values[:count]
-            out.append((t, values))
-            count -= len(t)
+        while self._chunks and self._chunks[0][0][0] < before:
+            reached, t, values = self._chunks.popleft()
+            count = int(np.searchsorted(reached, before))
+            if count < len(t):
+                self._chunks.appendleft((reached[count:], t[count:], values[count:]))
+            out.append((reached[:count], t[:count], values[:count]))
+            self.waiting -= count
+            self.taken += count
         return out
 
-    def _gather(self) -> None:
-        """Makes a chunk of the samples that came one by one."""
-        if self._single:
-            self._chunks.append((np.array(self._single_t), np.array(self._single)))
-            self._single_t, self._single = [], []
-
     def forget(self, before: float) -> None:
-        """Drops samples before a time [s]."""
+        """Drops sorted samples before a time [s]."""
         first = int(np.searchsorted(self.t, before))
         if first:
             self.t, self.values = self.t[first:], self.values[first:]
 
     def between(self, name: str, a: float, b: float) -> Channel | None:
-        """The samples in [a, b] as a channel; None when there are fewer than two."""
-        low, high = int(np.searchsorted(self.t, a)), int(np.searchsorted(self.t, b, side="right"))
+        """The samples in [a, b) as a channel; None when there are fewer than two."""
+        low, high = int(np.searchsorted(self.t, a)), int(np.searchsorted(self.t, b))
         if high - low < 2:
             return None
         values = self.values[low:high]

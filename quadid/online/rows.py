@@ -27,6 +27,7 @@ class Rows:
         fresh: True when the grid was anchored anew before the first row: nothing may be joined across.
         problem: why there are no rotor speeds, or empty.
         spacing: time between two readings of the rotors [rows].
+        new_clock: True where it was anchored anew because a new time base began: another run of the vehicle, maybe.
     """
 
     t: FloatArray
@@ -36,6 +37,7 @@ class Rows:
     fresh: bool = False
     problem: str = ""
     spacing: float = 1.0
+    new_clock: bool = False
 
 
 def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:

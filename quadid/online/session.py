@@ -30,7 +30,7 @@ from quadid.online.jobs import MOST_ERRORS, Job, JobReply, unexpected
 from quadid.online.outbox import Action, Outbox
 from quadid.online.quality import Quality
 from quadid.online.records import OnlineSet, Phase, Publish, SessionStatus, SetState
-from quadid.online.resampler import Resampler
+from quadid.online.resampler import LEADER, Resampler
 from quadid.online.rows import Rows
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
@@ -95,13 +95,17 @@ class Session:
 
     # --- input
 
-    def push(self, sample: Sample) -> None:
-        """Takes one sample: stamp [s], channel, values in core units and frames."""
-        self.resampler.push(sample)
+    def push(self, messages: Block | Sample) -> None:
+        """Takes messages: stamps [s], channels in core units and frames; their portions change nothing."""
+        self.resampler.push(messages if isinstance(messages, Block) else messages.block)
+        for channel, text in self.resampler.notices:
+            if channel == LEADER:
+                self._outbox.note(self.resampler.time.newest, Phase.BLOCKED, text)
+            else:
+                self._outbox.say(self.resampler.time.newest, "warning", "clock", text)
+        self.resampler.notices.clear()
 
-    def push_block(self, block: Block) -> None:
-        """Takes messages as if their samples were pushed one by one."""
-        self.resampler.push_block(block)
+    push_block = push
 
     def deliver(self, reply: JobReply) -> None:
         """Takes the answer to a running job; an answer to any other is ignored."""
@@ -220,6 +224,7 @@ class Session:
         if rows.fresh:
             first = float(rows.t[0])
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
+        if rows.new_clock:
             self._supervisor.interrupted(first)
             self._consistency.restart()
             self._change_supervisor.restart()

@@ -128,15 +128,14 @@ class Service:
 
     def push(self, sample: Sample) -> None:
         """Takes one sample."""
-        self._arrived[sample.channel] = self._clock()
-        self.session.push(sample)
+        self.push_block(sample.block)
 
     def push_block(self, block: Block) -> None:
         """Takes messages as if their samples were pushed one by one."""
         now = self._clock()
         for name, _ in block.columns:
             self._arrived[name] = now
-        self.session.push_block(block)
+        self.session.push(block)
 
     def push_all(self, items: Iterable[Sample | Block]) -> None:
         """Takes samples and messages in order."""

@@ -34,9 +34,9 @@ def test_the_commands_are_those_of_the_vehicle(rate: float) -> None:
     flight = fly(STEERED, seconds=16.0, seed=2, profile="excited", log_rate=rate, command_rate=rate)
     told, steered = Resampler(STEERED), Resampler(STEERED)
     for sample in samples(flight.recording):
-        told.push(sample)
+        told.push(sample.block)
     for sample in samples(without_rotors(flight.recording)):
-        steered.push(sample)
+        steered.push(sample.block)
     differences, count = [], 0
     while (a := next_rows(told)) is not None and (b := next_rows(steered)) is not None:
         both = np.isfinite(a.columns["rotor_speed"]).all(axis=1) & np.isfinite(b.columns["rotor_speed"]).all(axis=1)

@@ -41,7 +41,7 @@ def consistency_of(recording: Recording, vehicle: Vehicle = PELICAN) -> Consiste
     resampler, store, found = Resampler(vehicle, 50.0), GridBuffer(50.0, 20.0), Consistency()
     tick = 1.0
     for sample in samples(recording):
-        resampler.push(sample)
+        resampler.push(sample.block)
         while (rows := next_rows(resampler)) is not None:
             store.add(rows)
             while rows.t[-1] >= tick:

@@ -42,7 +42,7 @@ def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
     """Rows as they come."""
     resampler = Resampler(vehicle, RATE)
     for count, sample in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
-        resampler.push(sample)
+        resampler.push(sample.block)
         while count % 200 == 0 and resampler.busy:
             if (rows := resampler.work()) is not None:
                 yield rows

@@ -172,7 +172,7 @@ def test_the_rows_tell_how_close_the_readings_are(every: int) -> None:
     channels["rotor_speed"] = replace(rotors, t=rotors.t[::every], values=rotors.values[::every])
     resampler = Resampler(PELICAN, 50.0)
     for sample in samples(replace(flight(24.0, 5).recording, channels=channels)):
-        resampler.push(sample)
+        resampler.push(sample.block)
     spacing = set[float]()
     while resampler.busy:
         rows = resampler.work()
