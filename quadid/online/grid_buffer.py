@@ -95,7 +95,7 @@ class GridBuffer:
     def cut(self, start: float, stop: float) -> Cut:
         """Windows of the rows with start <= t < stop."""
         blocks = self._reaching(start, stop)
-        problem = next((b.problem for b in reversed(blocks) if b.problem), "")
+        problem = blocks[-1].problem if blocks else ""  # what lacked before and came passes by itself
         pieces: list[list[Rows]] = []
         for block in blocks:
             before = pieces[-1][-1] if pieces else None

@@ -195,7 +195,8 @@ class SessionStatus:
         in_force, pending: sequence numbers, 0 for none; stale: the set in force is from an earlier run.
         approval: auto or manual, now.
         faults: dropped samples by reason.
-        backlog: time of data that waits for a running fit [s].
+        backlog: time of data that wait for the processor or a running fit [s].
+        skipped: fits left out because the machine was too slow.
     """
 
     t: float
@@ -214,3 +215,4 @@ class SessionStatus:
     approval: str
     faults: Mapping[str, int]
     backlog: float
+    skipped: int = 0

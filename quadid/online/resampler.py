@@ -181,7 +181,7 @@ class Resampler:
             self._early.append((stamps[k : k + 1], _part(columns, slice(k, k + 1))))
         self.counts.update({name: len(stamps) for name in columns})
         if len(self._early) == MOST_EARLY:
-            self._notice(LEADER, f"no gyro yet, while {', '.join(sorted(columns))} arrive: connect the IMU")
+            self._notice(LEADER, f"no gyro yet, while {', '.join(sorted(columns))} arrive; fix: connect the IMU")
 
     def _take(self, columns: Mapping[str, Column], t: FloatArray, reached: FloatArray) -> None:
         """Keeps what is usable of messages at times `t` [s], NaN: refused, before which the stream had come so far."""
@@ -208,10 +208,10 @@ class Resampler:
             count, since = self._apart.get(name, (0, self._leads))
             self._apart[name] = count + 1, since
             if count + 1 == APART and self._leads == since:
-                self._notice(LEADER, f"no gyro for {offset:.1f} s while {name} goes on: connect the IMU")
+                self._notice(LEADER, f"no gyro for {offset:.1f} s while {name} goes on; fix: connect the IMU")
             elif count + 1 == APART:
                 side = "ahead of" if offset > 0.0 else "behind"
-                why = f"{name} is {abs(offset):.1f} s {side} the gyro: it is left out; stamp both with one clock"
+                why = f"{name} is {abs(offset):.1f} s {side} the gyro: it is left out; fix: stamp both with one clock"
                 self._notice(name, why)
 
     def _notice(self, channel: str, text: str) -> None:

@@ -10,6 +10,8 @@
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)
 
 A session stands still while a fit runs and catches up afterwards, so that nothing depends on how long a fit takes.
+Where the machine is too slow for that, whoever drives the session says so (`hurry`, `go_on`): then it goes on without
+the reply, which is taken when it comes, no further fit begins until it has caught up, and changes are looked for.
 """
 
 from __future__ import annotations
@@ -50,6 +52,7 @@ class Session:
         resampler: the samples; its `counts`, `last` and `faults` tell what arrives.
         active_set: which set is in force.
         settings: as given.
+        skipped: fits that were due and left out in a hurry.
     """
 
     def __init__(
@@ -85,6 +88,8 @@ class Session:
         self._windows = WindowSupervisor(vehicle, self._store, self.settings, self._outbox, self._supervisor)
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
+        self._late: Job | None = None
+        self._hurried, self.skipped = False, 0
         self._outdated = 0
         self._now, self._tick_at = -math.inf, math.nan
         self._work: Iterator[None] | None = None
@@ -111,8 +116,21 @@ class Session:
         """Takes the answer to a running job; an answer to any other is ignored."""
         if self._waiting is not None and reply.number == self._waiting.number:
             self._reply = reply
+        elif self._late is not None and reply.number == self._late.number and self._waiting is None:
+            self._waiting, self._reply, self._late = self._late, reply, None
         else:
             self._diagnosis.deliver(reply)
+
+    def hurry(self, needed: bool) -> None:
+        """Says whether the machine is too slow at the moment: then changes come first, and no fit begins."""
+        self._hurried = needed
+
+    def go_on(self) -> None:
+        """Waits no longer for the running job: the reply to a fit is taken when it comes, a change keeps no cause."""
+        if isinstance(self._waiting, FitRequest) and self._reply is None:
+            self._waiting, self._late = None, self._waiting
+        elif self._waiting is not None and self._reply is None:
+            self._reply = self._waiting.failed("the machine is too slow for a fit in time")
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
         """A person approves the set that waits."""
@@ -193,6 +211,7 @@ class Session:
             approval=active_set.approval,
             faults=dict(self.resampler.faults),
             backlog=self.backlog,
+            skipped=self.skipped,
         )
 
     # --- the walk of the data
@@ -253,7 +272,10 @@ class Session:
         if self._change_supervisor.seen is not None:
             self._isolate(tick)
         elif self._windows.due(tick):
-            yield from self._fit(tick)
+            if self._hurried or self._late is not None:
+                self.skipped += 1
+            else:
+                yield from self._fit(tick)
 
     def _diagnose(self, tick: float) -> None:
         """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
@@ -261,7 +283,7 @@ class Session:
         told = self._diagnosis.answer(tick, supervisor.learn_from)
         if told is not None:
             self._outbox.act(told)
-        moving = estimator.learned and is_excited(estimator.excitation)
+        moving = estimator.learned and is_excited(estimator.excitation) and not self._hurried
         if moving and self._change_supervisor.seen is None and self._windows.quality == Quality():
             since = max(supervisor.learn_from, estimator.start)
             request = self._diagnosis.ask(self._number + 1, tick, since)
@@ -275,7 +297,7 @@ class Session:
         request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
-        self._number, self._waiting = request.number, request
+        self._number, self._waiting, self._late = request.number, request, None
         self._reply = self._change_supervisor.answer_without_fit(request, self._estimator)
         if self._reply is None:
             self._outbox.act(request)
@@ -291,6 +313,10 @@ class Session:
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
+        if isinstance(request, FitRequest) and (
+            self._change_supervisor.seen is not None or request.start < self._supervisor.learn_from - _EPS
+        ):
+            return  # a late one, of a time before what has happened since
         if reply.is_unexpected:
             self._fail(request.stop, reply.problem)
             return

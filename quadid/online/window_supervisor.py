@@ -18,6 +18,8 @@ from quadid.vehicle import Vehicle
 
 LEAD = 0.22
 """Flight before a window in which filters and delays settle [s]."""
+STARTING = 3.0
+"""What lacks in the first seconds of a stream [s] may still come, once the vehicle sends what it was asked for."""
 SHORT_WINDOW = 4.0
 """Least data for a fit that a person asked for [s]."""
 _EPS = 1e-6
@@ -83,7 +85,10 @@ class WindowSupervisor:
 
     def _incomplete(self, tick: float, start: float) -> None:
         if self.cut.blocked:
-            self._outbox.note(tick, Phase.BLOCKED, self.cut.reason)
+            if tick - start < STARTING:
+                self._outbox.state(Phase.COLLECTING, self.cut.reason)
+            else:
+                self._outbox.note(tick, Phase.BLOCKED, self.cut.reason)
             return
         have = f"{max(tick - start, 0.0):.0f} of {self._settings.window:g} s of flight"
         self._outbox.state(Phase.COLLECTING, f"{have}; {self.cut.reason or 'no gaps'}")

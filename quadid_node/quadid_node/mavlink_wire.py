@@ -39,6 +39,8 @@ SENT_A_SECOND, SENT_AT_ONCE = 100.0, 300.0
 """Messages that are sent on average and in a burst; answers leave half of the burst to what we say by ourselves."""
 _LONGEST = 12 + 255 + _SIGNATURE
 _DATAGRAM = 65535
+_RECEIVED = 1 << 22
+"""Bytes that wait in the vehicle's socket while we are busy, as far as the system allows."""
 
 
 class LinkError(QuadidError):
@@ -168,7 +170,7 @@ class Wire:
         dropped: bytes dropped unread because too many came.
         source: of the frame yielded last: UDP address, None on other links.
         signed: whether a signed frame came, believed or not.
-        drained: whether nothing was left unread when messages were looked for last.
+        drained: whether nothing of the vehicle was left unread when messages were looked for last.
         listened: for how long somebody has listened to everything that came [s].
         held_back: when a message was last not sent because too much is asked for [s].
     """
@@ -240,11 +242,11 @@ class Wire:
         pause, self._looked = now - self._looked, now
         ports = [self._own, None] if self._own is not None else [None]
         for port in ports:
-            self.drained = False
+            drained = False
             for _ in range(READS_AT_ONCE):
                 data = self._read(port)
                 if not data:
-                    self.drained = True
+                    drained = True
                     break
                 self._buffer = bytearray(data) if self._datagrams else self._buffer + data
                 for frame in frames(self._buffer, self._datagrams):
@@ -262,8 +264,9 @@ class Wire:
                         self.refused += 1
                         continue
                     yield message
-            if port is ports[0] and self.drained:
-                self.listened += min(pause, STALL)
+            if port is ports[0]:
+                self.drained = drained
+                self.listened += min(pause, STALL) * drained
         if self._memory is not None:
             self._memory.keep()
 
@@ -280,6 +283,7 @@ class Wire:
         self._own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED)
             self._own.setblocking(False)
             self._own.bind(self._conn.port.getsockname())
             self._own.connect(address)

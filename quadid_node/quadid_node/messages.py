@@ -12,7 +12,7 @@ from typing import Any
 from quadid.chi_square import Z95
 from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES
-from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health
+from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health, lag
 from quadid_node.stamps import stamp
 from quadid_node.vehicle_health import health_message
 
@@ -41,8 +41,6 @@ PHASES = {
     Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
 }  # fmt: skip
 VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
-BEHIND = 10.0
-"""A session that is this far behind its data [s] is worth a warning: it keeps what waits in memory."""
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
 
@@ -143,7 +141,7 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
         "vehicle_id": vehicle,
         "in_force": status.in_force,
         "state": PHASES[status.phase],
-        "reason": f"{status.phase.value}: {status.reason}",
+        "reason": "; ".join(filter(None, (lag(status.backlog), f"{status.phase.value}: {status.reason}"))),
         "names": list(NOMINAL_NAMES),
         "excitation": [float(v) for v in status.excitation],
         "samples": status.samples,
@@ -182,14 +180,14 @@ def diagnostics(
         entries = [_entry(name, "session", hardware, ERROR if problem else WARN, said, {})]
         return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
     status = health.status
-    warned = bool(idle) or status.phase in (Phase.BLOCKED, Phase.FAILED) or status.backlog > BEHIND
+    warned = bool(idle) or status.phase in (Phase.BLOCKED, Phase.FAILED) or bool(lag(status.backlog))
     said = idle or f"{status.phase.value}: {status.reason}"
-    if status.backlog > BEHIND:
-        said = f"{status.backlog:.0f} s behind the data, fits get too little of the processor: refit less often; {said}"
+    if lag(status.backlog):
+        said = f"{lag(status.backlog)}; {said}"
     session = _entry(name, "session", hardware, WARN if warned else OK, said, {
         "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
         "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
-        "backlog [s]": f"{status.backlog:.2f}",
+        "backlog [s]": f"{status.backlog:.2f}", "fits left out": status.skipped,
     })  # fmt: skip
     worker_level = OK if health.worker in ("idle", "busy", "inline") else WARN
     worker = _entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})

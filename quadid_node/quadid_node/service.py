@@ -27,8 +27,19 @@ SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
 """A channel that was there and is silent for this long [s] is worth a warning, an error."""
 DECISION_SECONDS = 2.0
 """How long a person's decision waits to be on the disk before it is answered [s]."""
+PATIENCE = 1.0
+"""A session this far behind its data [s] waits no longer for a fit that takes as long, and begins no other,"""
+BEHIND = 2.0
+"""... and from here on people are told, at every doubling."""
 RATE_MEMORY = 2.0
 """Time over which data rates are measured [s]."""
+
+
+def lag(seconds: float) -> str:
+    """What people are told of a session that is so far behind its data [s]; empty where it is not."""
+    if seconds < BEHIND:
+        return ""
+    return f"{seconds:.0f} s behind the data, the machine is too slow: fits are left out, changes come first"
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,7 @@ class Service:
         self._noted = 0
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
-        self._looked = clock()
+        self._looked, self._unfinished, self._tell_at = clock(), False, BEHIND
 
         if restored.approval not in ("", self._configured):
             self.session.active_set.approval = self._approval = restored.approval
@@ -163,9 +174,10 @@ class Service:
 
     def pieces(self) -> Iterator[list[Output]]:
         """As `step`, and gives control back, with what is to be published and told, after each piece of the work."""
-        outputs, self._looked = self._tidy(), self._clock()
+        outputs, self._looked = [*self._tidy(), *self._keep_up()], self._clock()
         while True:
             outputs += self._carried_out(self.session.poll(1))
+            self._unfinished = self.session.busy
             yield self._journalled(outputs)
             if not self.session.busy:
                 return
@@ -207,6 +219,25 @@ class Service:
                 outputs.append(self._trouble(Trouble("error", f"{item.problem}; {kept}")))
             self.session.deliver(item)
         return [*outputs, *self._history_trouble()]
+
+    def _keep_up(self) -> list[Event]:
+        """Lets a session that is behind its data shed work, and tells so."""
+        session, behind = self.session, self.session.backlog
+        waits = session.running is not None and self._clock() - self._fit_began > PATIENCE
+        if behind > PATIENCE and (waits or self._unfinished):
+            session.hurry(True)
+            if waits:
+                session.go_on()
+        elif behind < 0.5 * PATIENCE:
+            session.hurry(False)
+        t = session.status().t
+        if behind >= self._tell_at:
+            self._tell_at = 2.0 * behind
+            return [Event(t, "warning", "behind", lag(behind))]
+        if behind < PATIENCE and self._tell_at > BEHIND:
+            self._tell_at = BEHIND
+            return [Event(t, "info", "behind", "caught up with the data")]
+        return []
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:
         """Gives everything to the history, decisions before what follows from them; returns what may be published."""

@@ -209,8 +209,12 @@ class ProcessWorker:
                 if self._request is not None:
                     self._give()
             elif isinstance(item, JobReply):
-                self._request, self.state = None, "idle"
+                self.state = "idle"
                 replies.append(item)
+                if self._request is not None and item.number != self._request.number:
+                    self._give()  # what was asked while this one took too long
+                else:
+                    self._request = None
         if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
             self._failures = 0
         return replies
