@@ -1,7 +1,7 @@
 """Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted.
 
-pyulog says a file is not corrupt when it simply ends inside a record (26 of 30 cuts, 28 of 30 flipped bytes went
-unsaid), and loops for ever on some damaged definitions.
+pyulog says a file is not corrupt when it simply ends inside a record (26 of 30 random cuts), and loops for ever on some
+damaged definitions.
 """
 
 from __future__ import annotations
