@@ -10,17 +10,19 @@ import numpy as np
 
 from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
 from quadid.online.estimator import Estimator
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.fault_isolation import PULL, ChangeReply, ChangeRequest
 from quadid.online.fusion import DRIFT
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.quality import Quality, judge
-from quadid.online.records import OnlineFinding
-from quadid.vehicle import Vehicle
+from quadid.online.records import OnlineAlternative, OnlineFinding
+from quadid.vehicle import GRAVITY, Vehicle
 
 AFTER_CHANGE = 3.0
 """Data that a change is explained from [s]."""
 ASK_FLYING = 2.2
 """Flight judged before a change is looked for [s]."""
+CONFIRMED = 2
+"""Windows without a common sample that must agree before moments are judged."""
 _EPS = 1e-6
 
 
@@ -43,6 +45,7 @@ class ChangeSupervisor:
         """Watches the rows of `store`, which are of `vehicle`."""
         self._vehicle, self._store = vehicle, store
         self._detector = ChangeDetector(vehicle)
+        self._carried = 0.0
         self.seen: Seen | None = None
 
     def restart(self) -> None:
@@ -59,12 +62,19 @@ class ChangeSupervisor:
         yield
         recent = self._store.cut(tick - ASK_FLYING, tick - _EPS)
         yield
-        if recent.reason or judge(recent, self._vehicle, estimator.thrust, estimator.learned) != Quality():
+        quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
+        # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
+        self._carried = self._carried + length if quality.carried else 0.0
+        if recent.reason or (quality != Quality() and not 0.0 < self._carried <= ASK_FLYING):
             self._detector.restart()
+            return None
+        if quality.carried:
             return None
         yield
         inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
-        doubt = np.hypot(DRIFT, estimator.torque_sigma) if estimator.learned else None
+        # One window may have moved too little for its own interval to be right: another has to say the same.
+        known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED
+        doubt = np.hypot(DRIFT, estimator.torque_sigma) if known else None
         change = self._detector.look(estimator.value("b"), inertia, doubt)
         if change is None:
             return None
@@ -94,17 +104,20 @@ class ChangeSupervisor:
         if not request.windows:
             return ChangeReply(request.number, "too little data after the change")
         if not estimator.learned:
-            return ChangeReply(request.number, finding=_unlearned(request.change, request.time))
+            weight = request.vehicle.mass * GRAVITY
+            return ChangeReply(request.number, finding=_unlearned(request.change, request.time, weight))
         return None
 
 
-def _unlearned(change: ChangePoint, time: float) -> OnlineFinding | None:
+def _unlearned(change: ChangePoint, time: float, weight: float) -> OnlineFinding | None:
     """What a step of thrust means before anything was learned: mass or thrust, not to be told apart."""
     if change.channel != "thrust":
         return None
     fraction = float(np.expm1(-change.size))
+    rivals = tuple(OnlineAlternative(effect, math.nan) for effect in (PULL, "thrust_drop"))
     return OnlineFinding(
         "mass_change", {"time": time, "fraction": fraction}, {"time": 0.5, "fraction": abs(fraction / change.errors)},
-        {"time": "s", "fraction": ""}, math.nan, math.nan, math.nan, (),
-        f"thrust per weight stepped by {change.size:+.1%} before the vehicle was known: mass or thrust changed", False,
+        {"time": "s", "fraction": ""}, math.nan, math.nan, math.nan, rivals,
+        f"thrust per weight stepped by {change.size:+.1%} before the vehicle was known: {fraction * weight:+.2f} N "
+        "to hold it up, of a payload, of a steady pull, or of thrust that was lost", False,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from quadid.identify.covariance import Uncertainty, parameter_set
 from quadid.identify.noise_model import NoiseModel
 from quadid.identify.shooting import Free
 from quadid.model.channels import channels_of
-from quadid.model.layout import B, Layout
+from quadid.model.layout import LOSS, B, D, Layout
 from quadid.model.thrust import ThrustModel
 from quadid.online.active_set import ActiveSet
 from quadid.online.flexible_fit import with_room
@@ -182,6 +182,11 @@ class Estimator:
         self.theta, self.learned = self._free.placed(best, fused.z), True
         # Windows tell the b of the vehicle file's model; the curve and the losses that are fitted along have their own.
         self.theta[B] = self.published.like(ThrustModel(self._layout, self.theta), self.vehicle.mass * GRAVITY)
+        # Thrust knows b and the losses by their products only: the mean of the losses is the vehicle file's.
+        losses = slice(LOSS, LOSS + self._layout.rotors)
+        share = float(np.mean(1.0 - self.theta[losses]) / np.mean(1.0 - self._initial[losses]))
+        self.theta[losses] = 1.0 - (1.0 - self.theta[losses]) / share
+        self.theta[[B, D]] *= share
 
     def _pool_noise(self, reply: FitReply) -> None:
         if reply.noise is None:

@@ -20,6 +20,7 @@ from quadid.online.jobs import Job, JobReply
 from quadid.online.records import OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""
@@ -33,6 +34,8 @@ PENALTY = 2.0
 """Deviance that a free number has to earn (Akaike)."""
 CLEAR = 12.0
 """Deviance by which a cause must beat its look-alikes to be named with confidence."""
+PULL = "steady_pull"
+"""Not an effect of a vehicle: what holds or draws it, such as a line; in the finding as a force downwards [N]."""
 EFFECT_SIGMA = 0.3
 """Prior of the size of a sudden change."""
 
@@ -102,7 +105,11 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     outcomes = _without_idle(outcomes)
     best = outcomes[0] if outcomes else nothing
     drop = nothing.deviance - best.deviance
-    if not outcomes or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1)):
+    if (
+        not outcomes
+        or not np.isfinite(nothing.deviance)
+        or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1))
+    ):
         return ChangeReply(request.number, "no known cause explains it")
     return ChangeReply(request.number, finding=_finding(request, nothing, outcomes))
 
@@ -113,6 +120,8 @@ def _causes(request: ChangeRequest) -> list[_Cause]:
     return [
         _Cause("mass_change", ("mass_change.fraction",), (float(np.clip(np.expm1(-size), -0.5, 0.8)),)),
         _Cause("thrust_drop", ("thrust_drop.fraction",), (float(np.clip(-np.expm1(size), -0.5, 0.5)),)),
+        # A pull that stays takes off the specific force what it adds to the thrust.
+        _Cause(PULL, ("accel_bias.z",), (float(np.clip(np.expm1(-size), -0.5, 0.8)) * GRAVITY,)),
         _Cause("cg_offset", ("cg_offset.x", "cg_offset.y"), (0.0, 0.0)),
         _Cause("mass_change", ("mass_change.fraction", "cg_offset.x", "cg_offset.y"), (0.0, 0.0, 0.0)),
         *(_Cause("weak_rotor", (f"weak_rotor.loss_{i + 1}",), (0.05,), i + 1) for i in range(rotors)),
@@ -136,17 +145,17 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: Init
     theta = request.theta.copy()
     theta[[ix.MASS_TIME, ix.DROP_TIME]] = -NEVER
     place = free.index[len(NOMINAL_NAMES) :]
-    theta[place] = cause.start
+    theta[place] += cause.start
     known = np.hypot(request.z_sigma, HELD)
     known[0] = np.hypot(request.z_sigma[0], HELD_THRUST)
     if cause.effect == "mass_change":
         loaded = [NOMINAL_NAMES.index(n) for n in ("J_xx", "J_yy", "J_zz")]
         known[loaded] = np.hypot(request.z_sigma[loaded], LOADED)
-    width = EFFECT_SIGMA / free.scale[len(NOMINAL_NAMES) :]
+    width = EFFECT_SIGMA / free.scale[len(NOMINAL_NAMES) :] * (GRAVITY if cause.effect == PULL else 1.0)
     if "cg_offset.x" in cause.names:
         width[-2:] = 20.0
     prior = Prior(
-        np.concatenate([request.theta[: len(NOMINAL_NAMES)], np.zeros(len(place))]), np.concatenate([known, width])
+        np.concatenate([request.theta[: len(NOMINAL_NAMES)], request.theta[place]]), np.concatenate([known, width])
     )
     result = polish(shooting, theta, free, prior, states, iterations=8)
     sigma = np.sqrt(np.diag(posterior_covariance(result.lin.information, prior))) * free.jacobian(result.theta)
@@ -171,6 +180,10 @@ def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]
         f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
         f"residual {nothing.mse:.2f} falls to {best.mse:.2f} with {best.cause.effect}"
     )
+    if values.get("loss", 0.0) < 0.0:
+        text += f"; rotor {values['rotor']:.0f} gives {-values['loss']:.0%} more than before: it has recovered"
+    if seen.channel == "thrust":
+        text += f" ({np.expm1(-seen.size) * request.vehicle.mass * GRAVITY:+.2f} N to hold the vehicle up)"
     if rivals:
         text += f", to {min(r.mse for r in rivals.values()):.2f} with the next look-alike"
     return OnlineFinding(
@@ -182,12 +195,17 @@ def _numbers(request: ChangeRequest, best: _Outcome) -> tuple[dict[str, float], 
     """Values, standard deviations and units in the form of the vehicle file."""
     cause = best.cause
     if cause.effect == "weak_rotor":
-        loss = float(best.theta[LOSS + cause.rotor - 1])
+        loss, before = (float(theta[LOSS + cause.rotor - 1]) for theta in (best.theta, request.theta))
+        loss = (loss - before) / (1.0 - before)
         return {"rotor": float(cause.rotor), "loss": loss}, {"loss": float(best.sigma[0])}, {"rotor": "", "loss": ""}
     if cause.effect == "cg_offset":
-        x, y = float(best.theta[ix.CGX]), float(best.theta[ix.CGY])
+        x, y = (best.theta - request.theta)[[ix.CGX, ix.CGY]].tolist()
         sigma = {"x": float(best.sigma[0]), "y": float(best.sigma[1])}
         return {"x": x, "y": y}, sigma, {"x": "m", "y": "m"}
+    if cause.effect == PULL:
+        mass = request.vehicle.mass
+        values = {"time": request.time, "force": mass * float(best.theta[ix.ABZ])}
+        return values, {"time": 0.05, "force": mass * float(best.sigma[0])}, {"time": "s", "force": "N"}
     place = ix.MASS_FRACTION if cause.effect == "mass_change" else ix.DROP_FRACTION
     values = {"time": request.time, "fraction": float(best.theta[place])}
     return values, {"time": 0.05, "fraction": float(best.sigma[0])}, {"time": "s", "fraction": ""}

@@ -36,10 +36,15 @@ FLOOR_SLOPE = 0.2
 
 @dataclass(frozen=True)
 class Quality:
-    """Verdict on one window: `fault` names a broken sensor, `grounded` why it is not flight; both empty when good."""
+    """Verdict on one window: `fault` names a broken sensor, `grounded` why it is not flight; both empty when good.
+
+    `carried`: it is not flight only because the specific force does not follow the thrust.  A load that is taken up in
+    hover looks alike: there the thrust follows the weight.
+    """
 
     fault: str = ""
     grounded: str = ""
+    carried: bool = False
 
 
 def judge(cut: Cut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
@@ -60,7 +65,10 @@ def judge(cut: Cut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quali
             return Quality(fault=fault)
     if fault := mistake(cut, vehicle, known):
         return Quality(fault=fault)
-    return Quality(grounded=next((why for w in cut.windows if (why := _not_flying(w, vehicle, thrust))), ""))
+    if why := next((why for w in cut.windows if (why := _not_flying(w))), ""):
+        return Quality(grounded=why)
+    carried = next((why for w in cut.windows if (why := _floor(w, _weight_share(w, vehicle, thrust)))), "")
+    return Quality(grounded=carried, carried=bool(carried))
 
 
 def _broken(window: Window) -> str:
@@ -127,24 +135,24 @@ def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
     return Quality()
 
 
-def _not_flying(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> str:
-    """Says why a window with turning rotors is not flight, or returns an empty string.
-
-    A flying vehicle is upright, and its specific force follows its thrust; on the ground the floor carries the rest and
-    the accelerometer reads gravity whatever the rotors do.
-    """
+def _not_flying(window: Window) -> str:
+    """Says why a window with turning rotors is not flight, whatever they give, or returns an empty string."""
     if window.attitude is not None and np.any(down(window.attitude)[:, 2] < TUMBLED):
         return "tumbled, or lying on its side"
     if window.accel is None or not np.isfinite(window.accel).any():
         return ""
     if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:
         return f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
-    return _floor(window, _weight_share(window, vehicle, thrust))
+    return ""
 
 
 def _floor(window: Window, thrust: FloatArray) -> str:
-    """The accelerometer must follow the thrust where the thrust varies enough to tell."""
-    assert window.accel is not None
+    """The accelerometer must follow the thrust where the thrust varies enough to tell.
+
+    On the ground the floor carries the rest, and the accelerometer reads gravity whatever the rotors do.
+    """
+    if window.accel is None:
+        return ""
     width = max(round(0.1 / window.dt), 1)
     rows = len(thrust) // width * width
     force = -window.accel[:rows, 2].reshape(-1, width) / GRAVITY

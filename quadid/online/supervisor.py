@@ -11,7 +11,7 @@ from quadid.online.background_diagnosis import BackgroundDiagnosis
 from quadid.online.change_detection import LEAST, ChangePoint
 from quadid.online.consistency import Consistency
 from quadid.online.estimator import Estimator
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.fault_isolation import PULL, ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
 from quadid.online.gate import GateSettings, decide
 from quadid.online.outbox import Outbox
@@ -62,7 +62,7 @@ class Supervisor:
     def changed(self, request: ChangeRequest, reply: ChangeReply) -> None:
         """Publishes what a sudden change was; where it may be the mass, the sets after it wait for a person."""
         finding = reply.finding
-        self._active_set.load *= _load(request.change, finding)
+        self._active_set.load *= mass_factor(request.change, finding)
         text = finding.evidence if finding is not None else f"cause unknown: {reply.problem}"
         self._has_changed(request.start, request.stop, finding, "finding", text, request.start + 0.1, "unknown_cause")
 
@@ -186,11 +186,11 @@ class Supervisor:
         return Phase.ACCEPTED if force is not None and force.state is not SetState.STALE else Phase.CANDIDATE
 
 
-def _load(change: ChangePoint, finding: OnlineFinding | None) -> float:
+def mass_factor(change: ChangePoint, finding: OnlineFinding | None) -> float:
     """Factor on the mass that a change may be."""
     if finding is not None and finding.effect == "mass_change":
         return max(1.0 + finding.values["fraction"], LEAST)
-    sure = finding is not None and finding.confident
+    sure = finding is not None and finding.confident and finding.effect != PULL
     return 1.0 if sure or change.channel != "thrust" else math.exp(-change.size)
 
 

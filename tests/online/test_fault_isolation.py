@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from quadid.identify.noise_model import NoiseModel
-from quadid.model.layout import Layout
+from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import ChangeDetector, ChangePoint
 from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.rows import Rows
@@ -94,7 +96,7 @@ def test_the_cause_is_named_with_its_size(effects: Effects, seen: tuple[str, flo
     assert reply.finding.effect == name
     assert reply.finding.confident or name == "thrust_drop", "mass taken up with its inertia looks much like it"
     assert reply.finding.values[number] == pytest.approx({p: v for _, p, v in effects}[number], rel=0.1)
-    others = {"mass_change", "thrust_drop", "cg_offset", "weak_rotor"} - {name}
+    others = {"mass_change", "thrust_drop", "steady_pull", "cg_offset", "weak_rotor"} - {name}
     assert {a.effect for a in reply.finding.alternatives} == others
 
 
@@ -110,3 +112,15 @@ def test_no_cause_is_invented() -> None:
     reply = explained("excited", (), ChangePoint(40.0, "pitch moment", 0.05, 8.0)).answer()
     assert reply.finding is None
     assert "no known cause" in reply.problem
+
+
+def test_a_rotor_that_recovers_is_said_to() -> None:
+    """What was known before the change holds the loss; what is told is how it changed."""
+    request = explained("excited", (), ChangePoint(40.0, "roll moment", -0.1, 30.0))
+    weak = request.theta.copy()
+    weak[LOSS + 2] = 0.1
+    reply = replace(request, theta=weak).answer()
+    assert reply.finding is not None, reply.problem
+    assert (reply.finding.effect, reply.finding.values["rotor"]) == ("weak_rotor", 3.0)
+    assert reply.finding.values["loss"] == pytest.approx(-0.1 / 0.9, rel=0.15)
+    assert "recovered" in reply.finding.evidence
