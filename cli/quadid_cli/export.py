@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from quadid_report.programs import FORMATS
 
 from quadid_cli.options import JsonTarget, OutFolder, shipped_names
 
@@ -25,7 +26,7 @@ def export(
         typer.Option(
             "--format",
             metavar="F",
-            help="yaml, px4, ardupilot, gazebo, rotorpy, agilicious, mujoco, urdf, drone-models or isaac-lab.",
+            help=f"{', '.join(FORMATS)}; programs and kinds of files name them too: crazyflow, sdf.",
         ),
     ] = "yaml",
     what: Annotated[bool, typer.Option("--list", help="Print which effects each form carries, and end.")] = False,

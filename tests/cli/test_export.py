@@ -155,7 +155,7 @@ def test_ardupilot_gets_the_curve_that_was_fitted_and_names_what_it_cannot_hold(
     np.testing.assert_allclose((1 - e) * speed / full + e * (speed / full) ** 2, thrust / thrust[-1], rtol=1e-5)
     assert "weak_rotor" in text
     assert "residual (moment_x += -0.001 p)" in text
-    assert "propExpo" not in frame_of(vehicle)
+    assert frame_of(vehicle)["propExpo"] == 1.0, "SITL takes 0.65 where none is given"
 
 
 def test_full_and_hover_thrust_follow_the_thrust_curve_and_weak_rotors(vehicle: Vehicle) -> None:
@@ -165,7 +165,7 @@ def test_full_and_hover_thrust_follow_the_thrust_curve_and_weak_rotors(vehicle: 
     values = {row[2]: float(row[3]) for row in (line.split("\t") for line in text.splitlines() if line[0] != "#")}
     full = 2.3e-5 * (SPEED - 120.0) ** 2
     assert [values[f"CA_ROTOR{i}_CT"] for i in range(4)] == pytest.approx([full, 0.9 * full, full, full])
-    assert values["SIH_T_MAX"] == pytest.approx(3.9 / 4.0 * full)
+    assert "SIH_T_MAX" not in values, "it flies four alike rotors"
     hover = 1.3 * GRAVITY / (3.9 * full)
     at_hover = 120.0 + np.sqrt(1.3 * GRAVITY / (3.9 * 2.3e-5))
     assert values["MPC_THR_HOVER"] == pytest.approx(at_hover / SPEED)
@@ -188,7 +188,7 @@ def test_every_form_from_the_command_line(inside: Cli, tmp_path: Path, form: str
     for file in result["files"]:
         assert "pelican" in Path(file).read_text(encoding="utf-8")
     assert "guesses from the vehicle file" in result["warnings"][0]
-    assert ("max_speed" in result["warnings"][-1]) == (form in ("px4", "ardupilot"))
+    assert any("max_speed" in text for text in result["warnings"]) == (form in ("px4", "ardupilot"))
 
 
 def test_unknown_form(inside: Cli, tmp_path: Path) -> None:

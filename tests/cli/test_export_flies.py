@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import json
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +15,18 @@ import pytest
 import yaml
 from quadid_report.programs import export
 from quadid_report.programs.facts import SHORTEST_LAG
+from quadid_workflow.export import export as exported
+from quadid_workflow.init import shipped
 from scipy.integrate import solve_ivp
 
 from quadid.errors import ParameterError
 from quadid.model.simulate import simulate as fly_file
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle_parts import Command
 from tests.model.simulate import held, simulate, state
 
+VEHICLES = [entry["name"] for entry in shipped()]
 DT, STEPS = 0.02, 100
 TO_FLU = np.array([1.0, -1.0, -1.0])
 NOMINAL = ("b", "d", "J_xx", "J_yy", "J_zz")
@@ -208,7 +214,7 @@ def test_mujoco_flies_the_exported_vehicle_as_our_simulation_does() -> None:
     model = mujoco.MjModel.from_xml_string(export(tilted, "mujoco", "test")[".mjcf.xml"])
     data = mujoco.MjData(model)
     every = round(DT / model.opt.timestep)
-    b = vehicle.parameters["b"].initial * (1.0 - np.array([0.0, 0.01, 0.0, 0.0]))
+    b = vehicle.parameters["b"].initial  # the loss of rotor 2 stands in the model
     rate, velocity = [], []
     for row in rows:
         data.ctrl[:] = b * row**2
@@ -235,7 +241,7 @@ def test_urdf_holds_mass_inertia_and_rotors() -> None:
 
 
 def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -> None:
-    pelican = Vehicle.shipped("pelican")
+    pelican = as_px4_has_it(Vehicle.shipped("pelican_x"))
     bare = export(pelican, "px4", "x")[".params"]
     rich = export(
         pelican.model_copy(update={"effects": {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "parasitic_drag": {"c": 0.03},
@@ -249,3 +255,105 @@ def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -
     assert values["EKF2_BCOEF_X"] == pytest.approx(0.5 * 1.225 / 0.03)
     for name in ("SIH_KDV", "SIH_T_TAU", "EKF2_MCOEF", "THR_MDL_FAC"):
         assert f"\t{name}\t" not in bare
+
+
+ARDUPILOT = {
+    "+": "90 ccw, -90 ccw, 0 cw, 180 cw", "X": "45 ccw, -135 ccw, -45 cw, 135 cw",
+    "hexa": "0 cw, 180 ccw, -120 cw, 60 ccw, -60 ccw, 120 cw",
+    "hexax": "90 cw, -90 ccw, -30 cw, 150 ccw, 30 ccw, -150 cw",
+}  # fmt: skip
+"""AP_MotorsMatrix.cpp: motors 1, 2, ... of a frame: angle from forward, clockwise [deg], and how each turns."""
+CROSSES = ("crazyflie", "crazyflie_brushless", "pelican_x")
+
+
+def as_px4_has_it(cross: Vehicle) -> Vehicle:
+    """A shipped cross with its rotors in PX4's order."""
+    return cross.model_copy(update={"rotors": tuple(cross.rotors[i] for i in (0, 2, 3, 1))})
+
+
+def moments(vehicle: Vehicle) -> FloatArray:
+    """Roll, pitch, yaw moment of a newton of each rotor, FRD, shape (3, rotors)."""
+    x, y, _ = vehicle.rotor_positions.T
+    return np.array([-y, x, vehicle.spins * vehicle.parameters["d"].initial / vehicle.parameters["b"].initial])
+
+
+def assert_identity(product: FloatArray) -> None:
+    """Each axis asked for is the axis that moves; how much is a matter of gains."""
+    assert (np.diag(product) > 0.0).all()
+    scale = np.sqrt(np.outer(np.abs(np.diag(product)), np.abs(np.diag(product))))
+    np.testing.assert_allclose(product / scale, np.eye(3), atol=0.01)
+
+
+def px4_rows(text: str) -> dict[str, float]:
+    lines = (line.split("\t") for line in text.splitlines() if not line.startswith("#"))
+    return {name: float(value) for _, _, name, value, _ in lines}
+
+
+@pytest.mark.parametrize(
+    ("name", "ordered"), [*((name, False) for name in VEHICLES), *((name, True) for name in CROSSES)]
+)
+def test_px4_allocates_what_the_vehicle_and_its_simulator_do(name: str, ordered: bool) -> None:
+    vehicle = as_px4_has_it(Vehicle.shipped(name)) if ordered else Vehicle.shipped(name)
+    full = vehicle.model_copy(update={"command": Command(kind="normalized", max_speed=3.0 * vehicle.hover_speed())})
+    q = px4_rows(export(full, "px4", "x")[".params"])
+    n = int(q["CA_ROTOR_COUNT"])
+    # ActuatorEffectivenessRotors.cpp: moment = CT (position x axis) - CT KM axis, axis (0, 0, -1)
+    columns = [[-q[f"CA_ROTOR{i}_PY"], q[f"CA_ROTOR{i}_PX"], q[f"CA_ROTOR{i}_KM"]] for i in range(n)]
+    allocation = np.linalg.pinv(np.vstack([np.array(columns).T, np.full(n, -1.0)]))[:, :3]
+    assert_identity(moments(vehicle) @ allocation)
+    assert ("SIH_MASS" in q) == ordered
+    if "SIH_MASS" in q:
+        # sih.cpp, generate_force_and_torques: quadrotor in X
+        roll, pitch, yaw = q["SIH_L_ROLL"] * q["SIH_T_MAX"], q["SIH_L_PITCH"] * q["SIH_T_MAX"], q["SIH_Q_MAX"]
+        simulated = np.array([[-roll, roll, roll, -roll], [pitch, -pitch, pitch, -pitch], [yaw, yaw, -yaw, -yaw]])
+        assert_identity(simulated @ allocation)
+        np.testing.assert_allclose(simulated / q["SIH_T_MAX"], moments(vehicle), rtol=0.01)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_ardupilot_mixes_what_its_simulator_does_and_the_vehicle_is(name: str) -> None:
+    vehicle = Vehicle.shipped(name)
+    text = export(vehicle, "ardupilot", "x")[".sitl.json"]
+    found = re.search(r"-f (\S+):FILE.* are the rotors ([\d, ]+) of the vehicle file", text)
+    assert found
+    motors = [part.split() for part in ARDUPILOT[found[1]].split(", ")]
+    angles = np.radians([float(angle) for angle, _ in motors])
+    turns = np.array([1.0 if turn == "ccw" else -1.0 for _, turn in motors])
+    # AP_MotorsMatrix::add_motor: roll cos(angle + 90 deg), pitch cos(angle), yaw by the sense of rotation
+    mixer = np.array([np.cos(angles + 0.5 * np.pi), np.cos(angles), turns])
+    arm = json.loads(text[text.index("{") :])["diagonal_size"]
+    # SIM_Motor.cpp: thrust upwards at the motor's place, torque against its turning
+    simulated = np.array([-arm * np.sin(angles), arm * np.cos(angles), turns])
+    assert_identity(simulated @ mixer.T)
+    behind = [int(n) - 1 for n in found[2].split(", ")]
+    assert_identity(moments(vehicle)[:, behind] @ mixer.T)
+
+
+def test_what_sitl_and_sih_cannot_be_is_left_out_with_its_reason() -> None:
+    cross = Vehicle.shipped("pelican_x")
+    stretched = [r.model_copy(update={"position": (1.3 * r.position[0], *r.position[1:])}) for r in cross.rotors]
+    long = cross.model_copy(update={"rotors": tuple(stretched)})
+    done = exported(long, "ardupilot")
+    assert [name for name in done.texts if name.endswith(".json")] == []
+    assert any("none of the frames" in text for text in done.result["warnings"])
+    reversed_spins = [r.model_copy(update={"spin": -r.spin}) for r in cross.rotors]
+    done = exported(cross.model_copy(update={"rotors": tuple(reversed_spins)}), "px4")
+    assert any("yaw of this vehicle would come out wrong" in text for text in done.result["warnings"])
+    assert "SIH_" not in "".join(line for line in done.texts["pelican_x.params"].splitlines() if line[0] != "#")
+
+
+@pytest.mark.parametrize(("asked", "form"), [("sdf", "gazebo"), ("mjcf", "mujoco"), ("crazyflow", "drone-models"),
+                                             ("SITL", "ardupilot"), ("isaac", "isaac-lab")])  # fmt: skip
+def test_programs_and_kinds_of_files_name_a_form(asked: str, form: str) -> None:
+    cross = Vehicle.shipped("pelican_x")
+    assert exported(cross, asked).texts == exported(cross, form).texts
+    with pytest.raises(ParameterError):
+        exported(cross, "yaml2")
+
+
+def test_a_motor_lag_that_nobody_measured_is_written_as_such() -> None:
+    for form in ("isaac-lab", "rotorpy", "agilicious", "drone-models", "gazebo"):
+        for lag in ({}, {"motor_lag": {"tau": 0.03}}):
+            vehicle = Vehicle.shipped("pelican_x").model_copy(update={"effects": lag})
+            (text,) = export(vehicle, form, "x").values()
+            assert ("not measured: stands for rotors that follow at once" in text) == (not lag), form

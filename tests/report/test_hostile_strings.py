@@ -132,7 +132,7 @@ def check_lines(text: str, form: str, separator: str) -> None:
 
 def check_json(text: str) -> None:
     data = json.loads(text[text.index("{") :])
-    assert set(data) - {"hoverThrOut"} == {"mass", "diagonal_size", "moment_inertia", "num_motors"}
+    assert set(data) - {"hoverThrOut", "propExpo"} == {"mass", "diagonal_size", "moment_inertia", "num_motors"}
     assert MARK not in json.dumps(data)
 
 

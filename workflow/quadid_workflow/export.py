@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
 
 
+MOST_COLUMNS = 5
+"""Forms beside each other that a terminal of 80 characters has room for."""
+
+
 @dataclass(frozen=True)
 class Exported:
     """Files for another program.
@@ -59,8 +63,9 @@ def export(
         VehicleError: no such vehicle.
     """
     from quadid_report.programs import export as written_as
+    from quadid_report.programs import form_of, refused
 
-    described = as_vehicle(vehicle)
+    described, format = as_vehicle(vehicle), form_of(format)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
     lacking = doubt or (f"not proven: {described.proof.lacking}" if described.proof and described.proof.lacking else "")
     if lacking and not anyway:
@@ -73,7 +78,7 @@ def export(
     warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight was fitted"] if guessed else []
     if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
-    warnings += [f"{origin} is {doubt}"] if doubt else []
+    warnings += [why for why in (refused(described, format), doubt and f"{origin} is {doubt}") if why]
     result = {
         "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
     }  # fmt: skip
@@ -87,11 +92,8 @@ def forms() -> list[TextTable]:
 
     from quadid.effects import EFFECTS
 
-    out = []
-    for part in (
-        ("px4", "ardupilot", "gazebo", "agilicious"),
-        ("rotorpy", "mujoco", "urdf", "drone-models", "isaac-lab"),
-    ):
+    out, others = [], [name for name in FORMS if name != "yaml"]  # yaml carries all
+    for part in (others[i : i + MOST_COLUMNS] for i in range(0, len(others), MOST_COLUMNS)):
         rows = [(effect, *("yes" if effect in FORMS[name].carried else "-" for name in part)) for effect in EFFECTS]
         columns = (Column("effect"), *(Column(name) for name in part))
         programs = ", ".join(FORMS[name].program for name in part)

@@ -3,3 +3,5 @@
 from quadid_report.programs.forms import FORMATS as FORMATS
 from quadid_report.programs.forms import FORMS as FORMS
 from quadid_report.programs.forms import export as export
+from quadid_report.programs.forms import form_of as form_of
+from quadid_report.programs.forms import refused as refused

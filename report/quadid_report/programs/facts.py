@@ -137,6 +137,11 @@ class Facts:
         return max(self.effect("motor_lag", "tau"), SHORTEST_LAG)
 
     @property
+    def lag_remark(self) -> str:
+        """What a reader of `lag` must know; empty where the vehicle file has one."""
+        return "" if "motor_lag" in self.vehicle.effects else ", not measured: stands for rotors that follow at once"
+
+    @property
     def lag_down(self) -> float:
         """Time constant of a rotor that slows down [s]."""
         return self.effect("motor_lag", "tau_down") or self.lag

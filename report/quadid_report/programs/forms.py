@@ -20,8 +20,8 @@ class Form(NamedTuple):
         program: whose.
         carried: effects that it can hold, and optional numbers of these; all others are named in the file as left out.
         templates: name of the template of every file, by the ending of the file's name.
-        particulars: what the templates need beside `Facts`; ``lost`` among it are effects that it cannot hold of this
-            vehicle.
+        particulars: what the templates need beside `Facts`; of this vehicle the form cannot hold the effects ``lost``
+            and the files ``without``, and ``refused`` says what else it does not write, and why.
     """
 
     program: str
@@ -33,6 +33,12 @@ class Form(NamedTuple):
     def effects(self) -> tuple[str, ...]:
         """Effects that it can hold."""
         return tuple(name for name in self.carried if name in EFFECTS)
+
+    @property
+    def names(self) -> set[str]:
+        """What people call it: its programs, and the kinds of its files."""
+        kinds = {part for end in self.templates for part in end.split(".")[1:]}
+        return {*kinds, *self.program.lower().split(", "), *self.program.lower().replace(",", "").split()}
 
 
 ALL = (*EFFECTS, *(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters), "residual")
@@ -79,12 +85,32 @@ FORMS: dict[str, Form] = {
 FORMATS = tuple(FORMS)
 
 
+def form_of(name: str) -> str:
+    """The form of that name, program or kind of file (``sdf``, ``crazyflow``).
+
+    Raises:
+        ParameterError: no form, or several.
+    """
+    if name in FORMS:
+        return name
+    asked = name.lower().lstrip(".")
+    found = [form for form, about in FORMS.items() if asked in about.names]
+    if len(found) != 1:
+        raise ParameterError(f"unknown format '{name}'", ", ".join(FORMATS), nearest(name, FORMATS))
+    return found[0]
+
+
+def refused(vehicle: Vehicle, form: str) -> str:
+    """What a form does not write of this vehicle, and why; empty where it writes all it has."""
+    return str(FORMS[form_of(form)].particulars(Facts(vehicle, "")).get("refused", ""))
+
+
 def export(vehicle: Vehicle, form: str, source: str, doubt: str = "") -> dict[str, str]:
     """Writes a vehicle in the form of another program.
 
     Args:
         vehicle: with its fitted values as initial values.
-        form: one of `FORMATS`.
+        form: one of `FORMATS`, or what `form_of` takes for one.
         source: what the vehicle was read from, for the header.
         doubt: what speaks against the values, for the header.
 
@@ -94,10 +120,9 @@ def export(vehicle: Vehicle, form: str, source: str, doubt: str = "") -> dict[st
     Raises:
         ParameterError: unknown form, or a vehicle that it cannot hold.
     """
-    if form not in FORMS:
-        raise ParameterError(f"unknown format '{form}'", ", ".join(FORMATS), nearest(form, FORMATS))
-    facts, asked = Facts(vehicle, source, doubt), FORMS[form]
+    facts, asked = Facts(vehicle, source, doubt), FORMS[form_of(form)]
     own = asked.particulars(facts)
     header = facts.header(tuple(name for name in asked.carried if name not in own.get("lost", ())))
     values = {**own, "f": facts, "v": vehicle, "rotors": facts.rotors, "header": header}
-    return {end: render(f"programs/{name}", values) for end, name in asked.templates.items()}
+    without = own.get("without", ())
+    return {end: render(f"programs/{name}", values) for end, name in asked.templates.items() if end not in without}

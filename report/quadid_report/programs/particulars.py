@@ -17,6 +17,17 @@ AIR_DENSITY = 1.225
 """Of the standard atmosphere [kg/m^3], in which a ballistic coefficient is stated."""
 ROTOR_MASS = 1e-3
 """Share of the mass that each rotor link gets in Gazebo; taken off the body, so that the vehicle keeps its own."""
+SAME_MOMENT = 0.01
+"""Relative difference up to which a rotor's place or moment is that which a simulator gives it."""
+_SIH = np.array([[-1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, 1.0, -1.0, -1.0]])
+"""Signs of roll, pitch, yaw moment of SIH's motors 1 to 4 (sih.cpp): an X; the first two turn counterclockwise."""
+SITL_FRAMES = {
+    "+": ((90, 1), (-90, 1), (0, -1), (180, -1)),
+    "X": ((45, 1), (-135, 1), (-45, -1), (135, -1)),
+    "hexa": ((0, -1), (180, 1), (-120, -1), (60, 1), (-60, 1), (120, -1)),
+    "hexax": ((90, -1), (-90, 1), (-30, -1), (150, 1), (30, 1), (-150, -1)),
+}
+"""Motors 1, 2, ... of ArduPilot's frames (SIM_Frame.cpp): angle from forward, clockwise [deg], and spin in ours."""
 _AGILICIOUS = {"fr": (1, -1, 1), "bl": (-1, 1, 1), "br": (-1, -1, -1), "fl": (1, 1, -1)}
 """Rotors of Agilicious in its order: signs of x forward and y left, and the spin, in ours, that it allocates for."""
 
@@ -35,7 +46,22 @@ def px4(facts: Facts) -> dict[str, Any]:
     MPC_THR_HOVER is a share of command, not of thrust.
     """
     lost = () if facts.max_speed is not None else ("weak_rotor",)
-    return {"lost": lost, "rows": [*_in_hardware(facts), *_drag_fusion(facts)]}
+    refused = _not_sih(facts)
+    rows = [] if refused else _in_hardware(facts)
+    return {"lost": lost, "rows": [*rows, *_drag_fusion(facts)], "refused": refused}
+
+
+def _not_sih(facts: Facts) -> str:
+    """Why PX4's simulation in hardware cannot be this vehicle; empty where its X and motor order hold."""
+    shape = "four alike rotors in an X: front right and back left counterclockwise, then front left and back right"
+    if len(facts.rotors) != _SIH.shape[1]:
+        return f"no SIH_*: PX4 simulates {shape}, this vehicle has {len(facts.rotors)} rotors"
+    pull = facts.thrust / np.mean(facts.thrust)
+    moments = np.array([-facts.arms[:, 1], facts.arms[:, 0], facts.vehicle.spins]) * pull
+    size = np.mean(np.abs(facts.arms[:, 1])), np.mean(np.abs(facts.arms[:, 0])), 1.0
+    wrong = np.abs(moments - _SIH * np.array(size)[:, None]).max(axis=1) > SAME_MOMENT * np.abs(moments).max(axis=1)
+    axes = [axis for axis, off in zip(("roll", "pitch", "yaw"), wrong, strict=True) if off]
+    return f"no SIH_*: PX4 simulates {shape}; {', '.join(axes)} of this vehicle would come out wrong" if axes else ""
 
 
 def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
@@ -69,8 +95,11 @@ def _drag_fusion(facts: Facts) -> list[tuple[str, float]]:
 
 
 def ardupilot(facts: Facts) -> dict[str, Any]:
-    """``expo``: share e of the square in ArduPilot's curve thrust / full = (1 - e) c + e c^2; None: none is fitted.
+    """Thrust curve, and the frame that the vehicle is in SITL with the rotor behind each of its motors.
 
+    ``expo`` is the share e of the square in ArduPilot's curve thrust / full = (1 - e) c + e c^2; None: none is fitted.
+    SITL, whose own e is 0.65 without ``propExpo``, is given 1 then, as rotor speed follows command; a flight controller
+    that undoes the curve (kind ``thrust``) may have any.
     Of b (w - w0)^2 with w = c w_full, the linear part is -2 w0 c w_full; what is left at no command has no place.
     SITL calls the distance of the motors from the centre ``diagonal_size`` (`SIM_Frame.cpp`).
     """
@@ -78,7 +107,30 @@ def ardupilot(facts: Facts) -> dict[str, Any]:
     if "thrust_curve" in facts.vehicle.effects and facts.max_speed is not None:
         bend = -2.0 * facts.effect("thrust_curve", "dead_speed") / facts.max_speed
         expo = 1.0 / (1.0 + bend) if bend > -1.0 else None
-    return {"expo": expo, "lost": () if expo is not None else ("thrust_curve",)}
+    frame, motors = _sitl_frame(facts)
+    refused = f"no .sitl.json: the rotors stand in none of the frames {', '.join(SITL_FRAMES)} of ArduPilot's simulator"
+    return {
+        "expo": expo, "sitl_expo": 1.0 if expo is None and facts.vehicle.command.kind != "thrust" else expo,
+        "lost": () if expo is not None else ("thrust_curve",), "frame": frame, "motors": motors,
+        "refused": "" if frame else refused, "without": () if frame else (".sitl.json",),
+    }  # fmt: skip
+
+
+def _sitl_frame(facts: Facts) -> tuple[str, list[int]]:
+    """The frame of SITL whose motors stand and turn as the rotors do, and the rotor (from 1) of each motor."""
+    arm = facts.vehicle.arm
+    for name, motors in SITL_FRAMES.items():
+        angles, spins = np.radians([a for a, _ in motors]), np.array([s for _, s in motors])
+        places = arm * np.column_stack([np.cos(angles), np.sin(angles)])
+        far = np.linalg.norm(places[:, None] - facts.vehicle.rotor_positions[None, :, :2], axis=2)
+        nearest = np.argmin(far, axis=1)
+        if (
+            len(motors) == len(facts.rotors) == len(set(nearest.tolist()))
+            and far.min(axis=1).max() <= SAME_MOMENT * arm
+            and (facts.vehicle.spins[nearest] == spins).all()
+        ):
+            return name, (nearest + 1).tolist()
+    return "", []
 
 
 def gazebo(facts: Facts) -> dict[str, Any]:
