@@ -31,7 +31,7 @@ def test_json_has_exactly_the_keys_of_the_contract(done: tuple[Run, dict[str, An
     run, result, out = done
     assert run.code == 0, run.err
     keys = ["schema", "vehicle", "optimizer", "seed", "seconds", "parameters", "sets", "vehicle_file", "warnings"]
-    assert list(result) == [*keys, "verdict", "report"]
+    assert list(result) == [*keys, "missing", "verdict", "report"]
     assert (result["schema"], result["vehicle"], result["optimizer"]) == ("quadid.identify/1", "pelican", "pso_polish")
     assert 0.0 < result["seconds"] < 300.0
     for p in result["parameters"]:
